@@ -1,4 +1,4 @@
-"""The thesis's attempts on the LandShark (its research question 3), with real nodes on two machines.
+"""The thesis's attacks on the LandShark (its research question 3), with real nodes on two machines.
 
 Only the first machine may publish the topic, and the second one may not end a node of the first.
 """
@@ -50,7 +50,7 @@ def second(common_lab: Lab) -> Host:
 
 
 def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """Only the first machine is heard on the topic; the denial names the rule, in the answer and the log."""
+    """Only the first machine is heard on the topic; the denial names the rule, in the answer and in the log."""
     listener = ros.listener("roscpp", "/topic1")
     ros.talker("rospy", "/topic1", name="rightful")
     answer = call_on(
@@ -73,7 +73,7 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
 
 
 def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> None:
-    """The second machine publishes what the policy grants it, as with any master."""
+    """The second machine can publish the topics that the policy grants it, as with any master."""
     listener = ros.listener("rospy", "/topic2")
     ros.on(second).talker("roscpp", "/topic2", name="guest")
     assert listener.wait_for(event="received")["publisher"] == "/guest"
@@ -92,7 +92,7 @@ def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, seco
 
 
 def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """A name in use on one machine cannot be taken over from another, though the policy lets both use it."""
+    """A name in use on one machine cannot be taken over from another, even if the policy lets both use it."""
     listener = ros.listener("rospy", "/topic2")
     ros.talker("rospy", "/topic2", "--text", "mine", name="voice")
     listener.wait_for(event="received")
@@ -111,7 +111,7 @@ def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, se
 
 
 def test_rest_can_be_disabled(appliance: Appliance) -> None:
-    """With `--api off` there is no process, no port, no token."""
+    """With `--api off` there is no REST process, port or token."""
     assert appliance.ready["api"] is None
     assert "token" not in appliance.ready
     assert appliance.pids("api") == []

@@ -1,4 +1,4 @@
-"""A backup of the running appliance is restored in another place, where the appliance continues."""
+"""A running appliance is backed up and restored in another place, where it continues."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
 
 @contextlib.contextmanager
 def busy(uri: str) -> Iterator[None]:
-    """Run a node that sets parameters all the time."""
+    """Run a node that sets parameters continuously."""
     ending = threading.Event()
 
     def work() -> None:
@@ -38,8 +38,7 @@ def busy(uri: str) -> Iterator[None]:
 
 
 def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
-    """After a backup under load and a restore elsewhere, the log verifies and grows; policy, parameters and tokens
-    exist.
+    """After backup under load and restore, the log verifies and grows; policy, parameters and tokens are there.
 
     The original appliance is not affected, and its own log stays complete.
     """
@@ -78,7 +77,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
 
 
 def test_a_half_restored_state_is_not_started() -> None:
-    """On the remains of an interrupted restore, `rosrv up` ends with the remedy, and changes nothing."""
+    """If a restore was interrupted, `rosrv up` ends with the remedy and changes nothing."""
     appliance = Appliance()
     try:
         appliance.state.mkdir(mode=0o711)

@@ -1,4 +1,4 @@
-"""Contents of messages are for authorized roles only: every path of REST, for each role."""
+"""Only authorized roles see the contents of messages: tested on every path of REST, for each role."""
 
 import itertools
 import json
@@ -44,8 +44,9 @@ def appliance() -> Iterator[Appliance]:
 
 
 def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tmp_path: Path) -> None:
-    """Neither do operators see the messages of a recording, which are for investigators; nor does a log line or a
-    metric.
+    """Operators also do not see the messages of a recording, which are for investigators.
+
+    No log line and no metric has them.
     """
     tokens: dict[str, Rest] = {}
     for role in ("viewer", "operator", "investigator"):
@@ -83,18 +84,18 @@ def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tm
     assert not messages & {*places["operator"]}
     assert messages - {*places["investigator"]} <= {
         f"/v1/recordings/{listed[0]['id']}/evidence"
-    }  # it is packed
+    }  # the text is packed
     assert WORD not in appliance.story()
 
 
 def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator[str]:
-    """Return the paths, of all GET paths and streams, whose answer contains it."""
+    """Yield the paths, of all GET paths and streams, whose answer contains the text."""
     asked = {
         "/v1/audit": "?limit=500", "/v1/evidence": "?since=1h", "/v1/monitors": "?texts=true",
         "messages": "?at=1970-01-01", "/v1/audit/stream": "?after=1",
     }  # fmt: skip
     for path, methods in rest.get("/v1/openapi.json").json["paths"].items():
-        if "get" not in methods or path == "/v1/messages":  # its frames are for operators alone
+        if "get" not in methods or path == "/v1/messages":  # the picture's frames are for operators only
             continue
         needed = re.search(r"\{(\w+)", path)
         for value in values[needed[1]] if needed else [""]:

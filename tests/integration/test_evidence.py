@@ -1,4 +1,4 @@
-"""Evidence bundles of a running appliance: by command and REST, by role, recorded, and verified on another machine."""
+"""Evidence bundles of a running appliance: by command and REST, for each role, recorded, and verified elsewhere."""
 
 import json
 import subprocess
@@ -63,7 +63,7 @@ def records_of(bundle: Path) -> list[dict[str, Any]]:
 
 
 def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
-    """The bundle has all records up to now, with proof although no checkpoint was due; the export is recorded."""
+    """The bundle has all records up to now with proof, although no checkpoint was due; the export is recorded."""
     bundle = tmp_path / "incident.zip"
     appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
     assert bundle.stat().st_mode & 0o777 == 0o600
@@ -142,7 +142,7 @@ def test_a_recording_exports_as_evidence(appliance: Appliance, tmp_path: Path) -
 
 
 def test_a_time_without_records(appliance: Appliance, tmp_path: Path) -> None:
-    """It is refused with a reason, and leaves no file."""
+    """The export is refused with a reason, and leaves no file."""
     place = tmp_path / "x.zip"
     span = ("--since", "1970-01-01", "--until", "1970-01-02")
     done = appliance.rosrv("evidence", "export", *span, "-o", str(place), check=False)

@@ -1,4 +1,4 @@
-"""The audit log of the real appliance is forwarded to a syslog receiver that is sometimes away."""
+"""The audit log of a real appliance is forwarded to a syslog receiver that is sometimes unavailable."""
 
 import json
 import os
@@ -37,7 +37,7 @@ def collector() -> Iterator[StreamCollector]:
 
 @pytest.fixture(scope="module")
 def appliance(collector: StreamCollector) -> Iterator[Appliance]:
-    """Run an appliance that forwards all records to it; after each test all processes run."""
+    """Run an appliance that forwards all records to the receiver; after each test all processes run."""
     with forwarding(collector.port) as appliance:
         yield appliance
 
@@ -50,7 +50,7 @@ def work(appliance: Appliance, count: int) -> None:
 
 
 def another_life(appliance: Appliance, role: str, before: list[int]) -> None:
-    """Return once the process was restarted."""
+    """Wait until the process was restarted."""
     eventually(lambda: appliance.pids(role) not in ([], before), f"another {role} runs")
 
 
@@ -111,7 +111,7 @@ def test_an_unavailable_receiver(collector: StreamCollector, appliance: Applianc
 
 
 def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
-    """After repeated kills of forwarder and control, and a restart of the appliance, no record is missing."""
+    """After repeated kills of the forwarder and control, and a restart of the appliance, no record is missing."""
     for role in ("syslog", "control", "syslog"):
         work(appliance, 60)
         before = appliance.pids(role)
@@ -127,7 +127,7 @@ def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
 
 
 def test_only_denials() -> None:
-    """With `send: denials` only denials are sent, with caller and reason."""
+    """With `send: denials` only denials are sent, each with caller and reason."""
     with (
         StreamCollector() as collector,
         forwarding(collector.port, send="denials", facility=10) as appliance,
@@ -145,7 +145,7 @@ def test_only_denials() -> None:
 
 
 def test_a_log_rewritten_by_root(tmp_path: Path) -> None:
-    """Root rewrites the log with the real key: it verifies here, but the receiver's copy reveals the change."""
+    """Root rewrites the log with the real key: the log verifies locally, but the receiver's copy reveals the change."""
     with StreamCollector() as collector, forwarding(collector.port) as appliance:
         with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/thief")[0] == 0
@@ -170,5 +170,5 @@ def test_a_log_rewritten_by_root(tmp_path: Path) -> None:
 
 
 def sealed(messages: list[Message]) -> list[Message]:
-    """Return the checkpoints among them."""
+    """Return the checkpoints in these messages."""
     return [one for one in messages if one.event == "checkpoint-signed"]

@@ -1,4 +1,4 @@
-"""With a full state disk, each change is stored, or refused before it has any effect."""
+"""If the disk of the state is full, each change is stored, or refused before it has any effect."""
 
 import subprocess
 from collections.abc import Iterator
@@ -75,7 +75,7 @@ class SmallDisk:
 
 @pytest.fixture
 def small() -> Iterator[SmallDisk]:
-    """Run it with a disk of 32 MiB, a token `guest` and a monitor."""
+    """Run an appliance with a disk of 32 MiB, a token `guest` and a monitor."""
     appliance = Appliance()
     appliance.state.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=32m,mode=755", "rosrv-state-test", str(appliance.state)]
@@ -94,7 +94,7 @@ def small() -> Iterator[SmallDisk]:
 
 
 def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
-    """Each refusal asks for disk space; with space the change is carried out, and survives a crash."""
+    """Each refusal asks for disk space; once there is space, the change is carried out and survives a crash."""
     assert {type(order) for order in ORDERS} == KEPT
     before = small.all()
     small.fill()
@@ -117,7 +117,10 @@ def test_a_change_that_cannot_be_stored_has_no_effect(small: SmallDisk) -> None:
 
 
 def test_a_revocation_is_effective_even_if_it_cannot_be_stored(small: SmallDisk) -> None:
-    """The revocation is effective at once; the answer warns of a restart, and it is stored once there is space."""
+    """The revocation is effective at once.
+
+    The answer warns of a restart, and the revocation is stored once there is space.
+    """
     small.fill()
     answer = small.ask(admin.TokenRevoke("guest"))
     assert answer.error is not None

@@ -1,4 +1,4 @@
-"""The simulated LandShark is an ordinary robot: without the appliance it is as open as ROS 1."""
+"""The simulated LandShark is an ordinary robot: without the appliance it is as unprotected as ROS 1."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from tests.support.nodes import ROOT, has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 
-ATTACKS = [  # attacks that end a node come after those that need it
+ATTACKS = [  # attacks that end a node come after attacks that need it
     "watch the battery",
     "look around",
     "spy on the position",
@@ -61,5 +61,5 @@ def test_mission(operator: Actor) -> None:
 
 @pytest.mark.parametrize("name", ATTACKS)
 def test_attack_succeeds_against_a_plain_master(stage: Stage, operator: Actor, name: str) -> None:
-    """Each attack of the demonstration is real: it succeeds without the appliance."""
+    """Each attack of the demonstration is real, because it succeeds without the appliance."""
     assert stage.attack(name).succeeded

@@ -1,4 +1,4 @@
-"""A policy learned from a real run allows the same nodes, and no other."""
+"""A policy learned from a real run allows the same nodes, and no others."""
 
 import xmlrpc.client
 from pathlib import Path
@@ -12,7 +12,7 @@ TRIAL += "[Options]\naudit-only = all\n"
 
 
 def run_nodes(appliance: Appliance, home: Path) -> None:
-    """Run a talker, a listener that hears it, a service and a client, a stock tool that reads parameters."""
+    """Run a talker, a listener that hears it, a service and a client, and a stock tool that reads parameters."""
     home.mkdir()
     with RosSession(appliance.master_uri, home) as ros:
         ros.talker("rospy", "/chatter", name="talker")
@@ -27,7 +27,7 @@ def run_nodes(appliance: Appliance, home: Path) -> None:
 
 
 def test_the_same_robot_works_under_the_learned_policy(tmp_path: Path) -> None:
-    """Run in audit-only mode, learn, load, run again: nothing is denied, except another topic, node and call."""
+    """After learning in audit-only mode, a second run has no denial, except for another topic, node and call."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Appliance(policy=TRIAL) as appliance:
         run_nodes(appliance, tmp_path / "first")

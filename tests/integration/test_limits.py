@@ -1,4 +1,4 @@
-"""`[Limits]` of a policy with real nodes: floods, throttles, and a change while they run."""
+"""`[Limits]` of a policy with real nodes: floods, throttles, and a change while the nodes run."""
 
 import time
 from collections.abc import Iterator
@@ -75,9 +75,9 @@ def judged(appliance: Appliance) -> int:
 def test_only_the_publisher_beyond_its_limit_loses_messages(
     appliance: Appliance, ros: RosSession, client: Client, topic: str
 ) -> None:
-    """With a monitor or without, five of a hundred messages a second pass, and a record says so.
+    """With or without a monitor, five of a hundred messages a second pass, and a record says so.
 
-    The other topic loses none.
+    The other topic loses no message.
     """
     before = judged(appliance)
     listener, other = ros.listener(client, topic), ros.listener(client, "/quiet")
@@ -104,7 +104,7 @@ def test_only_the_publisher_beyond_its_limit_loses_messages(
 def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
     appliance: Appliance, hosts: tuple[Host, Host], ros: RosSession, client: Client
 ) -> None:
-    """The tablet gets five a second, the robot twenty; without the limit the same connection gets all."""
+    """The tablet gets five messages a second, the robot twenty; without the limit, the same connection gets all."""
     tablet, robot = ros.on(hosts[1]).listener(client, "/camera"), ros.listener(client, "/camera")
     ros.talker(client, "/camera", "--rate", "100", name=f"camera_{client}")
     for listener, rate in ((tablet, 5), (robot, 20)):

@@ -1,4 +1,4 @@
-"""Monitors between real rospy and roscpp nodes: drop, change, publish, verdict; loaded during traffic."""
+"""Monitors between real rospy and roscpp nodes drop, change, publish and report; they are loaded during traffic."""
 
 import itertools
 import json
@@ -43,7 +43,7 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide it as at its start: `words` alone, in its initial state, and the log of this test only."""
+    """Provide the appliance as at its start: only `words`, in its initial state, and only this test's log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "remove", "words", check=False)
@@ -64,7 +64,7 @@ def dropped_by(appliance: Appliance, name: str, count: int) -> bool:
 
 
 def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: RosSession) -> None:
-    """Both clients reach both, with the publisher's own header; publications of a monitor come from the appliance."""
+    """Both listeners get both talkers with their own headers; messages of a monitor come from the appliance."""
     alarms = [ros.listener(client, "/alarm") for client in CLIENTS]
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     for client in CLIENTS:
@@ -85,7 +85,7 @@ def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: Ro
         assert not [event for event in said if "bad" in event["data"]]
     assert appliance.recorded(event="message dropped", resource="/chatter")
     told = appliance.recorded(event="message changed", resource="/chatter")
-    changed = next(one for one in told if "before" in one["detail"])  # the others are sums of a second
+    changed = next(one for one in told if "before" in one["detail"])  # the others are sums for one second
     assert bytes.fromhex(changed["detail"]["before"])[4:].startswith(b"good")
     assert changed["detail"]["before_fields"]["data"].startswith("good")
     assert bytes.fromhex(changed["detail"]["after"])[4:].startswith(b"checked good")
@@ -95,7 +95,7 @@ def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: Ro
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """No message is lost, the order is kept, and each change is recorded with its author."""
+    """No message is lost, the order stays, and each change is recorded with its author."""
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
@@ -125,7 +125,7 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
 def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """No message is lost meanwhile, and the first changed one follows the last unchanged one."""
+    """Meanwhile no message is lost, and the first changed message directly follows the last unchanged one."""
     assert appliance.rosrv("monitor", "enable", "words", "--shadow").stdout == "shadow mode: words\n"
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
@@ -181,7 +181,7 @@ watch() {
 def test_a_missing_message_is_published_at_the_deadline(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """The appliance publishes it, with a record; and `check` predicts it."""
+    """The appliance publishes the message, with a record; and `check` predicts it."""
     spec = tmp_path / "watch.rv"
     spec.write_text(WATCH)
     said = "enforced: at the deadline raise_alarm publishes the due message (/alarm)"
@@ -201,7 +201,7 @@ def test_a_missing_message_is_published_at_the_deadline(
 def test_an_invalid_specification_is_rejected_without_effect(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Exit status 1, as for `monitor check`."""
+    """The exit status is 1, as for `monitor check`."""
     spec = tmp_path / "words.rv"
     spec.write_text(WORDS.replace("heard + 1", "herd + 1"))
     done = appliance.rosrv("monitor", "load", str(spec), check=False)
@@ -218,7 +218,7 @@ def test_an_invalid_specification_is_rejected_without_effect(
 def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """An alarm reports it; switches and loaded files stay, and `hold` blocks messages until resumed."""
+    """An alarm reports the new relay; switches and loaded files stay, and `hold` blocks messages until resumed."""
     held = WORDS.strip().replace("begin words()", "hold gate()").replace("/chatter", "/held")
     path = Path(appliance.directory) / "gate.rv"
     path.write_text(held)
@@ -241,7 +241,7 @@ def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
 
 
 def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tmp_path: Path) -> None:
-    """They survive a restart of the appliance and of control; ROSRV's calls and flags report the same."""
+    """A restart of the appliance or of control keeps them; ROSRV's calls and flags report the same."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -266,7 +266,7 @@ def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tm
 
 
 def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, tmp_path: Path) -> None:
-    """As after an upgrade, the start names the verb that discards it; the next start has the folder's monitors."""
+    """The start, as after an upgrade, names the verb that discards the revision; the next start uses the folder."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -289,7 +289,7 @@ def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, 
 
 
 def test_a_start_with_an_invalid_file_fails_with_its_place() -> None:
-    """The appliance does not serve without its monitors."""
+    """The appliance does not start without its monitors."""
     monitors = {"words": WORDS, "broken": "broken() { event }"}
     appliance = Appliance(monitors=monitors, options=("--api", "off"))
     with pytest.raises(AssertionError):
@@ -315,7 +315,10 @@ gate() {
 def test_requests_are_refused_and_responses_changed(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """Both clients call both: the client gets the reason as the service's error; the service never gets the request."""
+    """Clients of both libraries call both services.
+
+    A client gets the reason as the service's error, and the service no request.
+    """
     for to in CLIENTS:
         spec = tmp_path / f"gate_{to}.rv"
         spec.write_text(GATE.replace("gate()", f"gate_{to}()").replace("/mode", f"/mode_{to}"))
@@ -336,7 +339,7 @@ def test_requests_are_refused_and_responses_changed(
 
 
 def said(listener: Process, prefix: str) -> None:
-    """Wait until the listener receives a text with this beginning."""
+    """Wait until the listener receives a text that begins with this."""
     listener.wait_for(lambda event: event.get("data", "").startswith(prefix), since=listener.mark())
 
 
@@ -367,13 +370,13 @@ def test_monitors_change_during_a_thousand_messages_a_second(
     appliance.rosrv("monitor", "remove", "words")
     said(steady, "hello")
     late.wait_for_count(500, event="received")
-    # A talker without processor time loses messages of its own queue: no listener gets those.
+    # A talker without processor time loses messages in its own queue, which no listener gets.
     mine, others = numbers(steady.seen(event="received")), numbers(late.seen(event="received"))
     first, last = others[0], min(mine[-1], others[-1])
     assert first < last
     assert [one for one in mine if first <= one <= last] == [one for one in others if one <= last]
     assert mine == sorted(set(mine))
-    # The stopped listener may have lost the oldest messages to its full queue, and gets the rest in order.
+    # The stopped listener may lose its oldest messages to its full queue; the rest arrives in order.
     rest = numbers(stopped.seen(event="received"))
     assert rest == sorted(set(rest))
     assert stopped.seen(event="received")[-1]["publisher"] == "/voice"
@@ -420,7 +423,7 @@ for line in sys.stdin:
 
 @pytest.mark.parametrize("relay", ["all", "monitored"])
 def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -> None:
-    """The gun fires only while it does not point at the robot itself, in either mode of the relay."""
+    """The gun does not fire while it points at the robot itself, in either mode of the relay."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     options = (
         "--monitors",
@@ -474,12 +477,12 @@ def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
 
 
 def test_each_goal_of_an_action_is_monitored_separately(appliance: Appliance, ros: RosSession) -> None:
-    """The shipped `goals.rv` reports a repeated id; actionlib's own goals leave no record."""
+    """The shipped `goals.rv` reports a repeated id; for the goals of actionlib itself there is no record."""
     appliance.rosrv("monitor", "load", str(ROOT / "monitors" / "goals.rv"))
     goal = "{goal_id: {id: twin}, goal: {goal: 1}}"
     twins = ros.start(["rostopic", "pub", "-r", "5", "/count/goal", "actionlib/TestActionGoal", goal])
     verdicts = appliance.recorded(event="monitor verdict", resource="/count/goal")
-    told = next(one for one in verdicts if "binding" in one["detail"])  # the others are sums of a second
+    told = next(one for one in verdicts if "binding" in one["detail"])  # the others are sums for one second
     assert (told["detail"]["category"], told["detail"]["binding"]) == ("twice", {"id": "twin"})
     assert told["reason"] == "property 1 of goals (fsm) with id = twin: twice"
     said = "another goal has the id twin, which is not answered yet"

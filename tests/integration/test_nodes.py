@@ -23,7 +23,7 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_first: bool) -> None:
-    """Messages arrive in order, from the node that sent them, whichever of the two started first."""
+    """Messages arrive in order and from the right node, whichever of the two nodes started first."""
     if subscriber_first:
         listener = ros.listener(to, "/chatter")
         ros.talker(by, "/chatter", name="voice")
@@ -38,7 +38,7 @@ def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
-    """Late subscribers get the last message of a latched topic, once each."""
+    """Late subscribers get the last message of a latched topic once each."""
     talker = ros.talker(by, "/map", "--latch")
     talker.wait_for(event="sent")
     for number in range(2):
@@ -60,7 +60,7 @@ def test_two_talkers_on_one_topic(ros: RosSession, to: Client) -> None:
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_restarted_talker(ros: RosSession, by: Client, to: Client) -> None:
-    """A publisher that ended and returned under its name is heard again."""
+    """A publisher that ended and returned under the same name is heard again."""
     listener = ros.listener(to, "/chatter")
     first = ros.talker(by, "/chatter", "--text", "before", name="voice")
     listener.wait_for(lambda event: event.get("data", "").startswith("before"))
@@ -82,7 +82,7 @@ def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> None:
-    """A publisher is notified when a subscriber connects and when the last one leaves."""
+    """A publisher is notified when a subscriber connects, and when the last subscriber leaves."""
     talker = ros.talker(by, "/chatter")
     listener = ros.listener("roscpp", "/chatter")
     talker.wait_for(event="connected")
@@ -120,7 +120,7 @@ def test_persistent_service_connection(ros: RosSession, client: Client) -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_missing_service(ros: RosSession, client: Client) -> None:
-    """A call of a missing service fails for the client and leaves it running."""
+    """A call of a missing service fails, and the client continues."""
     asker = ros.service_client(client, "/nobody")
     asker.send("true")
     asker.wait_for(event="failed")
@@ -130,7 +130,7 @@ def test_missing_service(ros: RosSession, client: Client) -> None:
 
 
 def test_watched_parameter(ros: RosSession) -> None:
-    """A parameter set by one node reaches the watching nodes, rospy and roscpp."""
+    """A parameter set by one node reaches the nodes that watch it, rospy and roscpp."""
     python, cpp = ros.parameters("rospy"), ros.parameters("roscpp")
     python.send(json.dumps({"do": "set", "key": "/speed", "value": "slow"}))
     python.wait_for(event="done", do="set")

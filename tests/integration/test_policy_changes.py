@@ -1,4 +1,4 @@
-"""The policy changes while a robot works: revoked rights end at once, rights granted again work without a restart."""
+"""The policy changes while a robot works: revoked rights end at once, restored rights work without a restart."""
 
 import signal
 from pathlib import Path
@@ -17,7 +17,7 @@ NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
 
 @pytest.fixture(scope="module")
 def appliance(own_appliance: Appliance) -> Appliance:
-    """Return an appliance of this file's own."""
+    """Return the appliance of this file."""
     return own_appliance
 
 
@@ -61,7 +61,7 @@ def test_a_policy_changed_during_downtime_applies_to_running_nodes(
     appliance: Appliance, ros: RosSession
 ) -> None:
     """After the file was edited between a stop and a start, running nodes lose the revoked rights at the start."""
-    appliance.reload(OPEN_POLICY)  # the policy in force is that of the file
+    appliance.reload(OPEN_POLICY)  # the policy in force is the file's
     listener = ros.listener("rospy", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     listener.wait_for(event="received")
@@ -77,7 +77,7 @@ def test_a_policy_changed_during_downtime_applies_to_running_nodes(
 
 
 def test_a_node_paused_during_a_reload_loses_revoked_rights(lab: Lab, robot: Host, tmp_path: Path) -> None:
-    """A node that was lost during the change and continues later gets no message of the topic until a rollback."""
+    """A node that was lost during the change and returns gets no message of the topic until a rollback."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     middle, settings = lab.host("appliance", "10.77.0.2/24"), "liveness: {interval: 0.5, silent: 2}\n"
     with (

@@ -35,7 +35,7 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide it with its first policy: only the operator's station may command. No node is registered."""
+    """Provide the appliance with its first policy: only the operator's station may command. No node is registered."""
     yield common_appliance
     common_appliance.reload(POLICY)
     with ServerProxy(common_appliance.master_uri) as master:
@@ -53,7 +53,7 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
 
 
 def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path: Path) -> None:
-    """With `--write` to the file in force and no disk space, the file stays complete, and the error says so."""
+    """If `--write` to the file in force finds no disk space, the file stays complete, and the error says so."""
     record = refused(appliance, "registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "rosrv-grant-test", tmp_path], check=True)
     try:
@@ -73,7 +73,7 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
 
 
 def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_path: Path) -> None:
-    """The change is shown as a diff, also over REST, and loaded with a time limit; then the node gets the right."""
+    """The change is shown as a diff, also over REST, and loaded with a time limit; then the node has the right."""
     call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     record = refused(appliance, *call)
     shown = appliance.rosrv("policy", "grant", record).stdout
@@ -87,7 +87,7 @@ def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_
     assert appliance.rest().get(f"/v1/audit/{record}/why").json["lines"] == why
     new, dos = tmp_path / "new.ini", tmp_path / "dos.ini"
     dos.write_bytes(b"[Groups]\r\n")
-    for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # its line endings stay the same
+    for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # the file's line endings stay the same
         appliance.rosrv("policy", "grant", record, "--write", str(file))
         assert set(re.findall(rb"\r?\n", file.read_bytes())) == {ends}
     done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
@@ -152,7 +152,7 @@ DENIALS: dict[str, tuple[tuple[object, ...], list[str]]] = {
 
 
 def test_every_denial_explains_itself(appliance: Appliance) -> None:
-    """Each has the caller, the rule with its line, and the change that would allow it; by command and over REST."""
+    """Each denial has the caller, the rule with its line, and the change that allows it, by command and over REST."""
     appliance.reload(CLOSED)
     rest = appliance.rest()
     allowed: dict[str, list[str]] = {}
@@ -169,7 +169,7 @@ def test_every_denial_explains_itself(appliance: Appliance) -> None:
 
 
 def test_a_revocation_explains_the_change_that_would_undo_it(appliance: Appliance) -> None:
-    """The record of a publication that another policy ends has the change that would allow it again."""
+    """If a new policy ends a publication, the record has the change that would allow the publication again."""
     open_to_all = CLOSED.replace("[Publishers]\ndefault = ocu", "[Publishers]\ndefault = *")
     appliance.reload(open_to_all)
     with ServerProxy(appliance.master_uri) as master:

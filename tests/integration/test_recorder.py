@@ -53,7 +53,7 @@ def recording() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(recording: Appliance) -> Iterator[Appliance]:
-    """Provide it without recordings; its memory has messages of other tests on other topics."""
+    """Provide the appliance without recordings; its memory has messages of other tests, on other topics."""
     recording.ignore_earlier_records()
     yield recording
     for line in recording.rosrv("record", "list", "--json", check=False).stdout.splitlines():
@@ -80,7 +80,7 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
 
 
 def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
-    """Return the strings of a topic by Debian's rosbag, read in sequence and (as rqt_bag does) by the index."""
+    """Return the strings of a topic, read by Debian's rosbag in sequence and, as rqt_bag does, by the index."""
     program = (
         "import rosbag, sys\n"
         "bag, topics = rosbag.Bag(sys.argv[1]), [sys.argv[2]]\n"
@@ -127,8 +127,9 @@ def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
 def test_a_drop_makes_a_recording_that_stock_tools_read(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """It has the dropped message, earlier and later ones, and the decisions; the log proves it and records its
-    export.
+    """The recording has the dropped message, earlier and later ones, and the decisions.
+
+    The log proves the recording and records its export.
     """
     assert "no recordings; make one: rosrv record now" in appliance.rosrv("record", "list").stdout
     listener = ros.listener("roscpp", "/chatter", name="ear")
@@ -208,7 +209,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
 def test_messages_of_a_killed_relay_are_in_the_recording(
     appliance: Appliance, ros: RosSession, tmp_path: Path, victims: tuple[str, ...]
 ) -> None:
-    """Every message that a subscriber got is in it once, except the one in transfer."""
+    """Every message that a subscriber got is in the recording once, except the message in transfer."""
     topic = f"/chatter_{len(victims)}"
     listener = ros.listener("roscpp", topic, name="ear")
     ros.talker("roscpp", topic, name="voice")
@@ -243,7 +244,7 @@ def test_a_killed_recorder_resumes(appliance: Appliance, ros: RosSession, tmp_pa
 
 
 def test_nodes_can_order_a_recording_if_the_policy_allows(appliance: Appliance, ros: RosSession) -> None:
-    """roscpp, rospy and the stock tool can; a denied node gets the reason, and no node can take over the service."""
+    """roscpp, rospy and the stock tool can order; a denied node gets the reason; no node can replace the service."""
     service = "/rosrv/record_now"
     ros.talker("roscpp", "/chatter", name="voice")
     eventually(lambda: appliance.status()["recorder"]["running"], appliance.story)

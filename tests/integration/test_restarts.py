@@ -1,4 +1,4 @@
-"""A process of the appliance is killed while a robot works: running nodes go on, and new ones can join."""
+"""A process of the appliance is killed while a robot works: running nodes continue, and new ones can join."""
 
 import itertools
 
@@ -13,13 +13,13 @@ ROLES = ["control", "relay", "rosmaster", "signer", "rosout"]
 
 @pytest.fixture(scope="module")
 def appliance(own_appliance: Appliance) -> Appliance:
-    """Return an appliance of this file's own."""
+    """Return the appliance of this file."""
     return own_appliance
 
 
 @pytest.mark.parametrize("role", ROLES)
 def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
-    """Messages arrive again, a service answers, parameters exist, and a node started afterwards is heard."""
+    """Messages arrive again, a service answers, parameters are kept, and a node started afterwards is heard."""
     listeners = [ros.listener(client, "/chatter") for client in CLIENTS]
     ros.talker("rospy", "/chatter", name="python_voice")
     ros.talker("roscpp", "/chatter", name="cpp_voice")

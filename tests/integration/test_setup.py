@@ -18,7 +18,7 @@ exit 100
 
 
 def run_setup(folder: Path, *, busy: int, said: str) -> subprocess.CompletedProcess[str]:
-    """Run it with an `apt-get` that fails `busy` times with this text, on a machine where every package is missing."""
+    """Run `scripts/setup` with an `apt-get` that fails `busy` times with this text; every package is missing."""
     for name, text in (("apt-get", _APT), ("dpkg-query", "#!/bin/sh\n"), ("sleep", "#!/bin/sh\n")):
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
@@ -34,7 +34,7 @@ def run_setup(folder: Path, *, busy: int, said: str) -> subprocess.CompletedProc
 
 
 def test_it_waits_for_the_lock_of_apt(tmp_path: Path) -> None:
-    """It says so once, and installs the packages then."""
+    """The script says once that it waits, and then installs the packages."""
     need_root()
     done = run_setup(
         tmp_path, busy=3, said="E: Could not get lock /var/lib/apt/lists/lock. It is held by process 9"
@@ -46,7 +46,7 @@ def test_it_waits_for_the_lock_of_apt(tmp_path: Path) -> None:
 
 
 def test_another_failure_of_apt_ends_it(tmp_path: Path) -> None:
-    """With what apt-get printed, and without a second try."""
+    """The script prints apt-get's output and does not try again."""
     need_root()
     done = run_setup(tmp_path, busy=1, said="E: Unable to fetch some archives")
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""With a site key, every way into the appliance requires its signature."""
+"""With a site key, every way to change the appliance requires a signature of the site."""
 
 import contextlib
 import json
@@ -22,7 +22,7 @@ NO_SIGNATURE = "it has no signature of the site (site_keys in appliance.yaml)"
 
 @contextlib.contextmanager
 def of_a_site() -> Iterator[Appliance]:
-    """Return an appliance with a site key, a signed policy and an empty folder of specifications; not started."""
+    """Return an appliance with a site key, a signed policy and an empty folder of specifications, before its start."""
     options = ("--api", "127.0.0.1:0", "--api-tls", "off")
     appliance = Appliance(settings=f"site_keys:\n  - {LINE}\n", monitors={}, options=options)
     sign(appliance.policy_file)
@@ -34,18 +34,18 @@ def of_a_site() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def started() -> Iterator[Appliance]:
-    """Run it; some tests load policies, others specifications."""
+    """Run the appliance; some tests load policies, others specifications."""
     with of_a_site() as appliance:
         yield appliance.start()
 
 
 def sign(file: Path) -> None:
-    """Sign the present contents of a file."""
+    """Sign the current contents of a file."""
     file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
 
 
 def post(appliance: Appliance, path: str, **body: Any) -> Answer:
-    """POST with the first token, whatever revision is in force."""
+    """Send a POST with the first token, whatever revision is in force."""
     headers = {"If-Match": "*", "Content-Type": "application/json"}
     return appliance.rest().request("POST", path, json.dumps(body).encode(), headers)
 
@@ -57,7 +57,7 @@ def in_force(appliance: Appliance) -> dict[str, Any] | None:
 
 
 def test_an_unsigned_policy_fails_the_start() -> None:
-    """The error says what to do; no process and no state directory is made."""
+    """The error gives advice; no process is started and no state directory is made."""
     with of_a_site() as appliance:
         Path(f"{appliance.policy_file}.sig").unlink()
         with pytest.raises(AssertionError, match="ended"):
@@ -71,7 +71,7 @@ def test_an_unsigned_policy_fails_the_start() -> None:
 
 
 def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> None:
-    """File, SIGHUP, REST, rollback and a crash require it, and the record names the key."""
+    """File, SIGHUP, REST, rollback and the start after a crash require it; the record names the key."""
     appliance = started
     appliance.policy_file.write_text(OTHER)
     assert "it is not the text that" in appliance.rosrv("policy", "reload", check=False).stderr
@@ -97,7 +97,7 @@ def test_every_way_requires_the_signature_of_a_policy(started: Appliance) -> Non
 
 
 def test_every_way_requires_the_signature_of_a_specification(started: Appliance) -> None:
-    """Command, folder and REST require it, and the record names the key."""
+    """Command, folder and REST require the signature; the record names the key."""
     appliance = started
     file = appliance.directory / "monitors" / "count.rv"
     file.write_text(SPECIFICATION)

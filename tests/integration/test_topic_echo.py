@@ -26,12 +26,12 @@ def echoed(appliance: Appliance, *arguments: str) -> list[dict[str, object]]:
 def test_echo_shows_the_subscribers_messages_and_is_recorded(
     appliance: Appliance, ros: RosSession, client: Client, tmp_path: Path
 ) -> None:
-    """It shows messages before and after a monitor changes them, without being a subscriber."""
+    """The output has messages before and after a monitor changes them; the graph shows no new subscriber."""
     topic = f"/{client}_chatter"
     ros.talker(client, topic, "--text", "word", name="voice").wait_for(event="ready")
     shown = echoed(appliance, topic, "-n", "3")
     assert [row["node"] for row in shown] == ["/voice"] * 3
-    echoed(appliance, topic)  # the same viewer is not recorded again
+    echoed(appliance, topic)  # further queries of the same viewer are not recorded
     assert all("word" in str(row["fields"]) for row in shown)
     [record] = appliance.recorded("--event", "topic looked into", "--topic", topic)
     assert record["detail"] == {"who": "operator", "seconds": 60.0}
@@ -43,7 +43,7 @@ def test_echo_shows_the_subscribers_messages_and_is_recorded(
 
 
 def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
-    """It is shown once, however many more are awaited; a later message counts as new."""
+    """The message is shown once, even if more are requested; a later message counts as new."""
     ros.talker("rospy", "/map", "--latch", "--count", "1", name="server").wait_for(event="ready")
     done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
     assert (done.returncode, len(done.stdout.splitlines())) == (1, 1)
@@ -71,7 +71,7 @@ def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) ->
 
 
 def test_a_silent_topic_ends_and_blocks_no_other_request(appliance: Appliance, ros: RosSession) -> None:
-    """A silent topic ends with status 1 after the time; meanwhile other requests are answered."""
+    """A silent topic ends the command with status 1 after the time limit; meanwhile other requests are answered."""
     ros.listener("roscpp", "/quiet", name="ear").wait_for(event="ready")
     eventually(
         lambda: appliance.rosrv("topic", "info", "/quiet", check=False).returncode == 0, lambda: "no topic"

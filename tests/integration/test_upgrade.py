@@ -1,7 +1,7 @@
-"""The appliance is upgraded in place: it starts with the state of version 0.1.0.
+"""The appliance is upgraded in place: it starts on the state of version 0.1.0.
 
-`state-0.1.0.sql` is the state file that 0.1.0 wrote while a talker, a listener, a service and its client (rospy) ran,
-and an operator loaded a policy over REST and a specification, added two tokens and revoked one of them.
+Version 0.1.0 wrote the state file `state-0.1.0.sql` while a talker, a listener, a service and its client (rospy) ran.
+An operator loaded a policy over REST and a specification, added two tokens and revoked one of them.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ NOBODY = "[Nodes]\n[Publishers]\n[Subscribers]\n[Commands]\n[Services]\n[Clients
 
 
 class Upgraded(NamedTuple):
-    """The appliance on the old state, the running nodes, and the strings of two tokens."""
+    """The appliance on the old state, the running nodes, and the texts of two tokens."""
 
     appliance: Appliance
     nodes: FakeNodes
@@ -35,9 +35,7 @@ class Upgraded(NamedTuple):
 
 
 def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
-    """Write the state file, with the addresses of this test's nodes; return the strings of a valid and a revoked
-    token.
-    """
+    """Write the state file with the addresses of this test's nodes; return the texts of a valid and a revoked token."""
     directory.mkdir(parents=True)
     sql = DUMP.read_text()
     for name in NODES:
@@ -51,7 +49,7 @@ def old_state(directory: Path, nodes: FakeNodes) -> tuple[str, str]:
 
 
 def make_secret(database: sqlite3.Connection, name: str) -> str:
-    """Give a token a new secret, stored as by 0.1.0: the repository contains no secret."""
+    """Give a token a new secret, stored as version 0.1.0 did: the repository contains no secret."""
     [token_id, salt] = database.execute("SELECT id, salt FROM token WHERE name = ?", (name,)).fetchone()
     secret = secrets.token_urlsafe(32)
     kept = hashlib.scrypt(secret.encode(), salt=salt, n=1 << 14, r=8, p=1, dklen=32, maxmem=64 << 20)
@@ -81,7 +79,7 @@ def call(appliance: Appliance, method: str, *parameters: str) -> Any:
 
 
 def test_the_policy_in_force_survives(upgraded: Upgraded) -> None:
-    """The revision that an operator loaded over REST is in force, though the file has another policy."""
+    """The revision that an operator loaded over REST is in force, even though the file has another policy."""
     status = upgraded.appliance.status()["policy"]
     assert (status["revision"], status["who"], status["differs_from_file"]) == (2, "first", True)
     rest = upgraded.appliance.rest(upgraded.token)
@@ -93,7 +91,7 @@ def test_the_policy_in_force_survives(upgraded: Upgraded) -> None:
 
 
 def test_tokens_survive(upgraded: Upgraded) -> None:
-    """A token has its former rights, a revoked one has none."""
+    """A token keeps its rights, and a revoked token has none."""
     appliance = upgraded.appliance
     assert appliance.rest(upgraded.token).get("/v1/tokens").status == 200
     assert appliance.rest(upgraded.revoked).get("/v1/policy").status == 401
@@ -113,7 +111,7 @@ def test_specifications_in_force_survive(upgraded: Upgraded) -> None:
 
 
 def test_registrations_and_parameters_survive(upgraded: Upgraded) -> None:
-    """The new ROS master has the nodes, which did not register again, and the parameters."""
+    """The new ROS master has the parameters and the nodes, which did not register again."""
     publishers, subscribers, services = call(upgraded.appliance, "getSystemState")[2]
     assert ["/chatter", ["/voice"]] in publishers
     assert ["/chatter", ["/ears"]] in subscribers
@@ -127,7 +125,7 @@ def test_registrations_and_parameters_survive(upgraded: Upgraded) -> None:
 
 
 def test_grants_survive(upgraded: Upgraded) -> None:
-    """Permissions of 0.1.0 are live: a policy that denies one reports it, and the store still has it."""
+    """Permissions of 0.1.0 are in force: a policy that denies one of them reports it, and the store still has it."""
     ends = upgraded.appliance.rest(upgraded.token).post("/v1/policy?dry_run=1", NOBODY).json["ends"]
     live = {(end["caller_id"], end["what"], end["resource"]) for end in ends}
     assert {

@@ -18,7 +18,7 @@ from tests.support.waiting import eventually
 
 @pytest.fixture
 def rest(running: Appliance) -> Rest:
-    """Return a REST client with the first token, at the present address: a test restarts the appliance."""
+    """Return a REST client with the first token at the current address, because a test restarts the appliance."""
     return running.rest()
 
 
@@ -70,7 +70,7 @@ def test_a_body_too_large_is_refused_unread(rest: Rest) -> None:
         )
         assert pieces.getresponse().status == 413
     except (BrokenPipeError, ConnectionResetError, http.client.HTTPException):
-        pass  # cut off while it was still sending: refused all the same
+        pass  # cut off while still sending: the request was refused as well
     finally:
         pieces.close()
     assert rest.get("/v1/status").status == 200
@@ -97,8 +97,9 @@ def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
 
 
 def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
-    """The path is printed besides the line for scripts; only the owner can read the file, and the token is an
-    admin's.
+    """The path is printed besides the line for scripts, and only the owner can read the file.
+
+    The token is an admin's.
     """
     with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off"), json=False) as appliance:
         process = appliance.process
@@ -128,7 +129,7 @@ def test_clear_text_stays_on_loopback(tmp_path: Path) -> None:
 
 
 def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
-    """A host has a quota of silent connections, which end; other hosts go on, and later that host as well."""
+    """A host has a quota of silent connections, which time out; other hosts are served, and later this host as well."""
     assert rest.url.hostname is not None
     with ExitStack() as stack:
         idle = [
@@ -152,7 +153,7 @@ def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
 
 
 def test_a_polling_client_gets_304_without_changes(running: Appliance, rest: Rest) -> None:
-    """The second answer to a polling client is 304; a revision's ETag is for changes alone."""
+    """If nothing changed, a polling client gets 304; a revision's ETag is only for changes."""
     for path in ("/v1/inventory", "/v1/policy/revisions", "/v1/tokens", "/v1/openapi.json"):
         first = rest.get(path)
         again = rest.get(path, If_None_Match=first.etag)
@@ -170,7 +171,7 @@ def test_a_polling_client_gets_304_without_changes(running: Appliance, rest: Res
 
 
 def test_the_first_token_is_shown_once(running: Appliance) -> None:
-    """With --json it is in the ready line of the first start only; it works after a restart."""
+    """With --json, only the ready line of the first start has the token; the token still works after a restart."""
     token = running.ready["token"]
     assert list(running.ready) == ["event", "master", "api", "revision", "token"]
     assert running.stop() == 0

@@ -1,4 +1,4 @@
-"""Attacks on REST to gain access or to stop it; floods are in `test_robustness.py`."""
+"""Attacks that try to get access to REST or to stop it; floods are in `test_robustness.py`."""
 
 import gzip
 import http.client
@@ -32,7 +32,7 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def rest(appliance: Appliance) -> Iterator[Rest]:
-    """Return a REST client; after each attack the same process serves as before, and has not grown much."""
+    """Return a REST client; after each attack the same process still serves, and its memory has grown little."""
     rest = appliance.rest()
     pid = api_of(rest)
     before = resident(pid)
@@ -177,7 +177,7 @@ def test_hostile_json_is_rejected(rest: Rest, path: str, body: bytes) -> None:
 
 
 def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> None:
-    """Exploding formulas and endless blocks are answered in time, and other clients meanwhile."""
+    """Exploding formulas and endless blocks are answered in time; other clients are answered meanwhile."""
     events = "\n".join(f"event e{one}() /a std_msgs/Bool '{{}}' {{ }}" for one in range(14))
     sometime = " and ".join(f"<>(e{one} and <>e{one + 1})" for one in range(12))
     bombs = [
@@ -216,7 +216,7 @@ def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> 
 
 
 def test_invalid_names_in_paths_are_rejected(rest: Rest) -> None:
-    """An invalid name of a monitor, token, host or record is 404 or 422, answered as text, not as a page."""
+    """An invalid name of a monitor, token, host or record gets 404 or 422, as text instead of a page."""
     for name in (
         "..%2f..%2fetc%2fpasswd",
         "%00",
@@ -246,7 +246,7 @@ def test_invalid_names_in_paths_are_rejected(rest: Rest) -> None:
 
 
 def test_guessing_tokens_is_slowed_down_and_recorded(appliance: Appliance, rest: Rest) -> None:
-    """After several wrong tokens their sender must wait; the holder of a valid one on the same machine need not."""
+    """After several wrong tokens their sender must wait; a client on the same machine with a valid token need not."""
     guesses = [
         rest.impatient().with_token(f"rosrv_{number:012x}_{'A' * 43}").get("/v1/status").status
         for number in range(60)
@@ -322,6 +322,6 @@ def test_a_client_that_does_not_read_delays_no_other(rest: Rest) -> None:
     ],
 )  # fmt: skip
 def test_malformed_requests_are_not_served(rest: Rest, data: bytes) -> None:
-    """Bytes that are not HTTP, endless headers and an interrupted request; the next client is served."""
+    """Covers bytes that are not HTTP, endless headers and an interrupted request; the next client is served."""
     assert not {101, 200} & set(statuses(rest, data))
     assert rest.get("/v1/status").status == 200

@@ -19,7 +19,7 @@ POLICY = "[Nodes]\ndefault = *\n[Publishers]\n/allowed = *\n[Commands]\ndefault 
 
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
-    """Run an appliance that denies every publisher except that of /allowed, with some decisions in its log."""
+    """Run an appliance that denies every publisher except those of /allowed, with some decisions in its log."""
     config = tmp_path_factory.mktemp("config") / "appliance.yaml"
     config.write_text("audit: {durability: strict, checkpoint_seconds: 2}\napi: 127.0.0.1:0\napi_tls: off\n")
     with Appliance(policy=POLICY, options=("--config", str(config))) as running:
@@ -66,7 +66,7 @@ def test_a_reconnecting_client_misses_no_record(appliance: Appliance, rest: Rest
 
 
 def test_search_returns_the_same_as_the_command(appliance: Appliance, rest: Rest) -> None:
-    """The same filters return the same records, field by field."""
+    """The same filters return the same records as the command, field by field."""
     publish(appliance, "/sought")
     found = rest.get("/v1/audit?resource=/sou*&decision=deny&since=1h").json["records"]
     assert found == appliance.audit("--topic", "/sou*", "--deny", "--since", "1h")
@@ -93,7 +93,7 @@ def test_pages_join_without_gap_or_repetition(appliance: Appliance, rest: Rest) 
 
 
 def test_one_record_and_its_neighbours(appliance: Appliance, rest: Rest) -> None:
-    """The id and the sequence return the same record; its neighbours are of the same host or caller."""
+    """The id and the sequence return the same record; its neighbours have the same host or caller."""
     publish(appliance, "/middle")
     record = rest.get("/v1/audit?resource=/middle&event=decision").json["records"][0]
     shown = rest.get(f"/v1/audit/{record['id']}").json
@@ -107,7 +107,7 @@ def test_one_record_and_its_neighbours(appliance: Appliance, rest: Rest) -> None
 
 
 def test_the_log_is_proven(rest: Rest) -> None:
-    """Verification reports that the chain is complete, and how much a signature covers."""
+    """Verification reports that the chain is complete, and how many records a signature covers."""
     verified = rest.get("/v1/audit/verify").json
     assert verified["ok"] is True
     assert verified["records"] > 0
@@ -150,13 +150,14 @@ def test_an_export_over_rest_is_verifiable(appliance: Appliance, rest: Rest, tmp
 
 
 def _record(line: str) -> dict[str, Any]:
-    """Return a line of an export without its position in the chain, to which each checkpoint adds."""
+    """Return a line of an export without its position in the chain, which each new checkpoint extends."""
     return {name: value for name, value in json.loads(line).items() if name != "chain"}
 
 
 def test_calls_of_rest_are_recorded(rest: Rest) -> None:
-    """Each call is recorded with caller, method, path and status; of five equal reads the first in full, the others
-    as sums.
+    """Each call is recorded with caller, method, path and status.
+
+    The first of five equal reads is recorded in full, the others as sums.
     """
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/graph")
     next(events)
@@ -192,7 +193,7 @@ def test_changes_over_rest_are_never_folded(rest: Rest) -> None:
 
 
 def test_an_error_in_a_draft_is_not_a_denial(rest: Rest) -> None:
-    """The console's checks of a draft are not denials: neither a dry run nor a question is a change."""
+    """The console's checks of a draft are not recorded as denials, because a dry run or a question changes nothing."""
     events = rest.events("/v1/audit/stream?event=rest%20call&resource=/v1/policy*")
     next(events)
     draft = {"text": "[Nodes]\nbogus\n"}
@@ -254,8 +255,9 @@ def test_search_takes_the_filters_of_the_command(rest: Rest) -> None:
 
 
 def test_followers_have_a_quota_of_streams(appliance: Appliance, rest: Rest) -> None:
-    """A viewer's token gets six of sixteen streams, then an error; an admin can still follow, and closed streams
-    free slots.
+    """A viewer's token gets six of sixteen streams, then an error.
+
+    An admin can still follow, and closed streams free their slots.
     """
     made = appliance.rosrv("token", "add", "greedy", "--role", "viewer", "--json").stdout
     admin, rest = rest, rest.with_token(json.loads(made)["token"])

@@ -1,6 +1,6 @@
-"""Examples of the contract: an appliance accepts the bodies, and its answers have the form of the shown ones.
+"""Examples of the contract: the appliance accepts the example bodies, and its answers have the form of the examples.
 
-tests/unit/api/test_contract.py checks that each fits its schema and that none is missing.
+tests/unit/api/test_contract.py checks that each example fits its schema and that no example is missing.
 """
 
 import json
@@ -55,7 +55,7 @@ def asked(rest: Rest, call: str, body: Any = None) -> Any:
 
 
 def differences(given: Any, shown: Any, place: str, *, whole: bool = True) -> list[str]:
-    """Return where an answer differs from the form of an example; extra fields may appear below its own."""
+    """Return the places where an answer differs from the form of an example; extra fields may appear below them."""
     if isinstance(given, dict) and isinstance(shown, dict):
         nowhen = {f"{name}_utc" for one in (given, shown) for name, value in one.items() if value is None}
         found = [f"{place}: {name}" for name in (given.keys() ^ shown.keys()) - nowhen if whole]
@@ -116,7 +116,7 @@ def test_answers_are_as_the_contract_shows_them(rest: Rest) -> None:
 
 
 def test_the_bodies_of_the_contract_are_accepted(rest: Rest) -> None:
-    """Each body is sent as the contract shows it, and answered as it shows."""
+    """Each body is sent as in the contract, and its answer is as in the contract."""
     found = [
         line
         for call, body, kind in BODIES
@@ -126,7 +126,7 @@ def test_the_bodies_of_the_contract_are_accepted(rest: Rest) -> None:
 
 
 def test_a_difference_would_be_found() -> None:
-    """The tests above can fail."""
+    """A wrong example would make the tests above fail."""
     shown = {"a": 1, "b": [{"c": "x"}]}
     assert differences({"a": 2.0, "b": [{"c": None}]}, shown, "") == []
     assert sorted(differences({"a": "1", "b": [{"c": 1}]}, shown, "")) == [

@@ -109,13 +109,13 @@ def test_renewal_outside_a_tunnel_is_refused(running: Appliance, nobody: Rest) -
 
 
 def test_the_authority_and_its_list_are_public(nobody: Rest) -> None:
-    """Every holder of an old list can get a new one."""
+    """Every holder of an old list of revocations can get a new one."""
     assert nobody.get("/v1/authority").body.startswith(b"-----BEGIN CERTIFICATE-----")
     assert nobody.get("/v1/revocations").body.startswith(b"-----BEGIN X509 CRL-----")
 
 
 def test_checked_ports_of_a_machine(rest: Rest, operator: Rest, viewer: Rest) -> None:
-    """Operators set it, viewers see it, and it changes the ETag; an unknown name is refused."""
+    """Operators set the checked ports, viewers see them, and they change the ETag; an unknown name is refused."""
     before = rest.get("/v1/hosts").etag
     told = {"state": "open", "open": [40001, 40000]}
     answer = put(operator, "/v1/hosts/10.0.0.7/ports", told, match=before)
@@ -128,7 +128,7 @@ def test_checked_ports_of_a_machine(rest: Rest, operator: Rest, viewer: Rest) ->
 
 
 def test_reload_of_hosts_yaml(operator: Rest) -> None:
-    """Without a file no host is declared and no host diverges."""
+    """Without a file, no host is declared and no host diverges from the file."""
     answer = operator.post("/v1/hosts/reload", match="*")
     assert answer.status == 200, answer.body
     assert (answer.json["declared"], answer.json["divergence"]) == ([], [])

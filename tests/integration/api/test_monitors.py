@@ -1,4 +1,4 @@
-"""Monitors over REST: loaded, tried, replaced, switched and removed while the appliance runs."""
+"""Monitors over REST: dry run, load, replace, switch and remove while the appliance runs."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide it without specifications, and with the log of this test only."""
+    """Provide the appliance without specifications, and with only this test's log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "reload", "--prune")
@@ -144,7 +144,7 @@ def test_a_rollback_and_a_confirmed_load(appliance: Appliance) -> None:
 
 
 def test_without_a_folder_a_reload_is_an_error(without_folder: Appliance) -> None:
-    """No monitor is removed, by command or over REST, and the error says how to have a folder."""
+    """No monitor is removed, by command or over REST, and the error says how to configure a folder."""
     rest = without_folder.rest()
     assert load(rest, {"speed.rv": LIMIT}).status == 200
     done = without_folder.rosrv("monitor", "reload", check=False)
@@ -156,7 +156,7 @@ def test_without_a_folder_a_reload_is_an_error(without_folder: Appliance) -> Non
 
 
 def test_one_monitor_is_shown_in_detail(appliance: Appliance) -> None:
-    """Text, events, properties, lint, counters; its automaton is a picture; an unknown one is 404."""
+    """The answer has text, events, properties, lint, counters and a picture of the automaton; an unknown one is 404."""
     rest = appliance.rest()
     load(rest, {"speed.rv": LIMIT, "count.rv": OTHER})
     shown = rest.get("/v1/monitors/speed").json
@@ -196,7 +196,7 @@ def test_an_invalid_specification_is_rejected_with_its_place(appliance: Applianc
 
 
 def test_a_stale_etag_cannot_undo_a_switch(appliance: Appliance) -> None:
-    """A stale ETag is 412 with the present one and has no effect, after a switch, a load and a restart."""
+    """A stale ETag gets 412 with the current ETag and has no effect, after a switch, a load and a restart."""
     rest = appliance.rest()
     empty = rest.get("/v1/monitors").etag
     loaded = load(rest, {"speed.rv": LIMIT})
@@ -248,7 +248,7 @@ def test_monitors_are_switched_together_or_not_at_all(appliance: Appliance) -> N
 
 
 def test_a_monitor_is_tried_and_promoted(appliance: Appliance) -> None:
-    """Operators do both; shadow mode survives a restart, and enabling the monitor does not end it."""
+    """Operators can do both; shadow mode survives a restart, and enabling the monitor does not end shadow mode."""
     rest = appliance.rest()
     load(rest, {"speed.rv": LIMIT})
     made = appliance.rosrv("token", "add", "olga", "--role", "operator", "--json").stdout
@@ -280,14 +280,14 @@ def test_a_monitor_is_tried_and_promoted(appliance: Appliance) -> None:
     ],
 )  # fmt: skip
 def test_invalid_loads_are_rejected(without_folder: Appliance, body: object) -> None:
-    """No file, a path as name, a name without `.rv`, an invalid definition or an endless note: 422 with a reason."""
+    """No file, a path as name, a name without `.rv`, an invalid definition or an endless note gives 422."""
     answer = send(without_folder.rest(), "POST", "/v1/monitors", body, "*")
     assert answer.status == 422, answer.body
     assert answer.json["errors"]
 
 
 def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_path: Path) -> None:
-    """A monitor that drops every message of a real talker: its counters rise, and its history has the drops."""
+    """A monitor drops every message of a real talker: its counters rise, and its history has the drops."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rest = appliance.rest()
     load(rest, {"speed.rv": DROPPING, "tally.rv": OTHER.replace("count", "tally")})
@@ -324,7 +324,7 @@ def nested_repetitions(count: int) -> dict[str, str]:
 
 
 def _compiling(appliance: Appliance) -> bool:
-    """Whether the compiler works: it has used more processor time than its start takes."""
+    """Whether the compiler is working, which means that it used more processor time than a start takes."""
     compiler = appliance.processes().get("compiler")
     if compiler is None:
         return False

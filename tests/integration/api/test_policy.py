@@ -1,4 +1,4 @@
-"""Policies over REST: tried, refused, loaded, explained, rolled back, kept over a restart."""
+"""Policies over REST: dry run, refusal, load, explanation, rollback, and survival of a restart."""
 
 import json
 import re
@@ -33,13 +33,13 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def running(common_appliance: Appliance) -> Appliance:
-    """Provide it for tests that change nothing."""
+    """Provide the appliance for tests that change nothing."""
     return common_appliance
 
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide it with the open policy of its file in force, and the log of this test only; the test may change it."""
+    """Provide the appliance with the open policy in force and only this test's log; the test may change the policy."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     cases_of(common_appliance).unlink(missing_ok=True)
@@ -49,7 +49,7 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def cases_of(appliance: Appliance) -> Path:
-    """Return the tests beside its policy."""
+    """Return the path of the tests beside the policy."""
     return Path(f"{appliance.policy_file}.tests.yaml")
 
 
@@ -95,7 +95,10 @@ def call_with(appliance: Appliance, status: int) -> dict[str, Any] | None:
 
 
 def test_an_invalid_policy_is_rejected_with_every_finding(appliance: Appliance) -> None:
-    """Each finding has line and column, the problem those of the first; nothing changes; the refusal is recorded."""
+    """Each finding has line and column, the problem those of the first finding.
+
+    Nothing changes; the refusal is recorded.
+    """
     rest = appliance.rest()
     first = in_force(rest)
     answer = rest.post("/v1/policy", "[Nodes]\ndefault = *\nbogus\n[Publishrs]\n", match=tag(first))
@@ -122,7 +125,7 @@ def loaded_last_by(appliance: Appliance) -> list[str]:
 
 
 def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
-    """It denies from the answer on; the revision has its author; a restart keeps it."""
+    """The policy denies from the answer on; its revision has the author; a restart keeps it."""
     rest = appliance.rest()
     first = in_force(rest)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
@@ -164,7 +167,7 @@ def test_a_dry_run_reports_changes_and_makes_none(appliance: Appliance) -> None:
 def test_a_dry_run_lists_every_revoked_registration(
     appliance: Appliance, living_node: int, tmp_path: Path
 ) -> None:
-    """Live publications, subscriptions, services, calls, parameters; alike over REST and by command."""
+    """Publications, subscriptions, services, calls and parameters are listed, both over REST and by command."""
     node = f"http://127.0.0.1:{living_node}/"
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         answers = [
@@ -231,7 +234,7 @@ def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None
 
 
 def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
-    """A text that fails FILE.tests.yaml is refused with the place of the case, also as a dry run."""
+    """A text that fails FILE.tests.yaml is refused with the position of the case, also as a dry run."""
     cases = cases_of(appliance)
     cases.write_text("cases:\n  - host: 10.0.0.9\n    node: /joy\n    allow: [publish /cmd_vel]\n")
     rest = appliance.rest()
@@ -290,7 +293,7 @@ def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> Non
 
 
 def test_reload_replaces_the_policy_by_the_file(appliance: Appliance) -> None:
-    """The file replaces the policy loaded over REST, which the answer reports; the revision is the disk's again."""
+    """The file replaces the policy loaded over REST, as the answer reports; the file's revision is in force again."""
     rest = appliance.rest()
     first = in_force(rest)
     rest.post("/v1/policy", WITHOUT_PUBLISHERS, match=tag(first))
@@ -351,7 +354,7 @@ def test_an_invalid_body_is_reported(rest: Rest, body: bytes, kind: str, status:
 
 
 def reported(rest: Rest) -> dict[str, Any] | None:
-    """Return the topic /chatter in the graph, once the relay has reported its rate (once a second)."""
+    """Return the topic /chatter in the graph after the relay has reported its rate, which it does once a second."""
     topic: dict[str, Any] = next(
         one for one in rest.get("/v1/graph").json["topics"] if one["name"] == "/chatter"
     )
@@ -359,7 +362,7 @@ def reported(rest: Rest) -> dict[str, Any] | None:
 
 
 def measured(rest: Rest) -> str | None:
-    """Return the metrics, once they have a delay of a message of /chatter."""
+    """Return the metrics after they include the delay of a message on /chatter."""
     metrics = rest.get("/metrics").body.decode()
     counted = re.search(r'rosrv_relay_delay_seconds_count\{resource="/chatter"\} [1-9]', metrics)
     return metrics if counted else None

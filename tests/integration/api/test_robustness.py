@@ -1,4 +1,4 @@
-"""A killed, stopped or flooded api does not affect RVMaster, nor does the death of control end REST."""
+"""A killed, stopped or flooded api does not affect RVMaster, and the death of control does not end REST."""
 
 import os
 import signal
@@ -53,7 +53,7 @@ def until_another(appliance: Appliance, role: str, pid: int) -> None:
 
 
 def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
-    """RVMaster answers all the time and is not restarted; the port stays open: a request waits for the next api."""
+    """RVMaster answers all the time and is not restarted. The port stays open, so a request waits for the next api."""
     rest = appliance.rest()
     assert rest.get("/v1/status").status == 200
     control, api = process_row(appliance, "control"), process_row(appliance, "api")
@@ -63,7 +63,7 @@ def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
         assert rest.get("/v1/status").status in (
             200,
             503,
-        )  # waits in the kernel's queue; 503 until control is connected
+        )  # waits in the kernel's queue; gets 503 until control is connected
         until_another(appliance, "api", pid)
     assert unchanged(appliance, control)
     assert process_row(appliance, "api")["restarts"] == api["restarts"] + 3
@@ -127,7 +127,7 @@ def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
 
 
 def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
-    """As root: its own user may read the log, but neither write it nor read tokens, keys or the state."""
+    """As root: the api's user may read the log, but may not write it, nor read tokens, keys or the state."""
     need_root()
     assert appliance.rest().get("/v1/audit").status == 200
     lines = Path(f"/proc/{appliance.pids('api')[0]}/status").read_text().splitlines()
@@ -155,7 +155,7 @@ def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
 
 
 def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:
-    """With a damaged certificate the log names the problem, and nodes are served; once fixed, REST is back."""
+    """With a damaged certificate, the log names the problem and nodes are served; once it is fixed, REST returns."""
     with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
         appliance.rest()
         appliance.stop()

@@ -1,4 +1,4 @@
-"""Signed requests over REST: by `rosrv`, by a script, and manipulated on the way."""
+"""Signed requests over REST: from `rosrv`, from a script, and manipulated in transit."""
 
 import json
 from collections.abc import Iterator
@@ -67,7 +67,7 @@ def test_a_script_changes_a_policy_without_sending_its_token(running: Appliance)
 
 
 def test_a_manipulated_request_is_refused_and_recorded(running: Appliance) -> None:
-    """Replayed, or with another text, address, condition or call: 403, and recorded."""
+    """A request that is replayed, or has another text, address, condition or call, gets 403 and is recorded."""
     holder = Holder(running)
     text = running.policy_file.read_text() + "\n# once\n"
     used, answer = holder.load(text, "/v1/policy?confirm_within=600")
@@ -96,7 +96,7 @@ def test_a_manipulated_request_is_refused_and_recorded(running: Appliance) -> No
 
 
 def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
-    """A signed request that was intercepted and withheld is refused after a crash of RVMaster."""
+    """A signed request that was intercepted and delayed is refused after a crash of RVMaster."""
     holder = Holder(running)
     text = running.policy_file.read_text() + "\n# kept back\n"
     kept_back = holder.signed(
@@ -119,7 +119,7 @@ def run(appliance: Appliance, *arguments: str) -> dict[str, Any]:
 
 
 def test_with_required_proofs_a_bare_token_only_reads(strict: Appliance) -> None:
-    """Every change with a bare token is 403 with the remedy; reading and `rosrv` over REST work as before."""
+    """Every change with a bare token gets 403 with the remedy; reading, and `rosrv` over REST, work as before."""
     rest = strict.rest()
     text = strict.policy_file.read_text()
     for method, path, body in (

@@ -1,4 +1,4 @@
-"""Access tokens over REST: admins list and revoke them; none can be made."""
+"""Access tokens over REST: admins list and revoke tokens, but cannot create any."""
 
 import json
 
@@ -12,7 +12,7 @@ def made(appliance: Appliance, name: str, role: str) -> str:
 
 
 def test_admins_list_and_revoke_tokens(running: Appliance, rest: Rest) -> None:
-    """The list contains no secret; a revoked token is 401 at once, and the record names the admin."""
+    """The list contains no secret; a revoked token gets 401 at once, and the record names the admin."""
     secret = made(running, "bob", "operator")
     bob = rest.with_token(secret)
     assert bob.get("/v1/whoami").json["role"] == "operator"

@@ -1,5 +1,6 @@
-"""Every verb prints the same over REST (`--api`) and over the state directory (`--state`), with the same exit
-status.
+"""Every verb behaves the same over REST (`--api`) and over the state directory (`--state`).
+
+The output and the exit status are equal.
 """
 
 import json
@@ -77,8 +78,8 @@ LOOKING = [
     ("record", "remove", "a" * 20), ("record", "timeline", "a" * 20), ("monitor", "rollback", "777"),
     ("monitor", "confirm"), ("monitor", "promote", "nobody"),
 ]  # fmt: skip
-# Verbs that other tests run over REST with their preconditions (a recording, a host's key, a policy), and three verbs
-# whose options of these names do not select the appliance.
+# These verbs are tested over REST elsewhere, with their preconditions (a recording, a host's key, a policy). The last
+# three have options with these names that do not select the appliance.
 ELSEWHERE = {
     "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff", "up",
     "selftest", "protect",
@@ -151,7 +152,10 @@ def test_status_has_the_same_fields(appliance: Appliance) -> None:
 
 
 def test_the_log_is_proven_both_ways(appliance: Appliance, tmp_path: Path) -> None:
-    """`audit verify` reports a complete log; it compares a local key or copies with the file only, and says so."""
+    """`audit verify` reports a complete log.
+
+    A local key or copies can be compared only with the file, and the output says so.
+    """
     for way in ("state", "api"):
         done = run(appliance, way, "audit", "verify", "--json")
         assert (done.returncode, done.stderr) == (0, ""), done.stdout
@@ -178,7 +182,7 @@ def test_changing_verbs_print_the_same(
 
 
 def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_path: Path) -> None:
-    """`policy diff` and `policy learn` take the audit log (and the registrations) from either source."""
+    """`policy diff` and `policy learn` read the audit log (and the registrations) from either source."""
     open_policy = tmp_path / "open.ini"
     open_policy.write_text(OPEN_POLICY)
     for verb in (
@@ -192,7 +196,7 @@ def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_pat
 
 
 def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Appliance) -> None:
-    """`token revoke` works both ways, at once; `token add` over REST says where to do it."""
+    """`token revoke` works both ways, at once; `token add` over REST says where to run it."""
     refused = run(appliance, "api", "token", "add", "bob")
     assert refused.returncode == 2
     assert "on the appliance's machine" in refused.stderr
@@ -211,7 +215,7 @@ def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Applian
 
 
 def test_following_survives_a_restart_of_the_api(appliance: Appliance) -> None:
-    """`audit tail --api` prints each later record once after the api was killed, and ends with its token."""
+    """After the api was killed, `audit tail --api` prints each later record once, and ends with its token."""
     made = json.loads(run(appliance, "state", "token", "add", "tail", "--json").stdout)
     certificate = str(appliance.state / "api" / "certificate.pem")
     place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]

@@ -39,7 +39,7 @@ def completed(words: str, state: str) -> list[str]:
 
 
 def test_names_of_the_running_appliance(appliance: Appliance) -> None:
-    """Monitors and tokens are completed from their beginning; a name on the line is not offered again."""
+    """Monitors and tokens are completed from their first letters; a name already on the line is not offered again."""
     state = str(appliance.state)
     assert completed("rosrv monitor disable wo", state) == ["words"]
     assert completed("rosrv monitor disable x", state) == []
@@ -48,5 +48,5 @@ def test_names_of_the_running_appliance(appliance: Appliance) -> None:
 
 
 def test_nothing_where_no_appliance_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Without an appliance there are no names, and no error in the middle of a line."""
+    """Without an appliance there are no names, and no error text inside the command line."""
     assert completed("rosrv monitor disable ", str(tmp_path_factory.mktemp("nobody"))) == []

@@ -1,4 +1,4 @@
-"""`rosrv selftest` against a running appliance tests each part for real, and finds faults."""
+"""`rosrv selftest` tests each part of a running appliance for real, and finds faults."""
 
 import json
 import os
@@ -44,7 +44,7 @@ def failures(found: Rows) -> list[dict[str, str]]:
 
 
 def test_a_message_really_goes_through(appliance: Appliance) -> None:
-    """Both ways a call is answered and recorded, a message passes the relay, and nothing remains."""
+    """Over REST and locally, a call is answered and recorded, a message passes the relay, and nothing remains."""
     for way in ("state", "api"):
         status, found = selftest(appliance, way)
         assert status == 0, failures(found)
@@ -60,7 +60,7 @@ def test_a_message_really_goes_through(appliance: Appliance) -> None:
 
 
 def test_a_strict_policy_is_not_a_failure(appliance: Appliance) -> None:
-    """A denial with its record proves RVMaster; the relay check is skipped, with the policy that would enable it."""
+    """A denial with its record shows that RVMaster works; the relay check is skipped, with the policy that it needs."""
     appliance.reload(STRICT)
     status, found = selftest(appliance)
     assert status == 0, failures(found)
@@ -87,7 +87,7 @@ def test_a_hanging_relay_is_found(appliance: Appliance) -> None:
 
 
 def test_a_missing_appliance_is_a_failure(appliance: Appliance) -> None:
-    """For a named appliance that does not run, the machine is checked, and the missing appliance is reported."""
+    """If a named appliance does not run, the machine is still checked, and the missing appliance is a failure."""
     appliance.stop()
     status, found = selftest(appliance)
     assert status == 1

@@ -1,4 +1,4 @@
-"""Masters on this machine's loopback: fast, and without namespaces."""
+"""Masters on this machine's loopback, without namespaces and therefore fast."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.support.site import Masters, Site
 
 @pytest.fixture(params=["plain", "appliance"])
 def local(request: pytest.FixtureRequest, masters: Masters) -> Iterator[Site]:
-    """Provide a master of either mode: a test runs with both, and promises the same of both."""
+    """Provide a master of either mode: a test runs with both and expects the same of both."""
     with masters.lend(request.param, "loopback") as site:
         yield site
 
@@ -35,7 +35,7 @@ def fakes() -> Iterator[tuple[FakeNodes, FakeNodes]]:
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Site, Site]]:
-    """Start a plain ROS master and an appliance that get the same calls: a master remembers the types of old topics."""
+    """Start a plain ROS master and an appliance that get the same calls, once, because a master remembers old types."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with (
         Site("plain", tmp_path_factory.mktemp("plain")) as plain,

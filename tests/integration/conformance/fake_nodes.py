@@ -1,10 +1,10 @@
-"""Node APIs that tests register: one server, one path per node and life; it keeps the master's calls.
+"""Node APIs that tests register: one server, one path for each node and life; it records the master's calls.
 
     with FakeNodes() as nodes:
         master.registerPublisher("/talker", "/chatter", "std_msgs/String", nodes.uri("talker"))
         nodes.calls("talker", "publisherUpdate")
 
-They answer as real nodes do, so that the appliance, which looks after its nodes, finds them alive.
+They answer as real nodes do, so that the appliance's liveness checks find them alive.
 """
 
 import os
@@ -62,7 +62,7 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
 
 
 class FakeNodes:
-    """The nodes of one master; a context manager."""
+    """The fake nodes of one master, as a context manager."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -82,7 +82,7 @@ class FakeNodes:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
     def all_calls(self) -> list[NodeCalled]:
-        """Return every call so far except `getPid` (a liveness check)."""
+        """Return every call so far except `getPid` (the liveness check)."""
         with self._changed:
             return [one for one in self._calls if one.method != "getPid"]
 

@@ -1,4 +1,4 @@
-"""Start the nodes that only these tests need, as `tests.support.nodes` starts its own."""
+"""Start the nodes that only these tests need, in the same way as `tests.support.nodes`."""
 
 import json
 import subprocess

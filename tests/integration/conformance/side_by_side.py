@@ -3,8 +3,8 @@
     answers = both.call("registerPublisher", "/talker", "/chatter", "std_msgs/String", Api("talker"))
     assert answers.plain == answers.appliance
 
-Only URIs and ids may differ by design, and only they are replaced here: each URI becomes the name of the node behind
-it. `Api` and `ServiceApi` stand for URIs of fake nodes; each master has its own fake nodes.
+Only URIs and ids may differ by design, and only these are replaced here: each URI becomes the name of its node. `Api`
+and `ServiceApi` stand for URIs of fake nodes; each master has its own fake nodes.
 """
 
 import itertools
@@ -65,7 +65,7 @@ class MasterSide:
     def __init__(self, uri: str, nodes: FakeNodes) -> None:
         self.uri = uri.rstrip("/")
         self.nodes = nodes
-        # In the URIs: a node that was replaced in one test is a new one in the next.
+        # Used in the URIs, so that a node replaced in one test is new in the next.
         self.epoch = next(_EPOCHS)
         self._server = xmlrpc.client.ServerProxy(uri, allow_none=True)
         rosout = self.call("lookupNode", [TESTER, "/rosout"])[2]
@@ -129,7 +129,7 @@ class MasterSide:
 
 
 class BothMasters:
-    """The pair; `reset` undoes registrations and parameters."""
+    """The two masters; `reset` undoes registrations and parameters."""
 
     def __init__(self, plain: MasterSide, appliance: MasterSide) -> None:
         self.plain, self.appliance = plain, appliance
@@ -139,7 +139,7 @@ class BothMasters:
         self.reset()
 
     def call(self, method: str, *params: Any) -> Answers:
-        """Call both."""
+        """Make the same call to both masters."""
         plain, appliance = self.plain.call(method, params), self.appliance.call(method, params)
         if method in _UNDO and isinstance(plain, list) and plain[0] == 1:
             undo, positions = _UNDO[method]
@@ -159,7 +159,7 @@ class BothMasters:
         return told
 
     def reset(self) -> None:
-        """Undo everything."""
+        """Undo all registrations and parameters."""
         for method, params in reversed(self._registered):
             self.plain.call(method, params)
             self.appliance.call(method, params)
@@ -173,8 +173,8 @@ class BothMasters:
 def differences(answers: Answers) -> list[str]:
     """Return the differences that a client library would notice: code, type and content of the value, message.
 
-    The text about an invalid parameter may differ; the named parameter may not. A plain master answers some errors with
-    0 whatever the call returns, the appliance with an empty value of the returned type.
+    The text about an invalid parameter may differ; the named parameter may not. For some errors a plain master returns
+    0 whatever the call's type is; the appliance returns an empty value of that type.
     """
     plain, appliance = answers.plain, answers.appliance
     if isinstance(plain, Fault) or isinstance(appliance, Fault):
@@ -193,8 +193,9 @@ def differences(answers: Answers) -> list[str]:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether both are equal, including types and the order of keys (`1` is not `True` or `1.0`; `nan` equals
-    `nan`).
+    """Whether both are equal, including types and the order of keys.
+
+    `1` differs from `True` and `1.0`; `nan` equals `nan`.
     """
     if type(one) is not type(other):
         return False

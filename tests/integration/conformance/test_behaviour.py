@@ -1,4 +1,4 @@
-"""Robots' behaviour beyond talking and listening works behind the appliance as behind a plain master."""
+"""Behind the appliance, robots can do more than talk and listen, as behind a plain master."""
 
 import itertools
 import signal
@@ -27,7 +27,7 @@ def texts(node: Process) -> list[str]:
 
 
 def test_own_topic_rospy(ros: RosSession) -> None:
-    """A rospy node that publishes and subscribes one topic receives its own messages once and the other node's."""
+    """A rospy node that publishes and subscribes to one topic gets its own messages once, and the other node's."""
     node = rospy_node(ros, "orders", "loop")
     order(node, "subscribe", topic="/loop")
     order(node, "advertise", topic="/loop")
@@ -50,7 +50,7 @@ def test_own_topic_rospy(ros: RosSession) -> None:
 
 
 def test_own_topic_roscpp(ros: RosSession) -> None:
-    """A roscpp node, which receives its own messages within its process, does the same."""
+    """A roscpp node, which gets its own messages inside its process, behaves in the same way."""
     node = roscpp_node(ros, "loop", "loop", "/loop")
     ros.talker("rospy", "/loop", "--text", "other", name="other")
     ear = ros.listener("rospy", "/loop")
@@ -110,12 +110,12 @@ def test_killed_node_is_replaced(ros: RosSession) -> None:
 
 
 def test_actions(ros: RosSession) -> None:
-    """With actionlib, a goal is reached and another one cancelled."""
+    """With actionlib, one goal is reached and another is cancelled."""
     rospy_node(ros, "action_server", "counter")
     client = rospy_node(ros, "action_client", "asker")
     assert client.wait_for(event="reached")["result"] == 5
     cancelled = client.wait_for(event="cancelled")
-    assert (cancelled["state"], cancelled["feedback"] > 0) == (2, True)  # PREEMPTED
+    assert (cancelled["state"], cancelled["feedback"] > 0) == (2, True)  # the goal's status is PREEMPTED
     assert client.wait() == 0
 
 
@@ -175,7 +175,7 @@ def test_anonymous_and_remapped_names(ros: RosSession) -> None:
 
 
 def test_wrong_type_is_not_connected(ros: RosSession) -> None:
-    """A publisher of another type is ignored without disturbance; one of the right type is received."""
+    """A publisher of another type is ignored and disturbs no one; a publisher of the right type is received."""
     ros.talker("roscpp", "/typed", name="right")
     wrong = ros.start(["rostopic", "pub", "-r", "10", "/typed", "std_msgs/Bool", "true"])
     ear = ros.listener("rospy", "/typed")
@@ -203,8 +203,9 @@ LAUNCH = """\
 
 
 def robot_package(workspace: Path) -> Path:
-    """Make a package `robot` with talkers and listeners of both client libraries and a launch file, and return its
-    path.
+    """Make a package `robot` and return its path.
+
+    The package has talkers and listeners of both client libraries, and a launch file.
     """
     package = workspace / "robot"
     package.mkdir(parents=True)
@@ -223,7 +224,7 @@ def robot_package(workspace: Path) -> Path:
 
 
 def test_launch_file(ros: RosSession, tmp_path: Path) -> None:
-    """Use roslaunch with arguments, parameters, namespaces, remappings, anonymous names, respawn, and a clean end."""
+    """roslaunch works with arguments, parameters, namespaces, remappings, anonymous names, respawn, and a clean end."""
     file = robot_package(tmp_path / "workspace")
     launch = ros.start(
         ["roslaunch", "--wait", str(file), "text:=told"], ROS_PACKAGE_PATH=str(tmp_path / "workspace")
@@ -246,7 +247,7 @@ def test_launch_file(ros: RosSession, tmp_path: Path) -> None:
 
 
 def test_hundred_nodes_of_ten_topics(local: Site) -> None:
-    """100 nodes that publish and subscribe 10 topics each as fast as they can: all are connected, in order."""
+    """100 nodes publish and subscribe to 10 topics each as fast as they can: all get connected, in order."""
     with FakeNodes() as nodes, ServerProxy(local.master_uri) as server:
         master: Any = server
         start = time.monotonic()
@@ -278,6 +279,6 @@ def test_hundred_nodes_of_ten_topics(local: Site) -> None:
 
 
 def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
-    """Return the subscribers that know a publisher, by an update or from their registration, each with its topic."""
+    """Return the subscribers that know a publisher, from an update or from their registration, each with its topic."""
     told = {(call.node, call.params[1]) for call in nodes.all_calls() if call.method == "publisherUpdate"}
     return told | {("n99", f"/n0/t{topic}") for topic in range(10)}

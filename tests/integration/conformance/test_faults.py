@@ -1,8 +1,8 @@
-"""A process of the appliance dies or hangs while a robot works: the robot goes on without restarting a node.
+"""A process of the appliance dies or hangs while a robot works: no node of the robot has to be restarted.
 
-The robot has rospy and roscpp nodes: every subscriber hears every publisher, every client calls every service, and
-both libraries watch parameters. After each fault everything flows again (the gap is printed, `pytest -rP`), no
-registration or parameter is missing, and the audit log is complete.
+The robot has rospy and roscpp nodes: every subscriber receives every publisher, every client calls every service, and
+both libraries watch parameters. After each fault all traffic resumes (`pytest -rP` prints the gap), no registration or
+parameter is missing, and the audit log is complete.
 """
 
 import json
@@ -33,7 +33,7 @@ TREE = {"arm": {"speed": 0.5, "joints": [1, 2, 3], "names": {"left": "l", "right
 
 @dataclass
 class RobotAtWork:
-    """The robot, its appliance, and the observed state."""
+    """The robot, its appliance, and the state recorded before each fault."""
 
     appliance: Appliance
     voices: dict[str, Process]
@@ -45,7 +45,7 @@ class RobotAtWork:
 
     @classmethod
     def started(cls, appliance: Appliance, ros: RosSession) -> Self:
-        """Return all nodes, once every subscriber hears every publisher."""
+        """Return all nodes, once every subscriber receives every publisher."""
         voices = {
             f"/{by}_voice": ros.talker(by, "/chatter", "--rate", "50", name=f"{by}_voice") for by in CLIENTS
         }
@@ -90,7 +90,7 @@ class RobotAtWork:
             return str(master.lookupNode("/test", "/rosout")[2])
 
     def flows_again(self) -> dict[str, float]:
-        """Wait until everything works; return for each kind of traffic the seconds of the slowest pair."""
+        """Wait until everything works again; for each kind of traffic, return the seconds of the slowest pair."""
         start = time.monotonic()
         sent = {name: voice.seen(event="sent")[-1:] for name, voice in self.voices.items()}
         for ear in self.ears:
@@ -111,12 +111,12 @@ class RobotAtWork:
 
 
 def _later(name: str, number: int, event: dict[str, Any]) -> bool:
-    """Whether it is a message that `name` sent after its message `number`."""
+    """Whether the message is from `name` and later than its message `number`."""
     return event.get("publisher") == name and int(event["data"].split()[-1]) > number
 
 
 def _ask_until_answered(asker: Process) -> None:
-    """Repeat a call: the one in progress may fail, the next ones are answered."""
+    """Repeat a call until it is answered: the call in progress may fail, the next ones must not."""
     deadline = time.monotonic() + LIMIT
     while True:
         mark = asker.mark()
@@ -132,7 +132,7 @@ def _ask_until_answered(asker: Process) -> None:
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
-    """Run one appliance and one robot for the whole module, so that damage of one fault shows in the next test."""
+    """Run one appliance and one robot for the whole module, so that damage from one fault shows in later tests."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     home: Path = tmp_path_factory.mktemp("robot")
@@ -143,7 +143,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotAtWork]:
 
 @pytest.fixture
 def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
-    """Return a check to call with the fault's name right after it: everything flows, is registered, is recorded."""
+    """Return a check to call with the fault's name right after it: traffic, registrations and records are complete."""
     before, rosout = robot.state(), robot.rosout()
 
     def check(fault: str) -> None:
@@ -160,7 +160,7 @@ def unharmed(robot: RobotAtWork) -> Iterator[Callable[[str], None]]:
 
 
 def _wait_for_state(robot: RobotAtWork, wanted: Any) -> None:
-    """Wait until the graph is as before: a new aggregator registers when it is up."""
+    """Wait until the graph is as before; a new aggregator registers once it runs."""
     await_node(robot.appliance.master_uri, robot.appliance.host, "/rosout")
     eventually(lambda: robot.state()[0] == wanted, lambda: f"{wanted}; it is {robot.state()[0]}")
 
@@ -185,14 +185,14 @@ def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
 
 @pytest.mark.parametrize("role", KILLED)
 def test_killed(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """SIGKILL to one process."""
+    """SIGKILL one process."""
     strike(robot, signal.SIGKILL, role)
     unharmed(f"{role} killed")
 
 
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """SIGKILL also to the successor, as soon as it runs."""
+    """SIGKILL a process, and its successor as soon as it runs."""
     first = processes(robot)[role]
     os.kill(first, signal.SIGKILL)
 
@@ -215,7 +215,7 @@ def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role:
     ids=" and ".join,
 )
 def test_killed_at_once(robot: RobotAtWork, unharmed: Callable[[str], None], roles: tuple[str, ...]) -> None:
-    """SIGKILL to several at once."""
+    """SIGKILL several processes at once."""
     strike(robot, signal.SIGKILL, *roles)
     unharmed(f"{' and '.join(roles)} killed")
 

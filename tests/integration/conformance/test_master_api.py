@@ -262,7 +262,7 @@ def test_wrong_arguments(both: BothMasters, step: Step) -> None:
 
 @pytest.mark.parametrize("name", SEQUENCES)
 def test_sequence(both: BothMasters, name: str) -> None:
-    """Every call of the sequence is answered alike, and the whole state is the same after each."""
+    """Both masters answer every call of the sequence alike, and have the same whole state after each."""
     for step in SEQUENCES[name]:
         assert differences(both.call(*step)) == [], step
         assert differences(both.call("getSystemState", TESTER)) == [], f"the state after {step}"
@@ -291,8 +291,8 @@ def test_nodes_get_the_same_updates(both: BothMasters) -> None:
         ("unregisterPublisher", "/talker", "/chatter", TALKER),
     ):
         assert differences(both.call(*step)) == []
-        # `rosmaster` sends its updates later, in a thread: a change right afterwards is included in the value of the
-        # earlier one.
+        # `rosmaster` sends its updates later, in a thread, so the value of an update may already include the next
+        # change.
         changes += step[0] in {"setParam", "deleteParam"} and step[1] == TESTER
         for side in (both.plain, both.appliance):
             assert side.nodes.wait_until(partial(updated, side, changes))
@@ -312,7 +312,7 @@ def test_nodes_get_the_same_updates(both: BothMasters) -> None:
 
 
 def test_own_address(both: BothMasters) -> None:
-    """`getUri` is the address by which the caller knows the master; `getPid` a process id."""
+    """`getUri` returns the address by which the caller knows the master; `getPid` returns a process id."""
     assert both.call("getUri", TESTER).appliance == [1, "", "<master>"]
     assert both.appliance.call("getUri", [TESTER])[2] == both.appliance.uri + "/"
     answers = both.call("getPid", TESTER)
@@ -367,7 +367,7 @@ def test_multicall(both: BothMasters) -> None:
     [(), (5,), ([5],), ([{}],), ([{"methodName": "getPid"}],), ([{"methodName": "getPid", "params": 5}],)],
 )
 def test_multicall_with_malformed_parts(both: BothMasters, given: tuple[Any, ...]) -> None:
-    """A malformed list of calls is an error of its sender (whole, or in one part) only."""
+    """A malformed list of calls, or one malformed part, is an error only for its sender."""
     answers = both.call("system.multicall", *given)
     wrong = answers.appliance[0] == -1 or all("faultCode" in part for part in answers.appliance)
     assert wrong, answers

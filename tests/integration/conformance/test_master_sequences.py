@@ -1,4 +1,4 @@
-"""Any sequence of Master API calls is answered as by a plain ROS master, and leaves the same state.
+"""Any sequence of Master API calls gets the answers of a plain ROS master, and leaves the same state.
 
 Hypothesis makes the sequences from few names, so that nodes, topics and keys collide; the seed is fixed.
 """
@@ -39,7 +39,7 @@ WRONG: st.SearchStrategy[Any] = st.sampled_from([None, "", 5, True, [], {}, ["/c
 
 @st.composite
 def node_with_api(draw: st.DrawFn) -> tuple[str, Api]:
-    """Generate a node's name and an API URI that is (nearly always) its own."""
+    """Generate a node's name, and an API URI that nearly always belongs to this node alone."""
     node = draw(NODES)
     return node, Api(node.rpartition("/")[2])
 

@@ -1,4 +1,4 @@
-"""A rospy node answers its callers alike through a plain master and through the appliance.
+"""A rospy node gives its callers the same answers through a plain master and through the appliance.
 
 Differences by design: URIs and process ids (only their form is compared), the numbers of connections, and the
 text about an invalid parameter, as in `side_by_side`.
@@ -60,8 +60,9 @@ SERVED: tuple[tuple[Any, ...], ...] = (
 
 @pytest.fixture(scope="module")
 def pair(masters: Masters, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
-    """Return the URIs by a plain master and by the appliance of a node that publishes /chatter and subscribes
-    /heard.
+    """Return the URIs of a node that publishes /chatter and subscribes to /heard.
+
+    The first is by a plain master, the second by the appliance.
     """
     with (
         masters.lend("plain", "loopback") as plain,
@@ -91,14 +92,14 @@ def formed(answer: Any) -> Any:
 
 
 def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
-    """Make the same call to both, and remove differences by design."""
+    """Make the same call through both masters, and remove differences by design."""
     plain, appliance = (formed(call_on(ThisMachine(), uri, *step)) for uri in pair)
     return Answers(plain, appliance)
 
 
 @pytest.mark.parametrize("step", ERRORS, ids=repr)
 def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    """An error of the caller is answered with -1 and an empty value, by the appliance as by rospy."""
+    """A caller's error gets -1 and an empty value, from the appliance as from rospy."""
     answers = asked(pair, step)
     assert answers.plain[0] == -1
     found = differences(answers)
@@ -115,7 +116,7 @@ def test_a_call_that_is_served(pair: tuple[str, str], step: tuple[Any, ...]) -> 
 
 @pytest.mark.parametrize("method", ["getBusInfo", "getBusStats"])
 def test_connection_information(pair: tuple[str, str], method: str) -> None:
-    """Connections change at any time, so code, text and only the form of the value are compared."""
+    """Connections change at any time, so only the form of the value is compared, with code and text."""
     answers = asked(pair, (method, TESTER))
     assert answers.plain[:2] == answers.appliance[:2]
     assert len(answers.plain) == len(answers.appliance) == 3
@@ -135,9 +136,7 @@ def test_malformed_protocols(pair: tuple[str, str], protocols: Any) -> None:
 
 @pytest.mark.parametrize("protocols", [[["UDPROS"]], [[]]], ids=repr)
 def test_no_protocol_in_common(pair: tuple[str, str], protocols: list[Any]) -> None:
-    """Without a common protocol the answer is 0, not a caller's error; the appliance lists the offered and relayed
-    ones.
-    """
+    """Without a common protocol the answer is 0, not a caller's error; the appliance lists offered and relayed ones."""
     answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
     assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (0, [])
     assert "relays only TCPROS" in answers.appliance[1]

@@ -1,4 +1,4 @@
-"""The parameter server answers as a plain ROS master: values, trees, scopes, the upward search, watchers.
+"""The parameter server answers as a plain ROS master does: values, trees, scopes, upward search and watchers.
 
 The cases follow ROS's own test of its parameter server (ros_comm, test_rosmaster).
 """
@@ -104,7 +104,7 @@ def test_tree(both: BothMasters) -> None:
 
 
 def test_scopes(both: BothMasters) -> None:
-    """A relative key is in the caller's namespace, a private one in the caller's name, without a search."""
+    """A relative key is in the caller's namespace and a private key in the caller's name; neither is searched for."""
     compare(
         both,
         ("setParam", "/down/one/two/node", "depth", 3),
@@ -149,7 +149,7 @@ def test_search(both: BothMasters) -> None:
 
 
 def test_search_for_a_private_name(both: BothMasters) -> None:
-    """A private name cannot be searched for: an error on both (a plain master reports an internal error)."""
+    """Searching for a private name is an error on both masters (a plain master reports an internal error)."""
     answers = both.call("searchParam", TESTER, "~param")
     assert (answers.plain[0], answers.appliance[0]) == (0, -1)
 
@@ -175,7 +175,7 @@ def test_watchers_get_the_same_updates(both: BothMasters, watched: str) -> None:
             ("setParam", TESTER, "/arm/speed", 10),
         )
     ):
-        # A plain master sends the current tree when it sends: wait for that before the next change.
+        # A plain master sends the tree as it is when it sends; so wait for the update before the next change.
         compare(both, step, ("setParam", TESTER, "/settled", number))
         for side in (both.plain, both.appliance):
             assert side.nodes.wait_until(lambda side=side, number=number: _has_settled(side, number))  # type: ignore[misc]  # mypy does not infer a lambda with defaults
@@ -228,7 +228,7 @@ def test_watchers_get_the_same_updates_of_any_sequence(both: BothMasters, steps:
 
 
 def _is_told(side: MasterSide, node: str, number: int) -> bool:
-    """Whether the node got the update that sets `/settled` to `number`; all earlier updates have come before it."""
+    """Whether the node got the update that sets `/settled` to `number`; all earlier updates then have arrived."""
     return any(
         call.node.startswith(f"{node}-") and call.params[1:] == ("/settled/", number)
         for call in side.nodes.all_calls()
@@ -236,7 +236,7 @@ def _is_told(side: MasterSide, node: str, number: int) -> bool:
 
 
 def _sorted(told: dict[str, list[Any]]) -> dict[str, list[str]]:
-    """Sort the updates of one write, which have no order."""
+    """Sort the updates of one write, whose order has no meaning."""
     return {node: sorted(map(repr, calls)) for node, calls in told.items()}
 
 

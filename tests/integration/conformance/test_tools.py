@@ -1,4 +1,4 @@
-"""The tools of ROS that test_stock_tools.py leaves out print the same for a robot behind the appliance."""
+"""ROS tools that test_stock_tools.py leaves out print the same for a robot behind the appliance."""
 
 import json
 import re
@@ -77,7 +77,7 @@ def test_rosnode_machine_and_list(local: Site, ros: RosSession) -> None:
 
 
 def test_rosnode_kill_all(ros: RosSession) -> None:
-    """`rosnode kill -a` ends every node of the robot; the aggregator is restarted where it is supervised."""
+    """`rosnode kill -a` ends every node of the robot; where the aggregator is supervised, it is restarted."""
     nodes = [
         ros.talker("rospy", "/chatter"),
         ros.listener("roscpp", "/chatter"),
@@ -151,7 +151,7 @@ def test_rosbag_play_with_a_clock(ros: RosSession, tmp_path: Path) -> None:
 @pytest.mark.parametrize("local", ["appliance"], indirect=True)  # not reached behind a plain master
 @pytest.mark.parametrize(("how", "value"), [("ROS_HOSTNAME", "nowhere.invalid"), ("ROS_IP", "192.0.2.7")])
 def test_node_with_an_unreachable_address(local: Site, tmp_path: Path, how: str, value: str) -> None:
-    """A node with an unresolvable or wrong address is reached at the address that it called from."""
+    """A node with an unresolvable or wrong address is reached at the source address of its call."""
     with RosSession(local.master_uri, tmp_path) as ros:
         odd = rospy_node(ros, "orders", "odd", **{"ROS_IP": "", how: value})
         order(odd, "advertise", topic="/odd", latch=True)

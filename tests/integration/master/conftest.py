@@ -22,6 +22,6 @@ def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 
 @pytest.fixture
 def field(battlefield: Field) -> Iterator[Field]:
-    """Provide the field for one attack, and assert afterwards that talker and listener went on unharmed."""
+    """Provide the field for one attack, and check afterwards that talker and listener continued unharmed."""
     yield battlefield
     battlefield.unharmed()

@@ -1,7 +1,7 @@
-"""Attacks on the graph from another host, by calls: identity, names, parameters, services, addresses, endpoints.
+"""Attacks on the graph by calls from another host: identity, names, parameters, services, addresses, endpoints.
 
-After each attack the robot's talker and its operator's listener still run (the fixture checks this), the caller has
-the reason in the form that its library expects, and the audit log has the denial with its rule.
+After each attack the robot's talker and its operator's listener still run (the fixture checks this). The caller gets
+the reason in the form of its library, and the audit log has the denial with its rule.
 """
 
 import contextlib
@@ -86,8 +86,9 @@ def graph(battlefield: Field) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
-    """Assert that the answers to the rogue contain no port of `rosmaster`, of a master-side endpoint, or of a real
-    node.
+    """Assert that the answers to the rogue contain no hidden port.
+
+    Ports of `rosmaster`, of master-side endpoints and of real nodes are hidden.
     """
     since = len(field.answers)
     yield
@@ -98,13 +99,13 @@ def no_hidden_port_is_revealed(field: Field) -> Iterator[None]:
         text = answer.decode("latin-1") if isinstance(answer, bytes) else str(answer)
         told = {
             int(port) for port in re.findall(rf"(?<!{ROGUE}):(\d+)\b", text)
-        }  # its own URIs are known to it
+        }  # the rogue knows its own URIs
         assert not told & (hidden | real), f"{method} revealed {told & (hidden | real)}: {text[:500]}"
         assert not re.search(r"\b[0-9a-f]{32}\b", text), f"{method} revealed a key: {text[:500]}"
 
 
 def outer(field: Field, node: str) -> str:
-    """Return the address that the rogue gets for a node."""
+    """Return the address of a node that the rogue gets."""
     code, _text, uri = field.rogue("lookupNode", "/looker", node)
     assert code == 1
     return str(uri)
@@ -158,7 +159,7 @@ def test_takeover_of_a_running_node(field: Field, method: str) -> None:
 
 
 def test_takeover_by_registering_a_service(field: Field) -> None:
-    """Registering a service does not take over the name of a running node either."""
+    """Registering a service also cannot take over the name of a running node."""
     answer = field.rogue("registerService", "/voice", "/shared/s", "rosrpc://10.77.0.66:9", API)
     held = "/voice is held by a running node"
     field.denied(answer, f"{held} of another host", in_record=f"{held} on 10.77.0.10", category="offer")
@@ -199,7 +200,7 @@ def test_topic_request_in_another_nodes_name(field: Field) -> None:
 
 
 def test_late_call_of_a_replaced_node(field: Field) -> None:
-    """A node that was replaced under its name on the same host can neither unregister its successor nor come back."""
+    """A replaced node on the same host can neither unregister its successor under the same name nor return."""
     with (
         Impostor(field.attacker, answering([1, "", 0])) as old,
         Impostor(field.attacker, answering([1, "", 7])) as new,
@@ -208,7 +209,7 @@ def test_late_call_of_a_replaced_node(field: Field) -> None:
             assert (
                 field.rogue("registerPublisher", "/twin", "/shared/twin", "std_msgs/String", one.uri)[0] == 1
             )
-        assert old.called.wait(LIMIT)  # `rosmaster` tells it to shut down, through the appliance
+        assert old.called.wait(LIMIT)  # `rosmaster` orders its shutdown, through the appliance
         assert b"shutdown" in old.requests[-1] or old.called.is_set()
         for method in ("unregisterPublisher", "registerPublisher"):
             parameters = (
@@ -221,7 +222,7 @@ def test_late_call_of_a_replaced_node(field: Field) -> None:
 
 
 def test_unregistering_with_the_real_uri_of_the_victim(field: Field) -> None:
-    """The real URI of a victim does not help an attacker: the caller is identified by its address."""
+    """The real URI of a victim does not help an attacker, because the appliance identifies a caller by its address."""
     uri = field.talker.seen(event="ready")[0]["uri"]
     answer = field.rogue("unregisterPublisher", "/another", "/shared/talk", uri)
     assert answer[:1] == [1]  # "not a registered node" of `rosmaster`
@@ -239,7 +240,7 @@ def part(method: str, *params: Any) -> dict[str, Any]:
 
 
 def test_multicall_is_decided_part_by_part(field: Field) -> None:
-    """Each part of a multicall is decided separately: allowed parts do not let denied ones pass."""
+    """Each part of a multicall is decided separately: allowed parts do not let denied parts pass."""
     answers = field.rogue(
         "system.multicall",
         [
@@ -286,7 +287,7 @@ def test_malformed_multicall(field: Field, parts: Any) -> None:
 
 
 def test_multicall_on_a_nodes_face(field: Field) -> None:
-    """A node serves no multicall, and neither does its endpoint."""
+    """Neither a node nor its endpoint serves multicalls."""
     answer = field.rogue("system.multicall", [part("getPid", "/x")], uri=outer(field, "/shared_voice"))
     field.denied(answer, "'system.multicall' is not a call that is served here")
 
@@ -304,7 +305,7 @@ def test_multicall_on_a_nodes_face(field: Field) -> None:
     ],
 )
 def test_other_spellings_of_a_topic(field: Field, spelling: str, reason: str) -> None:
-    """Every spelling that `rosmaster` takes for `/chatter` is decided as `/chatter`."""
+    """Every spelling that `rosmaster` treats as `/chatter` is decided as `/chatter`."""
     answer = field.rogue("registerPublisher", "/spell" + spelling.replace("/", "_"), spelling,
                          "std_msgs/String", API)  # fmt: skip
     field.denied(answer, reason, rule="[Publishers] default", resource="/chatter")
@@ -395,7 +396,7 @@ def test_parameters_of_other_hosts(field: Field, key: str) -> None:
 
 @pytest.mark.parametrize("key", ["/shared/fixed/x", "/shared//fixed/x/y/"])
 def test_a_value_is_not_replaced_by_setting_a_child(field: Field, key: str) -> None:
-    """Setting a parameter below a value needs the right to write the value, because `rosmaster` replaces it."""
+    """`rosmaster` would replace the value, so setting a parameter below a value needs the right to write that value."""
     assert field.call(field.robot, "setParam", "/looker", "/shared/fixed", 4711)[0] == 1
     answer = field.rogue("setParam", "/writer_below", key, 0)
     field.denied(answer, "", rule="[Parameters] write /shared/fixed", resource="setParam")
@@ -405,9 +406,7 @@ def test_a_value_is_not_replaced_by_setting_a_child(field: Field, key: str) -> N
 
 
 def test_a_right_to_a_key_does_not_cover_its_namespace(field: Field) -> None:
-    """The right to set a key to a value does not cover setting a dictionary or deleting other hosts' parameters
-    below it.
-    """
+    """The right to set a key to a value does not cover a dictionary, or deleting other hosts' parameters below it."""
     assert field.rogue("setParam", "/writer_leaf", "/leaf", 1)[0] == 1
     answer = field.rogue("setParam", "/writer_leaf", "/leaf", {"a": 1})
     field.denied(answer, "", rule="[Parameters] write default", resource="setParam")
@@ -420,7 +419,7 @@ def test_a_right_to_a_key_does_not_cover_its_namespace(field: Field) -> None:
 
 @pytest.mark.parametrize("key", ["/secret/key", "/secret", "/", "//secret/"])
 def test_reading_a_secret(field: Field, key: str) -> None:
-    """Neither the key of a secret nor a namespace that contains it can be read, watched or searched for."""
+    """Neither a secret's key nor a namespace that contains the secret can be read, watched or searched for."""
     for method, parameters in (
         ("getParam", (key,)),
         ("hasParam", (key,)),
@@ -455,7 +454,7 @@ def test_keys_with_slashes_inside_a_value(field: Field) -> None:
 
 @pytest.mark.parametrize("name", ["/limits/speed", "/limits", "~limits", "", "/", "a//b", "a/"])
 def test_a_forged_update(field: Field, name: str) -> None:
-    """Reject an update with a member that is not a relative name: nodes that watch other keys receive nothing."""
+    """Reject an update with a member that is not a relative name, so that watchers of other keys receive nothing."""
     watcher = field.ros.parameters("rospy", name="cautious")
     watcher.wait_for(event="ready")
     field.call(field.robot, "setParam", "/driver", "/limits/speed", 1)
@@ -480,7 +479,7 @@ def test_a_forged_update(field: Field, name: str) -> None:
 
 @pytest.mark.parametrize("value", [None, {"a": None}, [1, [None]], {"a": {"b": [{"c": None}]}}], ids=repr)
 def test_nil_inside_a_value(field: Field, value: Any) -> None:
-    """Reject `<nil/>`, which would break every answer that contains it, for its sender alone."""
+    """Reject `<nil/>` with an error for its sender only; stored, it would break every answer that contains it."""
     answer = field.rogue("setParam", "/writer", "/shared/nil", value)
     assert answer[0] == -1
     assert field.rogue("getParam", "/writer", "/shared")[0] == 1
@@ -502,7 +501,7 @@ def test_a_parameter_tree_that_is_too_deep(field: Field) -> None:
 
 
 def test_integers_beyond_32_bits(field: Field) -> None:
-    """An integer that ROS clients cannot read is a fault for its sender; the connection and other callers go on."""
+    """An integer that ROS clients cannot read is a fault for its sender; the connection and other callers continue."""
     body = (
         "<?xml version='1.0'?><methodCall><methodName>setParam</methodName><params><param><value>/writer</value>"
         "</param><param><value>/shared/big</value></param><param><value><i4>4294967296</i4></value></param></params>"
@@ -654,7 +653,7 @@ def test_service_of_a_third_machine(field: Field) -> None:
 
 @pytest.mark.parametrize("name", ["/listener", "/voice", "", "/caller\x1b[2J", "caller", "/other"])
 def test_forged_name_of_a_service_client(field: Field, name: str) -> None:
-    """A client must call under the name that it used for the lookup; other names are denied and recorded."""
+    """A client must call under the name of its lookup; any other name is denied and recorded."""
     code, _text, uri = field.rogue("lookupService", "/caller", "/shared/negate")
     assert code == 1
     port = int(uri.rpartition(":")[2])
@@ -667,7 +666,7 @@ def test_forged_name_of_a_service_client(field: Field, name: str) -> None:
 
 
 def test_header_that_a_service_receives(field: Field) -> None:
-    """A service sees the looked-up name and ROS's own fields; a probe by another tool gets the same answer."""
+    """A service receives the name of the lookup and ROS's own fields; a probe by another tool gets the same answer."""
     with field.robot.run(lambda: socket.create_server(("10.77.0.10", 0))) as home:
         home.settimeout(LIMIT)
         place = f"rosrpc://10.77.0.10:{home.getsockname()[1]}"
@@ -741,13 +740,13 @@ def test_posing_as_the_master(field: Field, method: str, parameters: tuple[Any, 
 
 
 def test_killing_a_node(field: Field) -> None:
-    """`shutdown` of another host's node needs the command's rule."""
+    """Calling `shutdown` of another host's node needs the rule for this command."""
     answer = field.rogue("shutdown", "/killer", "die", uri=outer(field, "/voice"))
     field.denied(answer, "shutdown", rule="[Commands] shutdown", resource="shutdown")
 
 
 def test_stopping_the_master(field: Field) -> None:
-    """`default` does not grant `shutdown` of the master."""
+    """The `default` rule does not grant `shutdown` of the master."""
     answer = field.rogue("shutdown", "/killer", "die")
     field.denied(answer, "shutdownMaster", resource="shutdownMaster")
 
@@ -772,7 +771,7 @@ def test_topic_without_the_right(field: Field) -> None:
     ids=repr,
 )
 def test_other_protocols(field: Field, protocols: Any, code: int, words: str) -> None:
-    """Only TCPROS is relayed; a request for other protocols, or for none, is answered as by rospy, without a port."""
+    """Only TCPROS is relayed; a request for other protocols, or for none, gets rospy's answer, without a port."""
     answer = field.rogue("requestTopic", "/udp", "/shared/talk", protocols, uri=outer(field, "/shared_voice"))
     assert (answer[0], answer[2]) == (code, [])
     assert words in answer[1]
@@ -797,7 +796,7 @@ def relay_port(field: Field) -> int:
 
 
 def knock(field: Field, port: int, data: bytes) -> bytes:
-    """Return the relay's answer to a connection header: until it closes, or the first bytes."""
+    """Return the relay's first bytes after a connection header, or nothing if it closes."""
     with field.connect(port=port) as sock:
         sock.sendall(data)
         with contextlib.suppress(ConnectionResetError):
@@ -809,7 +808,7 @@ STRING = {"type": "std_msgs/String", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1
 
 
 def test_granted_topic_arrives(field: Field) -> None:
-    """With the permission the connection is served, so the denials below have the intended reason."""
+    """With the permission the connection is served, so the denials in the tests below have the intended reason."""
     answer = knock(field, relay_port(field), header(callerid="/taker", topic="/shared/talk", **STRING))
     assert b"callerid=/shared_voice" in answer
 
@@ -836,9 +835,9 @@ def test_relay_port_without_the_grant(field: Field, fields: dict[str, str]) -> N
 
 
 def test_guessed_relay_port(field: Field) -> None:
-    """A guessed relay port of a victim's node does not help: it has no permission for this host."""
+    """A guessed relay port of a victim's node is useless without a permission for this host."""
     uri = outer(field, "/voice")
-    port = int(uri.rsplit(":", 1)[1].rstrip("/")) + 1  # two ports each
+    port = int(uri.rsplit(":", 1)[1].rstrip("/")) + 1  # two ports for each node
     answer = knock(field, port, header(callerid="/ear", topic="/chatter", **STRING))
     assert b"hello" not in answer
     assert b"callerid=/voice" not in answer
@@ -938,7 +937,7 @@ def redirect(connection: socket.socket, _request: bytes) -> None:
 
 
 def drip(connection: socket.socket, _request: bytes) -> None:
-    """Send a byte now and then, for ever."""
+    """Send one byte at a time, slowly, without end."""
     connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 100000\r\n\r\n")
     pause = threading.Event()
     for _ in range(600):
@@ -956,8 +955,9 @@ def bomb(connection: socket.socket, _request: bytes) -> None:
     "behave", [silent, endless, twice, rubbish, redirect, drip, bomb], ids=lambda one: one.__name__
 )
 def test_misbehaving_node(field: Field, behave: Any) -> None:
-    """A misbehaving node of the rogue harms only itself: its callers get a well-formed answer or, if it gives none,
-    a closed connection, as of a node that does not exist.
+    """A misbehaving node of the rogue harms only itself: its callers get a well-formed answer.
+
+    If the node gives no answer, they get a closed connection, as from a node that does not exist.
     """
     before = field.memory()
     with Impostor(field.attacker, behave) as node:

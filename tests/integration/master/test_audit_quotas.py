@@ -1,6 +1,4 @@
-"""Floods of records from guests and unknown hosts, while the robot works: the log stays small and complete where it
-matters.
-"""
+"""Guests and unknown hosts flood the log while the robot works: it stays small, and keeps the important records."""
 
 import xmlrpc.client
 from collections.abc import Iterator
@@ -42,7 +40,7 @@ def reads(prefix: str) -> list[dict[str, Any]]:
 
 
 def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
-    """A guest that reads without end gets its quota of the log, and is then refused with a reason; the robot is not."""
+    """A guest that reads without end gets its quota of the log and is then refused with a reason; the robot is not."""
     guest, before = siege.crowd.guests[0], log_bytes(siege)
     denied = siege.crowd.call(guest, "setParam", "/flooder", "/limits/speed", 1)
     assert denied[0] == 0
@@ -62,7 +60,7 @@ def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
 
 
 def test_repeated_reads_are_counted(siege: Siege) -> None:
-    """A node that polls a parameter leaves one record of its first read, and a count every ten seconds."""
+    """A node that polls a parameter leaves one record of its first read, and a count for every ten seconds."""
     guest = siege.crowd.guests[1]
     part = {"methodName": "hasParam", "params": ["/poller", "/rosdistro"]}
     answer = siege.crowd.call(guest, "system.multicall", [part] * 2000)
@@ -73,8 +71,9 @@ def test_repeated_reads_are_counted(siege: Siege) -> None:
 
 
 def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> None:
-    """A hundred unknown hosts with varying requests cause few records; each denial of a named host is logged in
-    full.
+    """A hundred unknown hosts with varying requests cause few records.
+
+    Each denial of a named host is recorded in full.
     """
     unknown_hosts, guest = siege.crowd.unknown_hosts, siege.crowd.guests[2]
     for turn in range(4):

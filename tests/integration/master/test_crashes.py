@@ -1,6 +1,4 @@
-"""Processes are killed or stopped while they work, and policies reloaded under load: no confirmed call is lost or
-halved.
-"""
+"""Processes are killed or stopped, and policies reloaded under load: every confirmed call takes full effect."""
 
 import contextlib
 import os
@@ -74,7 +72,7 @@ class Burst:
             assert not thread.is_alive()
 
     def all_there(self) -> None:
-        """Assert that every confirmed node is registered with its parameter, and that none was refused."""
+        """Assert that every confirmed node is registered with its parameter, and that no call was refused."""
         assert not self.failed, self.failed[:3]
         assert len(self.registered) == self._count
         state = self._field.call(self._field.robot, "getSystemState", "/looker")[2]
@@ -87,7 +85,7 @@ class Burst:
 
 @pytest.fixture
 def working(battlefield: Field) -> Iterator[Field]:
-    """Provide the field; afterwards messages flow again (some may have been lost), and a new node can join."""
+    """Provide the field; afterwards messages arrive again (some may be lost), and a new node can join."""
     yield battlefield
     battlefield.listener.wait_for(event="received", since=battlefield.listener.mark())
     late = battlefield.ros.on(battlefield.ocu).listener("rospy", "/chatter")
@@ -97,7 +95,7 @@ def working(battlefield: Field) -> Iterator[Field]:
 
 @pytest.mark.parametrize("role", ["control", "rosmaster", "relay"])
 def test_killed_in_a_burst_of_registrations(working: Field, role: str) -> None:
-    """`kill -9` during many registrations: each confirmed one survives, and none fails."""
+    """`kill -9` during many registrations: each confirmed registration survives, and none fails."""
     pid = working.appliance.pids(role)[0]
     with Burst(working, f"/burst_{role}") as burst:
         os.kill(pid, signal.SIGKILL)
@@ -167,7 +165,7 @@ def test_reloads_under_load(working: Field) -> None:
 
 
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:
-    """After `rosrv up` on the same state, running nodes go on with their parameters, without a restart."""
+    """After `rosrv up` on the same state, running nodes continue with their parameters and are not restarted."""
     field = battlefield
     ears = [
         field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear"),

@@ -1,6 +1,6 @@
-"""Floods from another host: connections, calls, registrations, names, permissions, values. Other hosts hardly notice.
+"""Floods of connections, calls, registrations, names, permissions and values; other hosts hardly notice them.
 
-The policy grants the rogue everything, so the appliance's limits protect the other hosts, not a rule.
+The policy grants the rogue everything, so limits, and not rules, protect the other hosts.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from tests.support.waiting import allowed, eventually
 
 POLICY = OPEN_POLICY
 CONFIGURATION = (
-    "limits: {topics_per_host: 1000}\n"  # fewer than by default, to reach the limit within seconds
+    "limits: {topics_per_host: 1000}\n"  # lower than by default, to reach the limit within seconds
 )
 HOST = "10.77.0.66"
 SLOW = 1.0  # seconds for one call of the victim during a flood, on an idle machine
@@ -82,7 +82,7 @@ def bystander(field: Field, calls: int = 30) -> float:
 
 
 def settled(field: Field, role: str, most: int) -> None:
-    """Wait until the memory of a flood is released: requests in progress at its end are still carried out."""
+    """Wait until the memory of a flood is released; requests in progress at the flood's end are still carried out."""
     eventually(lambda: field.memory(role) < most, f"{role} keeps less than {most >> 20} MiB")
 
 
@@ -157,7 +157,7 @@ def test_calls_whose_answers_are_not_read(calm: Field) -> None:
 
 
 def test_connections_closed_before_the_answer(calm: Field) -> None:
-    """Disconnect before the answer, repeatedly."""
+    """Clients repeatedly disconnect before the answer."""
     data = request("getSystemState", "/flooder")
 
     def act(_number: int, _turn: int) -> None:
@@ -187,7 +187,7 @@ def test_bodies_that_never_end(calm: Field) -> None:
 
 
 def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
-    """Slow requests, which query the rogue's own node, do not occupy the slots of other hosts."""
+    """Slow requests that query the rogue's own node do not occupy the slots of other hosts."""
     silence = threading.Event()
     with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
         answer = calm.rogue("registerPublisher", "/black_hole", "/hole", "std_msgs/String", node.uri)
@@ -219,9 +219,9 @@ def test_values_for_a_node_that_never_answers(calm: Field) -> None:
 
 
 def test_registrations(calm: Field) -> None:
-    """Nodes and topics of one host are limited (the rogue stays at its limit from here on); other hosts still get both.
+    """The rogue reaches its limit of nodes and topics, and keeps it in later tests; other hosts still get both.
 
-    The nodes answer: silent ones would be lost, and make room for the next.
+    The rogue's nodes answer: silent nodes would be lost, and make room for the next.
     """
     refused: list[Any] = []
     with Impostor(calm.attacker, answering([1, "", 4711])) as node:
@@ -263,7 +263,7 @@ def test_registrations_of_one_node(calm: Field) -> None:
 
 
 def test_queried_names_do_not_accumulate(calm: Field) -> None:
-    """Ever new names in reading calls and topic requests do not make memory grow."""
+    """New names in reading calls and topic requests, without end, do not make memory grow."""
     face = calm.rogue("lookupNode", "/looker", "/voice")[2]
 
     def act(number: int, turn: int) -> None:
@@ -280,7 +280,7 @@ def test_queried_names_do_not_accumulate(calm: Field) -> None:
 
 
 def test_denials(calm: Field) -> None:
-    """Thousands of denials become a few records with counts."""
+    """Thousands of denials are folded into a few records with counts."""
     parts = [{"methodName": f"noSuch{number}", "params": ["/denied"]} for number in range(5000)]
     calm.rogue("system.multicall", parts)
     calm.recorded(event="denials folded", host=HOST)

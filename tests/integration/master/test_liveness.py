@@ -1,4 +1,4 @@
-"""Decide which nodes are lost."""
+"""Tests of which nodes count as lost."""
 
 import os
 import signal
@@ -74,7 +74,7 @@ def test_a_dead_node_is_noticed_despite_unresponsive_nodes(lab: Lab, robot: Host
 def test_a_paused_subscriber_gets_a_new_publisher_when_it_goes_on(
     lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
-    """After failed updates about a new publisher, a subscriber that was never lost gets the update when it goes on."""
+    """A paused subscriber that missed a new publisher, but was never lost, gets the update when it continues."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     middle = lab.host("appliance", "10.77.0.2/24")
     settings = "limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n"

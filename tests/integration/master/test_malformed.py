@@ -1,6 +1,4 @@
-"""Malformed HTTP and XML on RVMaster's port and on a node's endpoint: rejected and recorded, without effect on
-others.
-"""
+"""Malformed HTTP and XML, sent to RVMaster or a node's endpoint, is rejected and recorded, and affects no other."""
 
 import re
 import zlib
@@ -107,7 +105,10 @@ def test_faults_are_recorded(field: Field) -> None:
 
 @pytest.mark.parametrize("method", ["setParam", "getPid"])
 def test_the_limit_of_values_in_one_request(field: Field, method: str) -> None:
-    """A million values in one request are parsed outside the loop; more are rejected. Other callers do not notice."""
+    """A million values in one request are parsed outside the event loop; larger requests are rejected.
+
+    Other callers do not notice.
+    """
     values = "<value/>" * 1_000_010
     body = CALL.format(method, f"<param><value><array><data>{values}</data></array></value></param>")
     assert b"more than 1000000 values" in field.raw(post(body))
@@ -122,7 +123,7 @@ def test_a_multicall_of_cheap_calls(field: Field) -> None:
         "system.multicall", f"<param><value><array><data>{part * count}</data></array></value></param>"
     )
     with field.connect() as sock:
-        sock.settimeout(4 * LIMIT)  # no time is promised for this answer, only that no other one waits
+        sock.settimeout(4 * LIMIT)  # this answer has no time limit, but no other answer may wait for it
         sock.sendall(post(body))
         field.unharmed(50)
         for number in range(20):
@@ -161,7 +162,7 @@ def test_pipelined_calls(field: Field) -> None:
 
 
 def test_malformed_on_a_nodes_face(field: Field) -> None:
-    """A node's endpoint is equally strict."""
+    """A node's endpoint is as strict as RVMaster's port."""
     uri = field.rogue("lookupNode", "/looker", "/voice")[2]
     port = int(uri.rsplit(":", 1)[1].rstrip("/"))
     assert field.raw(b"GET / HTTP/1.1\r\n\r\n", port=port).split()[1] == b"405"

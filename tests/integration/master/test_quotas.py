@@ -1,4 +1,4 @@
-"""Two hundred addresses take all they can of every limited resource, and the robot does not notice.
+"""Two hundred addresses take as much as they can of every limited resource, and the robot does not notice.
 
 Each test attacks a row of docs/reference/quotas.md. A hundred guests may do everything below `/guest`; a hundred
 unknown hosts may do nothing. Meanwhile the robot publishes, calls services and the master, and starts a node, and the
@@ -28,8 +28,8 @@ relay: {connections: 3000, connections_per_host: 1500}
 limits: {parameter_bytes: 16777216}
 api: 10.77.0.2:8443
 api_networks: [10.77.0.0/16]
-"""  # lower than by default, to reach the limits within seconds; quotas for unknown hosts and reserves in proportion
-LONG_HEADER = struct.pack("<I", 60_000) + bytes(50_000)  # of 60,000 bytes that never come
+"""  # lower than by default, to reach the limits within seconds; other quotas and reserves in proportion
+LONG_HEADER = struct.pack("<I", 60_000) + bytes(50_000)  # each of 60,000 bytes that never arrive
 SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 
 
@@ -57,9 +57,7 @@ def close_connections_first(siege: Siege) -> Iterator[None]:
 
 
 def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
-    """Open more idle connections to RVMaster than there are slots: twelve guests with a full quota each, and all
-    others.
-    """
+    """Guests and unknown hosts open more idle connections to RVMaster than there are slots; twelve use a full quota."""
     crowd = siege.crowd
 
     def attack() -> None:
@@ -72,7 +70,7 @@ def test_connections_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_requests_of_two_hundred_addresses(siege: Siege) -> None:
-    """Send requests from every guest on three connections, twice and without reading, and begin endless bodies."""
+    """Every guest sends requests on three connections, twice and without reading, and begins endless bodies."""
     crowd = siege.crowd
     ask = http_request("getSystemState", "/guest/asker")
     begun = b"POST / HTTP/1.1\r\nContent-Length: 8000000\r\n\r\n" + bytes(60_000)
@@ -81,13 +79,11 @@ def test_requests_of_two_hundred_addresses(siege: Siege) -> None:
         crowd.hold(crowd.guests, 11311, each=3, data=ask * 2)
         crowd.hold([*crowd.guests, *crowd.unknown_hosts], 11311, each=2, data=begun)
 
-    siege.throughout(attack, slowest=3 * SLOW)  # a thousand at once, ahead of the first call
+    siege.throughout(attack, slowest=3 * SLOW)  # a thousand at once, before the first call
 
 
 def test_connections_to_the_relay(siege: Siege) -> None:
-    """Guests take every slot of the relay, served or not, and unknown hosts send half a header: permitted hosts
-    connect.
-    """
+    """Guests take every slot of the relay, and unknown hosts send half a header: permitted hosts still connect."""
     crowd = siege.crowd
     port = max(crowd.subscribe(guest, "/guest/ear", "/voice", "/chatter") for guest in crowd.guests[:12])
     header = encode_header({
@@ -104,7 +100,7 @@ def test_connections_to_the_relay(siege: Siege) -> None:
 
 
 def test_handshakes_with_rest(siege: Siege) -> None:
-    """With five thousand silent connections, a client with a token is served, and the process does not grow."""
+    """Despite five thousand silent connections, a client with a token is served, and the process does not grow."""
     crowd, rest = siege.crowd, siege.ocu.run(siege.appliance.rest)
     before = siege.memory("api")
 
@@ -126,7 +122,7 @@ def test_handshakes_with_rest(siege: Siege) -> None:
 
 
 def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
-    """Guests set and read as many parameters as they can, repeatedly: the robot sets, overwrites and reads."""
+    """Guests repeatedly set and read as many parameters as they can: the robot can still set, overwrite and read."""
     crowd, ending, trees = siege.crowd, threading.Event(), list[int]()
     large, small = "x" * (1 << 18), {f"p{number}": number for number in range(2750)}
 
@@ -171,7 +167,7 @@ def test_parameters_of_two_hundred_addresses(siege: Siege) -> None:
 
 
 def test_ports_and_names(siege: Siege) -> None:
-    """Guests register as many nodes as they may, then unregister all: the robot's nodes still register."""
+    """Guests register as many nodes as they may, then unregister them all: the robot's nodes can still register."""
     crowd = siege.crowd
     with Impostor(crowd.host, answering([1, "", 4711]), address="0.0.0.0") as nodes:
 

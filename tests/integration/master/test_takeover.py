@@ -1,6 +1,6 @@
-"""When a node's machine is gone, a node on another host that the policy allows takes over its name at once.
+"""When a node's machine is gone, a node on another host can take over its name at once if the policy allows.
 
-A ROS 1 node registers only once: after a denial it has to be started again.
+A ROS 1 node registers only once, so it must be restarted after a denial.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 DROPPING = "add table inet gone; add chain inet gone in { type filter hook input priority 0; policy drop; }"
-_NUMBERS = itertools.count(40, 3)  # of the machines of a test
+_NUMBERS = itertools.count(40, 3)  # for the machines of a test
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Pair:
     topic: str
 
     def talker(self, client: Client, host: Host) -> Process:
-        """Start the voice on a host; `ready` when its constructor is done, whatever the master answered."""
+        """Start the voice on a host; `ready` is set when its constructor returns, whatever the master answered."""
         return self.ros.on(host).talker(client, self.topic, "--text", host.name, name=self.voice[1:])
 
     def registered(self) -> Any:
@@ -75,7 +75,7 @@ def dropped(pair: Pair, _voice: Process) -> None:
 
 
 def deleted(pair: Pair, voice: Process) -> None:
-    """Delete the machine and its network without a goodbye."""
+    """Delete the machine and its network without notice."""
     pair.lab.unplug(pair.first)
     voice.popen.send_signal(signal.SIGKILL)
     voice.wait()
@@ -87,23 +87,25 @@ def deleted(pair: Pair, voice: Process) -> None:
 def test_a_vanished_machine_releases_its_names(
     pair: Pair, away: Callable[[Pair, Process], None], client: Client
 ) -> None:
-    """After a loss of cable, power or container, the node on the other machine is heard at its first attempt,
-    before the silent node is lost.
+    """After a loss of cable, power or container, the node on the other machine is heard at its first attempt.
+
+    This holds even before the silent node counts as lost.
     """
     voice = pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
     away(pair, voice)
     pair.talker(client, pair.second)
     pair.ear.wait_for(lambda event: str(event.get("data", "")).startswith("second"))
-    voice.kill()  # it would wait for its master when it is interrupted
+    voice.kill()  # when interrupted, the node would wait for its master
     [taken] = pair.appliance.recorded("--event", "takeover", caller_id=pair.voice)
     lost = pair.appliance.audit("--event", "node lost", caller_id=pair.voice)
     assert [record for record in lost if record["sequence"] < taken["sequence"]] == []
 
 
 def test_a_hanging_node_keeps_its_name_until_it_is_lost(pair: Pair) -> None:
-    """A node that accepts connections without answering keeps its name until it is lost; the refusal says when to
-    retry.
+    """A node that accepts connections but does not answer keeps its name until it is lost.
+
+    The refusal says when to retry.
     """
     voice = pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
@@ -118,11 +120,11 @@ def test_a_hanging_node_keeps_its_name_until_it_is_lost(pair: Pair) -> None:
         withdraw = ("unregisterPublisher", pair.voice, pair.topic, f"http://{pair.second.address}:9/")
         assert call_on(pair.second, pair.appliance.master_uri, *withdraw)[2] == 1
     finally:
-        voice.kill()  # it would go on to publish without its name
+        voice.kill()  # without this, the node would publish without its name
 
 
 def test_a_running_node_keeps_its_name(pair: Pair) -> None:
-    """A node that answers keeps its name: the other one is refused at once, and publishes to no subscriber."""
+    """A node that answers keeps its name: the other node is refused at once, and publishes to no subscriber."""
     pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
     code, why, _ = pair.registered()

@@ -1,4 +1,4 @@
-"""Monitors change and a relay dies under a flood: only dropped messages are missing, and the order is kept."""
+"""Monitors change and a relay dies under a flood: only counted messages are missing, and the order is kept."""
 
 import os
 import signal
@@ -23,11 +23,11 @@ from tests.support.processes import Event, Process
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
-ROUNDS = 25  # of four changes each
+ROUNDS = 25  # four changes in each round
 
 
 def tag(version: int) -> str:
-    """Return a monitor that appends its version to messages on /flood, and drops none."""
+    """Return a monitor that appends its version to messages on /flood, and drops no message."""
     return (
         "tag() { event said(std::string text) /flood std_msgs/String '{data:text}'"
         f' {{ text = text + " v{version}"; }} }}'
@@ -35,7 +35,7 @@ def tag(version: int) -> str:
 
 
 def beside(version: int) -> str:
-    """Return a monitor of another topic and of the latched one, which it changes."""
+    """Return a monitor of another topic and of the latched topic, whose messages it changes."""
     return (
         "beside() { event other(std::string text) /elsewhere std_msgs/String '{data:text}' { }"
         f" event map(std::string text) /map std_msgs/String '{{data:text}}' {{ text = text + \" m{version}\"; }} }}"
@@ -51,7 +51,7 @@ def appliance() -> Iterator[Appliance]:
 
 
 def relays(appliance: Appliance) -> list[int]:
-    """Return the process ids of the relays; `rosrv status` fails while one is away."""
+    """Return the process ids of the relays; `rosrv status` fails while a relay is missing."""
     processes = appliance.ask(StatusWanted()).processes
     return [row.pid for row in processes if row.role == "relay"]
 
@@ -98,7 +98,7 @@ def change(appliance: Appliance, number: int) -> None:
 def test_monitor_changes_under_a_flood_lose_only_counted_messages(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """Fast listeners get everything in order; the missing messages of the others equal the counted drops."""
+    """Fast listeners get everything in order; for other listeners, the missing messages equal the counted drops."""
     ros.talker("roscpp", "/map", "--latch", name="map")
     early = ros.listener("roscpp", "/map")
     early.wait_for(event="received", data="hello 1")
@@ -137,7 +137,7 @@ def test_monitor_changes_under_a_flood_lose_only_counted_messages(
     )
     assert missing(counts[stopped]) > 0
     heard = ros.listener("rospy", "/map").wait_for(event="received")
-    assert heard["data"] == "hello 1"  # it was relayed before there was a monitor
+    assert heard["data"] == "hello 1"  # relayed before there was a monitor
     assert len(early.seen(event="received")) == 1
 
 

@@ -1,4 +1,4 @@
-"""A latched emergency stop survives the death of every process, until an operator releases it."""
+"""A latched emergency stop survives the death of every process until an operator releases it."""
 
 import itertools
 import json
@@ -80,7 +80,7 @@ DEATHS: dict[str, Callable[[Appliance], object]] = {
 
 @pytest.mark.parametrize("death", DEATHS)
 def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: Path, death: str) -> None:
-    """All messages are dropped after it, until it is released."""
+    """After the stop, all messages are dropped until it is released."""
     numbers = itertools.count()
 
     def session() -> RosSession:
@@ -109,7 +109,7 @@ def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: 
 def test_a_changed_stop_holds_until_it_is_resumed(
     stopped: Appliance, common_robot: Host, tmp_path: Path
 ) -> None:
-    """A load that loses the state of a latched stop blocks all messages, and reports which command resumes them."""
+    """A load that would lose a latched stop blocks all messages, and names the command that resumes them."""
     with RosSession(stopped.master_uri, tmp_path, common_robot) as ros:
         listener = ros.listener("roscpp", "/chatter")
         ros.talker("roscpp", "/chatter")

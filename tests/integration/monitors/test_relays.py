@@ -1,4 +1,4 @@
-"""With several relay processes, monitors and topics are distributed, and each relay survives the death of another."""
+"""Several relay processes share monitors and topics, and each relay survives the death of another."""
 
 import json
 import os
@@ -45,9 +45,7 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide a fresh start for a test that loads or kills: both monitors begin again afterwards, with a separate
-    log.
-    """
+    """Provide a fresh start for a test that loads or kills: both monitors begin again, with a separate log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     for name in rows(common_appliance):
@@ -71,7 +69,7 @@ def relay_of(appliance: Appliance, number: int) -> int:
 
 
 def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ros: RosSession) -> None:
-    """Topics of the dead relay go on as after any restart; the monitors of both keep their state."""
+    """Topics of the dead relay continue as after any restart; the monitors of both keep their state."""
     left, right = ros.listener("rospy", "/left"), ros.listener("roscpp", "/right")
     alarms = [ros.listener("rospy", f"/{one}/alarm") for one in ("left", "right")]
     ros.talker("roscpp", "/left", name="one")
@@ -137,7 +135,7 @@ def test_loading_a_specification_across_relays_moves_only_one_monitor(
 def test_services_use_the_relay_of_their_monitor(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """This holds before and after the load, and after the death of control; stored state stays in place."""
+    """Services use it before and after the load, and after the death of control; stored state stays in place."""
     ros.service_server("rospy", "/mode")
     ros.service_server("roscpp", "/other_mode")
     clients = [ros.service_client("roscpp", "/mode"), ros.service_client("rospy", "/other_mode")]
@@ -163,10 +161,10 @@ def test_services_use_the_relay_of_their_monitor(
 def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
     common_appliance: Appliance, tmp_path: Path, client: Client
 ) -> None:
-    """The monitor is connected, and counts as the awaited subscriber, before the real one is.
+    """Before the real subscriber, the monitor is connected and counts as the subscriber that the node waits for.
 
-    A message within a second of the first one reaches the listener. On an overloaded machine a node may need longer, so
-    each listener must get three of twelve; without this second, a roscpp listener gets none.
+    A message within a second of the first one reaches the listener. A node on an overloaded machine may need longer, so
+    each listener must get three of twelve; without this second, a roscpp listener gets no message.
     """
     with RosSession(common_appliance.master_uri, tmp_path) as ros:
         listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]
@@ -189,7 +187,7 @@ def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
 def test_a_new_subscriber_gets_no_old_messages(
     request: pytest.FixtureRequest, masters: Masters, tmp_path: Path, client: Client, master: str
 ) -> None:
-    """A new subscriber gets only messages sent after its start, behind the appliance as on a plain master."""
+    """A new subscriber gets only messages sent after its start, as on a plain master."""
     with ExitStack() as stack:
         if master == "plain":
             uri = stack.enter_context(masters.lend("plain", "loopback")).master_uri

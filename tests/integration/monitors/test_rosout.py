@@ -1,4 +1,4 @@
-"""Output of monitors appears on /rosout, when configured."""
+"""With the setting for it, the output of monitors appears on /rosout."""
 
 from collections.abc import Iterator
 
@@ -28,8 +28,9 @@ def appliance() -> Iterator[Appliance]:
 
 
 def test_output_and_verdicts_reach_rosout_agg(appliance: Appliance, ros: RosSession) -> None:
-    """They are `rosgraph_msgs/Log` of the node /rosrv: the aggregator passes them on to rqt_console and `rostopic
-    echo`.
+    """They are `rosgraph_msgs/Log` of the node /rosrv.
+
+    The aggregator passes them on to rqt_console and `rostopic echo`.
     """
     echo = ros.start(["/usr/bin/rostopic", "echo", "--filter", "m.name == '/rosrv'", "/rosout_agg"])
     assert "/rosrv" in ros.run("/usr/bin/rostopic", "info", "/rosout").stdout

@@ -26,7 +26,7 @@ Record = dict[str, Any]
 
 
 def specification(name: str) -> tuple[Path, ...]:
-    """Return one shipped file."""
+    """Return the text of a shipped specification."""
     return (MONITORS / f"{name}.rv",)
 
 
@@ -97,7 +97,7 @@ def test_obstacle_avoidance() -> None:
 @pytest.mark.parametrize("forward", [0.3, 1.0, 2.0])
 @pytest.mark.parametrize("start", [0.0, 0.4])
 def test_no_speed_and_no_course_touches_the_obstacle(forward: float, start: float) -> None:
-    """The required free distance follows from the speed."""
+    """The required distance grows with the speed."""
     mission = (
         Part(start / 0.4 if start else 0.1, turn=0.1 if start else 0.0),
         Part(30 / forward / 2, forward=forward),
@@ -123,7 +123,7 @@ def test_a_blind_laser_is_an_obstacle() -> None:
 
 
 def test_all_monitors_together(unguarded: Drive) -> None:
-    """Together each shipped monitor guards its own promise, without interference."""
+    """When all shipped monitors are loaded, each guards its own property, and none interferes."""
     guarded = Simulation(SHIPPED).run()
     assert guarded.nearest(OBSTACLE) > 0.3
     assert guarded.farthest() < 20 + SLACK
@@ -179,7 +179,7 @@ def robot(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 
 def told(robot: RosSession, *command: str) -> Record:
-    """Return the output of `command.py`."""
+    """Return the output of the node `command.py`."""
     said = robot.run(PYTHON, str(NODES / "command.py"), *command, timeout=120).stdout
     answer: Record = json.loads(said.splitlines()[-1])
     return answer
@@ -196,7 +196,7 @@ def test_the_running_robot_shoots_only_in_a_safe_pose(appliance: Appliance, robo
 
 
 def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot: RosSession) -> None:
-    """Ordered twice to drive 10 m at 2 m/s with an obstacle 7 m ahead, the robot does not reach it."""
+    """With an obstacle 7 m ahead, the robot is ordered twice to drive 10 m at 2 m/s, and does not reach it."""
     alarm = robot.start(["/usr/bin/rostopic", "echo", "-n", "1", "/landshark/obstacle_alarm"])
     there = told(robot, "drive", "2.0", "0", "5")
     assert 3 < there["x"] < 6.9
@@ -209,7 +209,7 @@ def test_the_running_robot_stops_before_the_obstacle(appliance: Appliance, robot
 
 
 def test_a_verdict_is_a_record(appliance: Appliance, robot: RosSession, tmp_path: Path) -> None:
-    """With the tutorial's lock loaded while the robot runs, the warning, the lock and every verdict are recorded."""
+    """With the tutorial's lock loaded into the running robot, the warning, the lock and every verdict are recorded."""
     page = (ROOT / "docs" / "monitors-tutorial.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```cpp\n(gunPose\(.*?)```", page, re.DOTALL)
     (tmp_path / "gun.rv").write_text(text)

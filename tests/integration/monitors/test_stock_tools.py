@@ -1,4 +1,4 @@
-"""The monitors' publisher is a node of the graph, and the stock tools treat it as any other node."""
+"""The monitors' publisher is a node of the graph; the stock tools treat it as any other node."""
 
 import json
 import re
@@ -64,9 +64,7 @@ def ros(field: tuple[Appliance, Host], tmp_path: Path) -> Iterator[RosSession]:
 
 
 def test_ping_reaches_every_node(ros: RosSession) -> None:
-    """`rosnode ping -a` reaches the robot's nodes, the aggregator and the monitors' node; cleanup finds nothing to
-    do.
-    """
+    """`rosnode ping -a` reaches the nodes of robot, aggregator and monitors; `rosnode cleanup` finds nothing to do."""
     ros.talker("rospy", "/chatter", name="voice")
     pinged = ros.run("rosnode", "ping", "-a").stdout
     shown = ros.run("rosnode", "list").stdout.split()
@@ -94,7 +92,7 @@ def test_the_graph_has_no_bad_node(ros: RosSession) -> None:
 
 
 def test_a_tool_cannot_kill_the_monitors_node(ros: RosSession) -> None:
-    """`shutdown` is denied with the alternative; after `rosnode kill /rosrv` the node publishes as before."""
+    """`shutdown` is denied with an alternative; after `rosnode kill /rosrv` the node still publishes."""
     uri = call_on(ros.host, ros.master_uri, "lookupNode", "/tool", "/rosrv")[2]
     code, why, _ = call_on(ros.host, uri, "shutdown", "/tool", "now")
     assert code == 0

@@ -30,7 +30,7 @@ def refuses(port: int) -> bool:
 
 
 def test_it_reports_that_it_is_ready_and_its_congestion_control(relay: RelayProcess) -> None:
-    """The relay reports the congestion control of its sockets, and its limit of connections."""
+    """The relay reports the congestion control of its sockets and its limit of connections."""
     assert relay.ready.detail["index"] == 0
     assert relay.ready.detail["congestion"] in {"cubic", "reno"}
     assert (
@@ -48,12 +48,12 @@ def test_it_answers_pings_from_its_main_loop(relay: RelayProcess) -> None:
 
 
 def test_stop_ends_it_cleanly(relay: RelayProcess) -> None:
-    """It ends with status 0."""
+    """On `Stop` the relay ends with status 0."""
     assert relay.stop() == 0
 
 
 def test_the_end_of_the_lifeline_ends_it(relay: RelayProcess) -> None:
-    """A relay ends with its supervisor."""
+    """When its supervisor dies, the relay ends."""
     relay.lifeline.close()
     assert relay.process.wait(LIMIT) == 0
 

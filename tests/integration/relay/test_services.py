@@ -15,7 +15,7 @@ BOTH: tuple[Client, Client] = ("rospy", "roscpp")
 
 
 def ask_header(face: Face, fields: dict[str, str]) -> dict[str, str]:
-    """Return the header with which a relay port answers this one."""
+    """Return the header that a relay port sends in answer to this header."""
     with socket.create_connection((LOOPBACK, face.port), timeout=20) as sock:
         sock.sendall(encode_header(fields))
         parser = HeaderParser()
@@ -37,7 +37,7 @@ def _refused(message: object, resource: str) -> bool:
 def test_calls_are_answered(
     driver: RelayDriver, ros: RosSession, server: Client, caller: Client, options: tuple[str, ...]
 ) -> None:
-    """Test every pair of client libraries, with a connection per call and with one for all calls."""
+    """Every pair of client libraries is tested, with a connection for each call and with one for all calls."""
     service = ros.service_server(server, "/mode", name="server")
     client = ros.service_client(caller, "/mode", *options, name="client")
     for count, value in enumerate(("true", "false", "true"), start=1):
@@ -67,7 +67,7 @@ def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession
 def test_a_probe_is_answered_with_the_services_header(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
-    """The relay accepts a probe with an open md5sum, as of a client that waits for a service."""
+    """The relay accepts a probe with any md5sum, as a client sends it while it waits for a service."""
     ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/probe", "service": "/mode", "md5sum": "*", "probe": "1"}
     header = ask_header(driver.faces["/server"], fields)
@@ -78,14 +78,14 @@ def test_a_probe_is_answered_with_the_services_header(
 def test_a_service_of_another_type_answers_with_its_own_error(
     driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
-    """The service's own error header comes back."""
+    """The caller receives the service's own error header."""
     ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/client", "service": "/mode", "md5sum": "0" * 32}
     assert "md5sum" in ask_header(driver.faces["/server"], fields)["error"]
 
 
 def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosSession) -> None:
-    """The error reply of a service that raises reaches the caller."""
+    """If a service raises an exception, its error reply reaches the caller."""
     program = (
         "import rospy\n"
         "from std_srvs.srv import SetBool\n"
@@ -102,7 +102,7 @@ def test_a_failed_call_returns_the_services_error(driver: RelayDriver, ros: RosS
 
 
 def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSession) -> None:
-    """The client gets an error header, and control a report; missing services are handled the same way."""
+    """The client gets an error header, and control a report; a missing service is handled the same way."""
     ros.service_server("rospy", "/mode", name="server")
     face = driver.faces["/server"]
     driver.link.send(ClientRevoked(face.key, "/mode", LOOPBACK, "/client"))
@@ -113,7 +113,7 @@ def test_a_client_without_a_grant_is_refused(driver: RelayDriver, ros: RosSessio
 
 
 def test_a_revoked_client_loses_its_persistent_connection(driver: RelayDriver, ros: RosSession) -> None:
-    """The next call fails; the service sees the end of the connection."""
+    """The client's next call fails, and the service sees the end of the connection."""
     ros.service_server("rospy", "/mode", name="server")
     client = ros.service_client("rospy", "/mode", "--persistent", name="client")
     client.send("true")

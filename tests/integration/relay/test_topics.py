@@ -34,7 +34,7 @@ def rss(pid: int) -> int:
 
 
 def subscribe(face: Face, fields: dict[str, str]) -> tuple[socket.socket, dict[str, str]]:
-    """Connect to a relay port by hand and read the header of the answer."""
+    """Connect to a relay port with a raw socket, and read the header of the answer."""
     sock = socket.create_connection((LOOPBACK, face.port), timeout=20)
     sock.sendall(encode_header(fields))
     parser = HeaderParser()
@@ -98,8 +98,9 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
 def test_a_stopped_subscriber_neither_delays_others_nor_grows_memory(
     driver: RelayDriver, ros: RosSession
 ) -> None:
-    """Its messages are dropped and counted; the other subscriber gets all, in order; the relay's memory does not
-    grow.
+    """Messages to the stopped subscriber are dropped and counted; the other subscriber gets all, in order.
+
+    The relay's memory does not grow.
     """
     ros.talker("roscpp", "/chatter", "--rate", "100", "--text", "x" * 60_000)
     stuck = ros.listener("roscpp", "/chatter", name="stuck")
@@ -199,7 +200,7 @@ def test_a_connection_is_for_one_topic(driver: RelayDriver, ros: RosSession) -> 
 
 
 def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosSession) -> None:
-    """The death of control interrupts no connection; the next control gets a report of each."""
+    """When control dies, no connection is interrupted; the next control gets a report of each."""
     ros.talker("roscpp", "/chatter", "--rate", "50")
     listener = ros.listener("roscpp", "/chatter", name="listener")
     listener.wait_for(event="received")
@@ -216,7 +217,7 @@ def test_traffic_continues_while_control_restarts(driver: RelayDriver, ros: RosS
 def test_a_connection_that_a_new_control_does_not_restate_is_closed(
     driver: RelayDriver, ros: RosSession
 ) -> None:
-    """A permission missing after the restatement ends its connection; other connections stay."""
+    """A permission that is missing after the restatement ends its connection; other connections stay."""
     ros.talker("rospy", "/chatter")
     out, stays = (
         ros.listener("rospy", "/chatter", name="out"),
@@ -246,7 +247,7 @@ def test_a_revocation_closes_its_connection(driver: RelayDriver, ros: RosSession
 
 
 def test_a_republished_topic_is_served_again(driver: RelayDriver, ros: RosSession) -> None:
-    """A killed and restarted publisher is another incarnation; its old subscribers are disconnected."""
+    """A killed and restarted publisher is a new incarnation; its old subscribers are disconnected."""
     first = ros.talker("rospy", "/chatter", name="talker")
     listener = ros.listener("rospy", "/chatter", name="listener")
     listener.wait_for(event="received")

@@ -1,4 +1,4 @@
-"""A fork of a process with rospy loaded behaves as a new process would."""
+"""A fork of a process that has rospy loaded behaves as a new process would."""
 
 import json
 import signal
@@ -39,7 +39,7 @@ sys.exit(3)
 
 
 def looked(host: Host | Forking, command: list[str], environment: Mapping[str, str], folder: Path) -> Any:
-    """Return the program's view of its process, and how it ended."""
+    """Return what the program sees of its own process, and its exit."""
     started = host.popen(
         command, env=environment, cwd=str(folder), start_new_session=True, text=True,
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -69,7 +69,7 @@ def test_a_fork_looks_like_a_new_process(lab: Lab, tmp_path: Path, place: str, f
 
 
 def test_a_fork_ends_as_a_process_does(tmp_path: Path) -> None:
-    """Both report the same before and after their end, by a signal and by a time limit."""
+    """Before and after the end, by a signal and by a time limit, a fork and a process report the same."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     host, program = ThisMachine(), "import signal; print('here'); signal.pause()"
     environment = RosSession("", tmp_path, host).environment(host)
@@ -87,4 +87,4 @@ def test_a_fork_ends_as_a_process_does(tmp_path: Path) -> None:
                 fork.wait(0)
             fork.send_signal(number)
             assert fork.wait(LIMIT) == fork.poll() == -number
-            fork.send_signal(number)  # to no process
+            fork.send_signal(number)  # the signal goes to no process

@@ -1,4 +1,4 @@
-"""Small processes that keep the contract of the real ones, so that the supervisor can be tested alone.
+"""Small processes that follow the protocol of the real ones, so that the supervisor can be tested alone.
 
 Each prints its messages as one JSON object per line. The actor for control keeps one listening socket and answers
 each connection with its process id.
@@ -39,7 +39,10 @@ CROWD = 2_000  # two for each node of a robot with a thousand
 
 
 def control(lifeline_fd: int, config: Path) -> None:
-    """Act as control. SIGUSR1: it plays supervisor; SIGUSR2: it asks for the end of the appliance."""
+    """Act as control.
+
+    SIGUSR1 makes it send a message of the supervisor; SIGUSR2 makes it request the appliance's end.
+    """
     asyncio.run(_Control(lifeline_fd, load_resolved(config).rosmaster_port).run())
 
 
@@ -70,7 +73,7 @@ def failing(lifeline_fd: int, config: Path) -> None:
 
 
 def failing_again(lifeline_fd: int, config: Path) -> None:
-    """Act as a control that serves at first, and fails in three later lives (a full disk)."""
+    """Act as a control that serves in its first life and fails in the next three, as with a full disk."""
     lives = config.parent.parent / "control" / "lives"
     with lives.open("a") as file:
         file.write(".")
@@ -186,7 +189,7 @@ class _Control(_Actor):
         detail = {
             "master": f"http://127.0.0.1:{port}",
             "revision": 1,
-            # rosout talks to rosmaster itself here.
+            # Here rosout talks to rosmaster directly.
             "rosout_master": f"http://127.0.0.1:{self.rosmaster_port}",
             "inner_port": 1,
             "own_port": 2,

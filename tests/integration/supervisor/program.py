@@ -1,7 +1,8 @@
-"""Run the supervisor with actors for our processes and the real rosmaster and rosout: `program.py STATE
-[ROLE=ENTRY…]`.
+"""Run the supervisor with the real rosmaster and rosout: `program.py STATE [ROLE=ENTRY…]`.
 
-The output of all processes comes on standard output, one JSON object per line.
+Actors take the place of our processes.
+
+All processes print to standard output, one JSON object a line.
 """
 
 import json

@@ -66,7 +66,7 @@ def reachable(host: Host, port: int) -> bool:
 def test_an_isolated_port_is_hidden_until_the_end(
     host: Host, isolation: ContainerIsolation, hidden: int
 ) -> None:
-    """The port is open before, closed during the isolation (root included), and open afterwards; the probe agrees."""
+    """The port is open before, closed during the isolation (even to root), and open afterwards; the probe agrees."""
     assert "can be reached" in str(isolation.probe())
     assert reachable(host, hidden)
     isolation.build()
@@ -79,7 +79,7 @@ def test_an_isolated_port_is_hidden_until_the_end(
 def test_the_master_side_endpoint_is_closed_once_it_is_known(
     host: Host, isolation: ContainerIsolation
 ) -> None:
-    """Control's master-side endpoint is open until control reports it, then open to rosmaster only."""
+    """Control's master-side endpoint is open until control reports it, and then open to rosmaster only."""
     isolation.build()
     with host.run(lambda: socket.create_server(("127.0.0.1", 0))) as inner:
         port = inner.getsockname()[1]
@@ -92,7 +92,7 @@ def test_the_master_side_endpoint_is_closed_once_it_is_known(
 def test_failed_rules_are_retried(
     host: Host, isolation: ContainerIsolation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new master-side endpoint whose rule failed is closed by the next check; the failure was an error."""
+    """If the rule for a new master-side endpoint fails, it is an error, and the next check adds the rule."""
     isolation.build()
     firewall = isolation.firewall
     assert firewall is not None
@@ -125,7 +125,7 @@ def test_removed_rules_are_restored(host: Host, isolation: ContainerIsolation, h
 def test_a_check_does_not_restore_rules_after_the_end(
     host: Host, isolation: ContainerIsolation, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A check during the end, or after it, restores nothing: the end waits for it."""
+    """A check that runs during or after the end restores nothing, because the end waits for it."""
     isolation.build()
     firewall = isolation.firewall
     assert firewall is not None
@@ -137,7 +137,7 @@ def test_a_check_does_not_restore_rules_after_the_end(
         assert go_on.wait(LIMIT)
         return replace(
             report(), rules=(), backend=None
-        )  # as another program sees it right after the removal of its rules
+        )  # as another program sees the firewall right after the removal of its rules
 
     monkeypatch.setattr(firewall, "report", slowly)
     with ThreadPoolExecutor() as pool:
@@ -160,7 +160,7 @@ def test_a_check_does_not_restore_rules_after_the_end(
 def test_the_end_does_not_wait_for_a_hanging_check(
     host: Host, isolation: ContainerIsolation, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rules are removed all the same, and the check restores nothing when it continues."""
+    """The rules are removed while a check hangs, and the check restores nothing when it continues."""
     monkeypatch.setattr("appliance.supervisor.isolation_lifecycle._PATIENCE_SECONDS", 0.1)
     isolation.build()
     firewall = isolation.firewall

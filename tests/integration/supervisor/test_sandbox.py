@@ -1,6 +1,6 @@
-"""The sandbox of each process, tested from inside: as the role's user, with the settings of its row.
+"""The sandbox of each process, tested from inside as the role's user, with the settings of the role's row.
 
-The same user makes the same attempts without a sandbox, so that a refusal is due to the sandbox.
+The same user makes the same attempts without a sandbox, which shows that the sandbox causes the refusals.
 """
 
 import json
@@ -36,7 +36,7 @@ UNIX, NETWORK, ROUTES = (
     ["AF_UNIX", "AF_INET", "AF_INET6"],
     ["AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK"],
 )
-# Rights that differ by role: families of sockets, listening, connecting to the two ports of the test.
+# Rights that differ by role: socket families, listening, and connecting to the two ports of the test.
 MAY = {
     "rosmaster": (ROUTES, False, [True, True]),
     "signer": (UNIX, False, [False, False]),
@@ -75,7 +75,7 @@ def place() -> Iterator["Place"]:
 
 
 class Place:
-    """The surroundings that the roles are started in."""
+    """The surroundings in which the roles are started."""
 
     def __init__(self, directory: Path) -> None:
         self.roles = {role.name: role for role in roles_of(syslog=True, recorder=True)}
@@ -99,7 +99,7 @@ class Place:
         self.state.close()
 
     def trial(self, role: Role, pid: int) -> dict[str, Any]:
-        """Write the attempts of this role to the file where it finds them."""
+        """Write the attempts of this role to the file from which its process reads them."""
         part = self.state.path / role.part
         (self.theirs / "new").unlink(missing_ok=True)
         wanted = {
@@ -152,7 +152,7 @@ class Place:
 
 @pytest.mark.parametrize("name", MAY)
 def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
-    """The sandbox denies every role what it does not need, independent of privileges, and allows the rest."""
+    """The sandbox denies each role every call that it does not need, whatever its privileges, and allows the rest."""
     role = place.roles[name]
     account = account_of(role.user, role.group)
     families, listens, connects = MAY[name]
@@ -164,7 +164,7 @@ def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
             found, said = place.inside(role)
             assert sleeper.poll() is None
             outside = place.outside(role, account)
-            sleeper.wait(timeout=60)  # of the signal
+            sleeper.wait(timeout=60)  # the number of the signal
         finally:
             sleeper.kill()
     assert said == Walled("usual" if name in PROGRAMS else "listed", landlock.version(), [])
@@ -205,7 +205,7 @@ def test_the_sandbox_denies_forbidden_calls(place: Place, name: str) -> None:
 
 
 def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
-    """Also a later module runs: its code is in memory that is executable and not writable, and starts no thread."""
+    """A later module also runs: its code is in memory that is executable and not writable, and it starts no thread."""
     found, said = place.inside(place.roles["relay"], "run_modules")
     assert said == Walled("listed", landlock.version(), [])
     assert (found["results"], found["traps"]) == ([7, 7], ["integer division by zero"] * 2)
@@ -215,7 +215,7 @@ def test_a_relay_runs_modules_in_its_sandbox(place: Place) -> None:
 
 
 def test_status_shows_the_sandbox(appliance: Appliance) -> None:
-    """`rosrv status` and REST show the sandbox of each process; nothing is missing on this kernel.
+    """`rosrv status` and REST show the sandbox of each process; this kernel lacks no limit.
 
     A relay with a specification has the runtime of its module, and no writable memory for code.
     """
@@ -239,7 +239,7 @@ def test_status_shows_the_sandbox(appliance: Appliance) -> None:
 
 
 def test_status_shows_the_relays_congestion_control(appliance: Appliance) -> None:
-    """Its user gets cubic where the kernel allows it for all users, else reno."""
+    """The relay's user gets cubic if the kernel allows it for all users, otherwise reno."""
 
     def congestion() -> str:
         said: str = appliance.processes()["relay"]["congestion"]

@@ -15,7 +15,7 @@ from tests.support.requirements import need_root
 
 LOG = {"control/audit.db", "control/audit.db-wal", "control/audit.db-shm"}
 NO_SECRET = {"run/config.json", "control/audit.pub"}
-READS = {  # besides its own part
+READS = {  # besides the role's own part
     "api": LOG,
     "syslog": LOG,
     "relay": set(),
@@ -31,7 +31,7 @@ USERS = {"control": "rosrv", "rosmaster": "rosmaster"}
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance that was started by root, and has written all files of a start."""
+    """Run an appliance that root started and that has written all files of a start."""
     need_root()
     with Appliance(options=("--api", "127.0.0.1:0")) as running:
         assert running.rest().get("/v1/audit").status == 200
@@ -40,7 +40,7 @@ def appliance() -> Iterator[Appliance]:
 
 @pytest.mark.parametrize("role", READS)
 def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> None:
-    """A compromised process finds no key and no token of another, and can write only its own files."""
+    """A compromised process finds no key or token of another process, and can write only its own files."""
     user, group = 65534, 65534
     if role != "nobody":
         name = USERS.get(role, f"rosrv-{role}")
@@ -48,7 +48,7 @@ def test_a_process_reads_only_its_own_files(appliance: Appliance, role: str) -> 
         user, group = account.uid, account.gid
 
     def found(flag: str) -> set[str]:
-        """Return all files that this user may read, or write, by `test`, except those of the role's own part."""
+        """Return all files that this user may read (or write), by `test`, except those of the role's own part."""
         files = [path for path in appliance.state.rglob("*") if path.is_file()]
         program = 'for one; do [ "$FLAG" "$one" ] && echo "$one"; done; true'
         command = ["/bin/sh", "-c", program.replace("$FLAG", flag), "sh", *map(str, files)]
@@ -69,7 +69,7 @@ def test_the_hidden_files_exist(appliance: Appliance) -> None:
 
 
 def test_the_order_of_oom_kills(appliance: Appliance) -> None:
-    """Processes that others can flood, and that are not essential, end first; the supervisor and the signer last."""
+    """Processes that can be flooded and are not essential are killed first; the supervisor and the signer last."""
     scores = {
         role: int(Path(f"/proc/{row['pid']}/oom_score_adj").read_text())
         for role, row in appliance.processes().items()
@@ -80,7 +80,7 @@ def test_the_order_of_oom_kills(appliance: Appliance) -> None:
 
 
 def test_planted_code_is_not_loaded_at_the_next_start(appliance: Appliance) -> None:
-    """Code that a compromised process, or a backup, puts into Python's user folders is not loaded by any process."""
+    """Code that a compromised process, or a backup, puts into Python's user folders is never loaded."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     parts = [path for path in appliance.state.iterdir() if path.is_dir() and path.name != "run"]
     assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}

@@ -61,7 +61,7 @@ class Running:
         return self.pid(role, restarts=starts.index(pid) + 1)
 
     def living(self, role: str) -> int:
-        """Return the present process id of a role, once it works and has dropped its privileges."""
+        """Return the current process id of a role, once it works and has dropped its privileges."""
         pid = self.pid(role, restarts=self.restarts(role))
         # The system call filter is the last step.
         eventually(partial(_is_filtered, pid), f"{role} is in its sandbox")
@@ -85,7 +85,7 @@ class Running:
         return [pid for pid in started if Path(f"/proc/{pid}").exists()]
 
     def until_childless(self) -> None:
-        """Wait until none of the children is there; fail after ten seconds."""
+        """Wait until no child is left; fail after ten seconds."""
         for pid in self.children():
             with _pidfd(pid) as descriptor:
                 if descriptor is not None:
@@ -145,7 +145,7 @@ def start(state: Path) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def common() -> Iterator[Running]:
-    """Run a supervisor for all tests of this file that leave its processes running."""
+    """Run a supervisor for all tests of this file that do not end its processes."""
     with state_directory() as state:
         running = Running(state)
         yield running.until_ready()
@@ -179,7 +179,7 @@ def test_a_hanging_process_is_replaced(common: Running, role: str) -> None:
 
 
 def test_a_port_of_control_stays_open_while_control_is_dead(common: Running) -> None:
-    """A node that connects while there is no control waits in the queue and is served by the next one."""
+    """A node that connects while control is dead waits in the queue, and the next control serves it."""
     old = common.living("control")
     os.kill(old, signal.SIGKILL)
     answered = common.echo()
@@ -222,8 +222,8 @@ def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
 
 @pytest.mark.parametrize("role", ["relay", "control"])
 def test_a_process_with_a_forbidden_message_is_replaced(common: Running, role: str) -> None:
-    """A relay cannot have sockets kept, control cannot play supervisor: both are killed for the attempt."""
-    old = common.living(role)  # it handles signals before its first message
+    """If a relay asks to keep sockets, or control sends a message of the supervisor, the process is killed."""
+    old = common.living(role)  # control handles signals before its first message
     os.kill(old, signal.SIGUSR1)
     common.process.wait_for(event="process is killed", role=role, pid=old)
     common.next_pid(role, old)
@@ -241,7 +241,7 @@ def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
 
 
 def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
-    """SIGTERM: exit status 0 in less than five seconds, no process, no socket, no lock, no complaint."""
+    """After SIGTERM: exit status 0 in less than five seconds, and no process, socket, lock or complaint is left."""
     running = start().until_ready()
     began = time.monotonic()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
@@ -253,7 +253,7 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
 
 
 def test_an_end_during_the_build_removes_the_surroundings(start: Any, state: Path) -> None:
-    """SIGTERM, Ctrl-C or a closed terminal before the first process: a clean end without leftovers."""
+    """SIGTERM, Ctrl-C or a closed terminal before the first process starts gives a clean end without leftovers."""
     running = start("interrupted=build")
     assert running.process.wait() == 0
     assert [one["event"] for one in running.process.seen() if one.get("event") in {"built", "removed"}] == [
@@ -282,7 +282,7 @@ def test_control_may_end_the_appliance(start: Any) -> None:
 
 
 def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
-    """A process that ends neither when asked nor by SIGTERM is killed; the end still takes less than five seconds."""
+    """A process that ends neither on request nor by SIGTERM is killed; the end still takes less than five seconds."""
     running = start("relay=stubborn").until_ready()
     began = time.monotonic()
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
@@ -310,9 +310,7 @@ def test_the_user_sees_why_control_cannot_serve(start: Any) -> None:
 
 
 def test_a_control_that_fails_later_is_retried(start: Any) -> None:
-    """With nodes connected, a control that finds the disk full is restarted until it succeeds, and the reason is
-    logged.
-    """
+    """With nodes connected, a control that finds the disk full is restarted until it succeeds; the reason is logged."""
     running = start("control=failing_again").until_ready()
     os.kill(running.pid("control"), signal.SIGKILL)
     for restarts in (1, 2, 3):
@@ -332,7 +330,7 @@ def test_a_control_that_never_lives_is_an_error(start: Any) -> None:
 
 
 def test_no_service_while_the_hidden_master_is_reachable(start: Any) -> None:
-    """When the probe succeeds at the start, the start fails, names the open port, and admits no node."""
+    """If the probe can connect at the start, the start fails, names the open port, and admits no node."""
     running = start("leaky")
     assert running.process.wait() == 1
     assert running.process.wait_for(event="refused")["reason"] == "ROSMaster can be reached by another user"
@@ -340,7 +338,7 @@ def test_no_service_while_the_hidden_master_is_reachable(start: Any) -> None:
 
 
 def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) -> None:
-    """As root: the ids of the design, no groups, no capability in any set, no way to gain one."""
+    """As root: each process has the ids of the design, no groups, no capability in any set, and no way to gain one."""
     need_root()
     users = {"control": "rosrv", "relay": "rosrv-relay", "signer": "rosrv-signer", "rosmaster": "rosmaster"}
     ids = {role: _status(common.living(role))["Uid"].split() for role in users}
@@ -352,11 +350,11 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) ->
         assert {status[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
         assert status["NoNewPrivs"] == "1"
         assert status["Umask"] == "0077"
-        assert status["SigBlk"] == "0" * 16  # it ends when it is asked to
+        assert status["SigBlk"] == "0" * 16  # the process ends on request
 
 
 def test_the_supervisor_keeps_few_capabilities(common: Running) -> None:
-    """As root: it lacks unneeded capabilities (kernel modules, raw memory, clock …)."""
+    """As root: the supervisor lacks unneeded capabilities (kernel modules, raw memory, clock …)."""
     need_root()
     allowed = sum(1 << number for number in SUPERVISOR_CAPABILITIES.values())
     status = _status(common.process.pid)
@@ -377,14 +375,14 @@ def test_each_part_of_the_state_is_private(common: Running) -> None:
     assert stat.S_IMODE(common.state.stat().st_mode) == 0o711
     for part in ("control", "relay", "signer", "rosmaster"):
         found = (common.state / part).stat()
-        # The audit log is readable for the api's group, which may traverse control's part but not list it.
+        # The api's group may read the audit log; it may traverse control's part but not list it.
         assert stat.S_IMODE(found.st_mode) == (0o2710 if part == "control" and os.geteuid() == 0 else 0o700)
         assert str(found.st_uid) == _status(common.living(part))["Uid"].split()[0]
     assert stat.S_IMODE((common.state / "admin.sock").stat().st_mode) == 0o600
 
 
 def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
-    """A relay shares one file with the supervisor: the state of its monitors, which no other role has open."""
+    """A relay and the supervisor share one file, the state of the relay's monitors, which no other role has open."""
     memory = [str(path) for path in (common.state / "monitors").glob("*/relay-0")]
     supervisors = _open_files(common.process.pid)
     relays = supervisors & _open_files(common.living("relay")) - {"/dev/null"}
@@ -393,7 +391,7 @@ def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
 
 
 def test_the_hidden_master_listens_on_loopback_only(common: Running) -> None:
-    """rosmaster's port is not reachable by any other address of the machine."""
+    """No other address of the machine can reach rosmaster's port."""
     port = json.loads((common.state / "run" / "config.json").read_text())["rosmaster_port"]
     listening = Path(f"/proc/{common.living('rosmaster')}/net/tcp").read_text().splitlines()
     addresses = {row.split()[1] for row in listening[1:] if row.split()[3] == "0A"}

@@ -45,7 +45,7 @@ def directory() -> Iterator[Path]:
 def command(directory: Path, *more: str) -> list[str]:
     """Return `rosrv up` on free loopback ports."""
     fixed = ["--state", str(directory / "state"), "--policy", str(directory / "policy.ini")]
-    return [ROSRV, "up", *fixed, *PLACE, *more]  # of a repeated flag the second value counts
+    return [ROSRV, "up", *fixed, *PLACE, *more]  # if a flag is repeated, the second value counts
 
 
 @contextlib.contextmanager
@@ -59,7 +59,7 @@ def up(directory: Path, *more: str) -> Iterator[Process]:
 
 
 def refusal(directory: Path, *more: str) -> str:
-    """Return the standard error of a failing start, which prints nothing on standard output."""
+    """Return the standard error of a failing start, which must print nothing on standard output."""
     done = subprocess.run(
         command(directory, *more),
         env=ENVIRONMENT,
@@ -81,8 +81,9 @@ def pid_of_master(uri: str) -> str:
 
 
 def test_it_says_when_nodes_may_connect_and_ends_cleanly_in_time(directory: Path) -> None:
-    """It prints a line for scripts and a sentence for people; Ctrl-C and SIGTERM end it with status 0 within five
-    seconds, and the next start on the same state is served.
+    """`rosrv up` prints a line for scripts and a sentence for people.
+
+    Ctrl-C and SIGTERM end it with status 0 within five seconds, and the next start on the same state serves.
     """
 
     def end(running: Process, number: signal.Signals) -> None:
@@ -116,7 +117,7 @@ def test_a_signal_before_it_is_ready_ends_it_as_well(directory: Path) -> None:
 
 
 def test_a_port_in_use_is_reported_with_its_owner(directory: Path) -> None:
-    """The message names the port and its owner, for RVMaster's and for rosmaster's."""
+    """For RVMaster's and for rosmaster's port, the message names the port and the process that uses it."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         for flags in (("--listen", f"127.0.0.1:{port}"), ("--rosmaster-port", str(port))):
@@ -133,7 +134,7 @@ def test_invalid_configuration_is_reported_before_the_start(directory: Path) -> 
 
 
 def test_an_unreachable_state_directory_is_reported(directory: Path) -> None:
-    """As root: the children's users must be able to reach their part; the message names the closed directory."""
+    """As root: if the children's users cannot reach their part, the message names the closed directory."""
     need_root()
     directory.chmod(0o700)
     said = refusal(directory)
@@ -142,8 +143,9 @@ def test_an_unreachable_state_directory_is_reported(directory: Path) -> None:
 
 
 def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> None:
-    """As root, on a host of the lab: the firewall is in force while the appliance runs; there is one set of rules
-    after a crash, and none after the end.
+    """As root, on a host of the lab: the firewall is in force while the appliance runs.
+
+    After a crash there is one set of rules, and after the end none.
     """
     need_root()
     with Lab("rosrv-up") as lab:
@@ -168,8 +170,9 @@ def test_isolation_is_in_force_from_the_start_to_the_end(directory: Path) -> Non
 
 
 def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Path) -> None:
-    """As root, on a host of the lab: the processes are in a namespace that is reached by the host's address;
-    after the end the namespace is gone.
+    """As root, on a host of the lab: the processes run in a namespace, which is reached by the host's address.
+
+    After the end the namespace is gone.
     """
     need_root()
     with own_namespace(), Lab("rosrv-up") as lab:
@@ -202,7 +205,7 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
 def test_input_files_are_checked_before_the_state_is_made(
     directory: Path, policy: str | None, monitors: str | None, said: list[str]
 ) -> None:
-    """A missing or invalid policy or specification: exit status 1, every place once, no state directory."""
+    """For a missing or invalid policy or specification: exit status 1, each position once, and no state directory."""
     (directory / "policy.ini").unlink()
     if policy is not None:
         (directory / "policy.ini").write_bytes(policy.encode("latin-1"))
@@ -217,8 +220,9 @@ def test_input_files_are_checked_before_the_state_is_made(
 
 
 def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
-    """The appliance starts with the policy that an operator loaded, even if its file is gone; without one it does
-    not.
+    """The appliance starts with the policy that an operator loaded, even if its file is gone.
+
+    If none was loaded, it does not start.
     """
     state = str(directory / "state")
     with up(directory, "--json") as running:

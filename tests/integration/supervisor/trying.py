@@ -1,4 +1,4 @@
-"""Attempts of an attacker who took over a process: run as its user, in its sandbox, with results as JSON."""
+"""Attempts of an attacker in control of a process: run as its user, in its sandbox, with results as JSON."""
 
 import ctypes
 import errno
@@ -23,18 +23,18 @@ DIVIDES = bytes.fromhex(  # a module with a memory, and a function `divide` of t
     "0713 02 06 6d656d6f7279 0200 06 646976696465 0000 0a0901 0700200020016d0b"
 )
 _PTRACE_ATTACH = 16
-_ENDS_THE_TRIAL = {"reboot", "vhangup"}  # without the sandbox these would have an effect
+_ENDS_THE_TRIAL = {"reboot", "vhangup"}  # without the sandbox these calls would have an effect
 
 
 def main(*_given: Any) -> None:
-    """Make every attempt in the file `trial` of the role's part; the entry of a role's actor."""
-    told = sys.stderr  # the launcher has put standard output there
+    """Make every attempt in the file `trial` of the role's part; this is the entry point of a role's actor."""
+    told = sys.stderr  # the launcher has redirected standard output there
     told.write(json.dumps(tried(json.loads(Path("trial").read_text()))) + "\n")
     told.flush()
 
 
 def run_modules(*_given: Any) -> None:
-    """Run modules, the second one much later than the first, and report; the entry of a relay's actor."""
+    """Run modules, the second much later than the first, and report; this is the entry point of a relay's actor."""
     from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, translated  # noqa: PLC0415  within the sandbox, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
@@ -102,20 +102,20 @@ def _connect(port: int) -> None:
 
 
 def _call(name: str) -> str:
-    """Make a system call without arguments; one that this machine lacks is not tried."""
+    """Make a system call without arguments; a call that this machine lacks is not tried."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(name.encode())
     if number < 0:
         return "not there"
     libc = ctypes.CDLL(None, use_errno=True)
     first = (
         _PTRACE_ATTACH if name == "ptrace" else 0
-    )  # 0 is PTRACE_TRACEME: the trial would stop at its next signal
+    )  # 0 is PTRACE_TRACEME: the process would then stop at its next signal
     result = libc.syscall(ctypes.c_long(number), ctypes.c_long(first), *(ctypes.c_long(0) for _ in range(5)))
     return "done" if result >= 0 else errno.errorcode[ctypes.get_errno()]
 
 
 def _new_namespace() -> str:
-    """Use `clone`, as unshare is among the calls: in a user namespace everything else would be open."""
+    """Use `clone`, because unshare is already among the calls: in a user namespace everything else would be allowed."""
     number = ctypes.CDLL(LIBRARY).seccomp_syscall_resolve_name(b"clone")
     libc = ctypes.CDLL(None, use_errno=True)
     arguments = (NEW_USER | signal.SIGCHLD, 0, 0, 0, 0)

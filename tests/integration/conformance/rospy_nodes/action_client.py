@@ -14,7 +14,7 @@ from report import init_node, report
 
 
 def main():
-    """Send the goals, report, end."""
+    """Send the goals, report their results, and end."""
     init_node("action_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     client = actionlib.SimpleActionClient("count", TestAction)
@@ -27,7 +27,7 @@ def main():
         TestGoal(goal=100000), feedback_cb=lambda given: (feedback.append(given.feedback), begun.set())
     )
     # Feedback may overtake the status. If a client cancels before it knows that its goal is accepted, an older status
-    # without the goal makes actionlib's client say LOST. Its active_cb is not called if the status is very fast.
+    # without the goal makes actionlib's client report LOST. If the status is very fast, active_cb is not called.
     while client.get_state() != GoalStatus.ACTIVE and not rospy.is_shutdown():
         rospy.sleep(0.01)
     begun.wait(30)

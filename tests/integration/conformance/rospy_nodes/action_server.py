@@ -12,11 +12,11 @@ from report import init_node, report
 
 
 def main():
-    """Serve until terminated; a goal over 100 goes on until it is cancelled."""
+    """Serve until terminated; a goal over 100 continues until it is cancelled."""
     init_node("action_server")
 
     def work(goal):
-        # The client sees its connections before this side has them: messages in between reach no subscriber.
+        # The client sees its connections before this side has them, so messages sent in between reach no subscriber.
         heard = (server.action_server.feedback_pub, server.action_server.result_pub)
         while not all(topic.get_num_connections() for topic in heard) and not rospy.is_shutdown():
             rospy.sleep(0.01)

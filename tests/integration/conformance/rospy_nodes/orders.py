@@ -2,7 +2,7 @@
 
 {"do": "subscribe" | "unsubscribe" | "advertise" | "unadvertise" | "publish" | "abandoned", "topic": T, "text": X,
 "latch": B},
-{"do": "now"} (the time it believes), {"do": "log", "text": X} (to rosout); events `done`, `received`, `connected`.
+{"do": "now"} (the node's time), {"do": "log", "text": X} (to rosout); events `done`, `received`, `connected`.
 """
 
 import json
@@ -40,7 +40,7 @@ class Orders:
         self.subscribers.pop(told["topic"]).unregister()
 
     def abandoned(self, told):
-        """Wait until it has no connection: rospy takes a publisher that returns earlier for the old one."""
+        """Wait until the topic has no connection: rospy mistakes a publisher that returns earlier for the old one."""
         subscriber = self.subscribers[told["topic"]]
         for _ in range(3000):
             if not subscriber.get_num_connections():
