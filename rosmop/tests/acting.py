@@ -1,4 +1,4 @@
-"""Small specifications and messages for tests: an action in, what comes of it out."""
+"""Small specifications and messages for tests: each test gives an action and compares its result."""
 
 import functools
 from collections.abc import Mapping
@@ -24,19 +24,19 @@ PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
 
 @functools.cache
 def definitions() -> Definitions:
-    """ROS's own definitions, and those of the LandShark."""
+    """Return ROS's own definitions, and those of the LandShark."""
     return standard_definitions().extended(
         Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": PAINTBALL})
     )
 
 
 def message(kind: str, **fields: object) -> bytes:
-    """A message by another library's encoder; fields that are not given are zero. `a__b` is the path `a.b`."""
+    """Return a message from another library's encoder; missing fields are zero, and `a__b` is the path `a.b`."""
     return bytes(STORE.serialize_ros1(_value(_long(kind), _tree(fields)), _long(kind)))
 
 
 def fields(kind: str, data: bytes) -> Any:
-    """A message by another library's decoder."""
+    """Return a message's fields, read by another library's decoder."""
     return STORE.deserialize_ros1(data, _long(kind))
 
 
@@ -57,7 +57,7 @@ def _long(kind: str) -> str:
 
 
 def _value(kind: str, given: object) -> Any:
-    """An object of the other library with the given fields, the rest zero."""
+    """Return an object of the other library with the given fields, and zero for the rest."""
     if not isinstance(given, dict):
         return given
     import numpy as np  # noqa: PLC0415  only for the other library's arrays
@@ -86,7 +86,7 @@ def _value(kind: str, given: object) -> Any:
 def load(
     text: str, on_fault: OnFault = "drop", patience: Patience = lambda: lambda: False, **others: str
 ) -> MonitorSet:
-    """The monitors of a text (and of other files by name), started at time 0."""
+    """Return the monitors of a text (and of other files, by name), started at time 0."""
     sources = {"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}}
     monitors = MonitorSet.of(compiled_from(sources, definitions()), on_fault, patience)
     monitors.start(0)
@@ -101,7 +101,7 @@ def action(body: str, *, before: str = "") -> str:
 def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Outcome:
     """Return the result of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
 
-    `most` are the instructions that a message may take.
+    `most` is the number of instructions that a message may take.
     """
     text = action(body, before=before)
     told = message("std_msgs/Int32", data=data)
@@ -111,7 +111,7 @@ def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Ou
 
 
 def shown(expression: str, *, conversion: str = "%s", before: str = "", data: int = 0) -> str:
-    """Return the output of an expression; a fault's text if there is one."""
+    """Return the output of an expression, or the text of its fault."""
     outcome = act(f'ROS_INFO("{conversion}", {expression});', before=before, data=data)
     if outcome.faults:
         return f"fault: {outcome.faults[0].text}"
@@ -119,7 +119,7 @@ def shown(expression: str, *, conversion: str = "%s", before: str = "", data: in
 
 
 def refused(text: str) -> list[Diagnostic]:
-    """The errors of a specification; fails if there is none."""
+    """Return the errors of a specification; fail if it has none."""
     try:
         MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     except SpecificationError as error:
@@ -128,6 +128,6 @@ def refused(text: str) -> list[Diagnostic]:
 
 
 def refused_action(body: str, *, before: str = "") -> list[Diagnostic]:
-    """The errors of an action on `/t`, `std_msgs/Int32` bound to `x`; columns count from the action."""
+    """Return the errors of an action on `/t`, `std_msgs/Int32` bound to `x`; columns count from the action."""
     text = f"s() {{ {before}\nevent e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{body}\n}} }}"
     return refused(text)

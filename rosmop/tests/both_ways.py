@@ -1,4 +1,4 @@
-"""The fast path of a set beside the interpreter: whatever comes to both, they do the same."""
+"""Compare the fast path of a set with the interpreter: for any message both must do the same."""
 
 import struct
 from collections import Counter
@@ -21,26 +21,26 @@ STAMPED = struct.pack("<I3sIIdhI2dBI", 3, b"abc", 9, 8, 2.5, 1, 2, 0.5, 7.0, 1, 
 
 
 def plain(count: int = 0, x: float = 0.0, kind: int = 0, rest: bytes = b"") -> bytes:
-    """An `own/Plain`."""
+    """Return the bytes of an `own/Plain`."""
     return struct.pack("<BidfBII3qI", kind, count, x, 0.0, 0, 5, 7, 1, 2, 3, len(rest)) + rest
 
 
 def stamped(
     frame: bytes = b"abc", count: int = 0, names: tuple[bytes, ...] = (), values: tuple[float, ...] = ()
 ) -> bytes:
-    """An `own/Stamped`."""
+    """Return the bytes of an `own/Stamped`."""
     body = struct.pack("<I", len(frame)) + frame + struct.pack("<IIdhI", 9, 8, 2.5, count, len(values))
     body += struct.pack(f"<{len(values)}dBI", *values, 0, len(names))
     return body + b"".join(struct.pack("<I", len(name)) + name for name in names)
 
 
 def frames(bodies: Iterable[bytes]) -> bytes:
-    """Messages as they come."""
+    """Return messages as frames."""
     return b"".join(struct.pack("<I", len(body)) + body for body in bodies)
 
 
 class BothWays:
-    """A set with its module, and the same whose functions the interpreter runs, both started."""
+    """A set with its module, and the same set run by the interpreter; both are started."""
 
     def __init__(self, *texts: str, on_fault: OnFault = "drop", margins: bool = False) -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
@@ -68,13 +68,13 @@ class BothWays:
         """Whether messages are in the module's memory; this changes with each check."""
 
     def lane(self, topic: str = "/plain") -> FastLane:
-        """The walk of a topic; there is one."""
+        """Return the fast path of a topic, which must have one."""
         found = self.monitors.lane(topic)
         assert found is not None
         return found
 
     def check(self, bodies: list[bytes], topic: str = "/plain", time: int = 1) -> list[bytes]:
-        """Fail if messages that come together make a difference; what goes on."""
+        """Fail if a batch of messages makes a difference; return the messages that pass."""
         expected = []
         began, self.counts = len(self.interpreted), Counter()
         lines: list[LogLine] = []
@@ -100,7 +100,7 @@ class BothWays:
         return expected
 
     def state(self) -> list[str]:
-        """As `state_of`, by the fast path."""
+        """Return the same as `state_of`, from the fast path."""
         return state_of(self.monitors)
 
     def _fed(self, given: bytes, topic: str, time: int) -> bytes:
@@ -142,7 +142,7 @@ class BothWays:
 
 
 def state_of(monitors: MonitorSet) -> list[str]:
-    """Variables, states of properties, and how close comparisons came."""
+    """Return variables, states of properties, and how close comparisons came."""
     state = []
     for monitor in monitors.monitors:
         names = monitors.interpreter.variables
@@ -158,5 +158,5 @@ def state_of(monitors: MonitorSet) -> list[str]:
 def event(
     body: str, parameters: str = "int count", pattern: str = "count:count", before: str = "int n = 0;"
 ) -> str:
-    """A specification with one event on `/plain`."""
+    """Return a specification with one event on `/plain`."""
     return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"

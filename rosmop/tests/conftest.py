@@ -1,9 +1,9 @@
-"""Settings that all tests of the language share."""
+"""Settings shared by all tests of the language."""
 
 from hypothesis import settings
 
 from rosmop.tests.examples import examples
 
-# The time an example takes depends on what else the machine does.
+# The time of an example depends on the load of the machine.
 settings.register_profile("no clock", deadline=None, max_examples=examples(100))
 settings.load_profile("no clock")

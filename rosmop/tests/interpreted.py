@@ -1,4 +1,4 @@
-"""The same monitors in the interpreter only, as a reference for modules."""
+"""The same monitors run by the interpreter only, as a reference for modules."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,18 +11,18 @@ from rosmop.run.outcomes import Fault, Outcome
 
 
 def sent(functions: Mapping[str, nodes.Function]) -> dict[str, nodes.Function]:
-    """The form as another process reads it."""
+    """Return the form as another process reads it."""
     return msgspec.msgpack.decode(msgspec.msgpack.encode(functions), type=dict[str, nodes.Function])
 
 
 def beside(monitors: MonitorSet) -> MonitorSet:
-    """The same set, of the form as it is sent, with a state of its own and no module; not started."""
+    """Return the same set, from the form as it is sent, with its own state and without a module; not started."""
     compiled = replace(monitors.compiled, functions=sent(monitors.compiled.functions))
     return MonitorSet(compiled, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:
-    """Fail if two ways came to different outcomes."""
+    """Fail if the two ways had different outcomes."""
     assert _told(one) == _told(other)
     for fault, other_fault in zip(one.faults, other.faults, strict=True):
         assert repr(sorted(fault.values.items())) == repr(sorted(other_fault.values.items()))

@@ -1,4 +1,4 @@
-"""Make a set whose messages a module takes, as in the relay."""
+"""Make a set whose messages are handled by a module, as in the relay."""
 
 from collections.abc import Collection
 
@@ -9,5 +9,5 @@ from rosmop.run.execution import OnFault
 
 
 def on_module(compiled: Compiled, on_fault: OnFault = "drop", shadows: Collection[str] = ()) -> MonitorSet:
-    """Return the set of what was compiled, with a module of its own; not started."""
+    """Return the compiled set with its own module; not started."""
     return MonitorSet.of(compiled, on_fault, fast=fast_path_of(compiled.without(shadows)), shadows=shadows)

@@ -1,4 +1,4 @@
-"""Random messages of any type, whole, cut short, and with lengths that lie."""
+"""Random messages of any type: whole, cut short, and with false lengths."""
 
 import math
 import struct
@@ -32,7 +32,7 @@ class RandomMessages:
         return b"".join(map(self._field, self._definitions.message(kind).fields))
 
     def read(self, kind: str) -> list[bytes]:
-        """Return what one read may have: messages that are alike or not, some cut or with a length that lies."""
+        """Return the messages of one read: similar or not, some of them cut or with a false length."""
         random, whole = self._random, self.whole(kind)
         bodies = [
             whole if random.random() < 0.3 else self.whole(kind) for _ in range(random.choice((1, 2, 6, 12)))
@@ -74,7 +74,7 @@ class RandomMessages:
 
 
 def cuts(whole: bytes) -> list[bytes]:
-    """Return a message cut after each byte, whole ones between."""
+    """Return a message cut after each byte, with whole messages in between."""
     return [body for end in range(len(whole)) for body in (whole, whole[:end])]
 
 
@@ -84,6 +84,6 @@ def lie(whole: bytes, at: int, length: int) -> bytes:
 
 
 def lies(whole: bytes, random: Random, lengths: Sequence[int] = LIES) -> list[bytes]:
-    """Return a message with each of these numbers at a dozen offsets, whole ones between."""
+    """Return a message with each of these numbers at a dozen offsets, with whole messages in between."""
     places = sorted(random.sample(range(len(whole) - 3), k=min(12, len(whole) - 3))) if len(whole) > 4 else []
     return [body for at in places for length in lengths for body in (lie(whole, at, length), whole)]

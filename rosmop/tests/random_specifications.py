@@ -1,4 +1,4 @@
-"""Random specifications and messages, for comparing two ways of running the same thing."""
+"""Random specifications and messages, for comparing two implementations."""
 
 import struct
 from collections.abc import Iterator
@@ -66,20 +66,20 @@ _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; 
 
 
 def definitions() -> Definitions:
-    """ROS's definitions, and those of these tests."""
+    """Return ROS's definitions, and those of these tests."""
     return acting.definitions().extended(OWN)
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Messages of one topic (`EventCode.channel`) as frames one after the other, and how many."""
+    """Messages of one topic (`EventCode.channel`) as consecutive frames, and their number."""
 
     topic: str
     frames: bytes
     messages: int
 
     def bodies(self) -> Iterator[bytes]:
-        """The messages, one by one."""
+        """Yield the messages one by one."""
         position = 0
         while position < len(self.frames):
             first = position + 4
@@ -88,7 +88,10 @@ class Traffic:
 
 
 class Specifications:
-    """Random texts of specifications. With `numbers`, they have what the module takes: numbers and conditions."""
+    """Random texts of specifications.
+
+    With `numbers`, they only have parts that a module handles: numbers and conditions.
+    """
 
     def __init__(self, seed: int, *, numbers: bool = False) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
@@ -96,7 +99,7 @@ class Specifications:
         self._ways = ways(seed)
 
     def texts(self) -> list[str]:
-        """One to three specifications."""
+        """Return one to three specifications."""
         return [self._specification(number) for number in range(self._random.choice((1, 1, 1, 2, 3)))]
 
     def _specification(self, number: int) -> str:
@@ -229,7 +232,7 @@ class Specifications:
         return random.choice(choices)
 
     def _publications(self, texts: list[str], value: str) -> list[str]:
-        """Statements that make messages, change those that are kept, and publish."""
+        """Return statements that make messages, change kept messages, and publish."""
         text = self._random.choice(texts)
         return [
             f"{{ std_msgs::String m; m.data = {text}; PUBLISH(/text, std_msgs/String, m); }}",
@@ -247,14 +250,14 @@ class Specifications:
 
 
 class Messages:
-    """Random messages of the two topics, and of a service (`EventCode.channel`)."""
+    """Random messages of the two topics and of a service (`EventCode.channel`)."""
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
         self._ways = ways(seed)
 
     def traffic(self) -> Traffic:
-        """Some messages of one topic; mostly equally long, now and then not even of their type."""
+        """Return messages of one topic: mostly of equal length, sometimes not of the topic's type."""
         random = self._random
         topic = random.choice(self._ways)
         make = self._plain if topic in PLAIN else self._stamped
@@ -276,14 +279,14 @@ class Messages:
         body += struct.pack("<dfB", self._number(), self._number(), random.choice((0, 1, 1, 2)))
         body += struct.pack("<II3q", 5, random.choice((0, 7, 3_000_000_000)), 1, random.choice((0, 2, -1)), 3)
         body += struct.pack("<I", len(rest)) + rest
-        return _frame(body[: random.choice((*[None] * 60, 3))])  # None: all of it
+        return _frame(body[: random.choice((*[None] * 60, 3))])  # None means all bytes
 
     def _stamped(self, shape: int) -> bytes:
         random = self._random
         frame = (b"abc", b"abd", b"", b"longer")[shape % 4] if random.random() < 0.95 else b"xyz"
         values = [self._number() for _ in range(shape % 3)]
         names = [b"n" * (shape % 5)] * (shape % 2)
-        if frame and names and random.random() < 0.1:  # as long as the others, with other lengths inside
+        if frame and names and random.random() < 0.1:  # as long as the others, but with other lengths inside
             frame, names = frame[:-1], [names[0] + b"n"]
         body = struct.pack("<I", len(frame)) + frame
         body += struct.pack("<IIdh", 9, 8, self._number(), random.choice((0, 1, -5)))

@@ -1,4 +1,4 @@
-"""Replace a running set by one of other texts, as loading specifications does."""
+"""Replace a running set by a set of other texts, as loading specifications does."""
 
 from collections.abc import Mapping
 
@@ -11,6 +11,6 @@ from roswire.definitions import Definitions
 def replaced(
     before: MonitorSet, sources: Mapping[str, str], definitions: Definitions, time_ns: int
 ) -> tuple[MonitorSet, Outcome]:
-    """Return the set that takes the place of another one, started, and what came of that."""
+    """Return the set that replaces another one, started, and the effects of the start."""
     following = MonitorSet.of(compiled_from(sources, definitions), before.on_fault, before.patience)
     return following, following.succeed(before, time_ns)

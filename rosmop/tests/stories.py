@@ -1,4 +1,4 @@
-"""Runs stories about specifications: messages and other steps, each with what comes of it.
+"""Run stories about specifications: messages and other steps, each with its outcome.
 
     # The title of a story, which names its test
     % on_fault=pass shadows=a slices=2        how the set is made
@@ -11,7 +11,7 @@
     > 2s load                                the set is replaced by the lines with `+` behind it
     + a() { … }
 
-Behind a step stand the lines of its outcome (`lines_of`). Interpreter, engine and module come to the same.
+The lines of its outcome (`lines_of`) follow each step. Interpreter, engine and module must have the same outcome.
 """
 
 import ast
@@ -36,7 +36,7 @@ UNITS = {"s": 10**9, "ms": 10**6, "ns": 1}
 
 @dataclass(frozen=True)
 class Step:
-    """A step, the specifications behind it, and its expected lines."""
+    """A step, the specifications that follow it, and its expected lines."""
 
     words: str
     loaded: str
@@ -45,7 +45,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Story:
-    """A story of a file."""
+    """A story in a file."""
 
     title: str
     options: dict[str, str]
@@ -113,7 +113,7 @@ def _without_places(lines: Sequence[str]) -> list[str]:
 
 
 def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet, list[str]]:
-    """Take a step with a set; the set that is there then, and the lines of what came of it."""
+    """Carry out a step with a set; return the set after the step, and the lines of the outcome."""
     first, *words = step.words.split(" ")
     outcomes: Sequence[Outcome] = ()
     kind = ""
@@ -153,7 +153,7 @@ def _done(monitors: MonitorSet, step: Step, *, judged: bool) -> tuple[MonitorSet
 
 
 def body_of(kind: str, given: Sequence[str]) -> bytes:
-    """Return a message of fields as text; one `hex=…` is the bytes themselves."""
+    """Return a message from fields given as text; a single `hex=…` gives the bytes themselves."""
     pairs = [field.split("=", 1) for field in given]
     if pairs and pairs[0][0] == "hex":
         return bytes.fromhex(pairs[0][1])
@@ -168,7 +168,7 @@ def _read(value: str) -> object:
 
 
 def fields_of(kind: str, data: bytes) -> str:
-    """Return the fields of a message that are not zero, by another library's decoder; its encoder gives the bytes.
+    """Return the fields of a message that are not zero, by another library's decoder, and check its encoder.
 
     A space in a string is `␠`. Parts of services are in bytes.
     """
@@ -199,9 +199,9 @@ def _fields(path: str, value: Any) -> Iterator[str]:
 
 
 def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str]:
-    """Return all that an outcome says: what was due before, result and events, verdicts, output, publications, faults.
+    """Return all lines of an outcome: earlier effects, result and events, verdicts, output, publications and faults.
 
-    Without a kind of message there is no result.
+    Without a message type there is no result.
     """
     lines = [line for one in outcome.before for line in lines_of(one, monitors)]
     head: str = outcome.result

@@ -1,4 +1,4 @@
-"""The processor time of one message is bounded, whatever the message makes monitors do."""
+"""The processor time of one message is limited, whatever the message makes monitors do."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ WALKS = {
 
 
 def ticking(readings: list[None]) -> Callable[[], float]:
-    """A clock that shows a millisecond more with each reading."""
+    """Return a clock that advances by one millisecond with each reading."""
 
     def read() -> float:
         readings.append(None)
@@ -36,7 +36,7 @@ def ticking(readings: list[None]) -> Callable[[], float]:
 
 @pytest.mark.parametrize("name", WALKS)
 def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
-    """A message that may be read ten times is cut off at the eleventh; without a limit it passes."""
+    """A message that needs more than ten readings of the clock is cut off; without a limit it passes."""
     kind, parameter, pattern, action, data = WALKS[name]
     text = f"a() {{ double n = 0; event e({parameter}) /t {kind} '{pattern}' {{ {action} }} }}"
     monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
@@ -53,7 +53,7 @@ def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
 
 
 def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
-    """With `pass` it goes on unchanged, and the next specification finds the time used up."""
+    """With `pass` the message continues unchanged, and the next specification finds the time used up."""
     loop = (
         "event e(std::string s) /t std_msgs/String '{data:s}' { for (int i = 0; i < s.size(); i++) n += i; }"
     )
@@ -69,7 +69,7 @@ def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
 
 
 def test_a_hurried_message_has_a_part_of_the_time() -> None:
-    """And the fault says so."""
+    """The message gets a part of the time, and the fault says so."""
     text = "a() { int n; event e(std::string s) /t std_msgs/String '{data:s}' { for (;;) n++; } }"
     monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
     monitors.start(0)

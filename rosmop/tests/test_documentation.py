@@ -1,4 +1,4 @@
-"""The page on the language is right: its examples load, its functions and limits are those of the code."""
+"""The page on the language is correct: its examples load, and its functions and limits are those of the code."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ def test_the_example_of_a_property_loads() -> None:
 
 
 def row(head: str) -> str:
-    """A row of the tables."""
+    """Return a row of the tables."""
     return next(line for line in PAGE.splitlines() if line.startswith(f"| {head} "))
 
 
@@ -52,7 +52,7 @@ def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> N
 
 
 def test_every_function_of_the_library_is_on_the_page() -> None:
-    """Also those that come from several headers; those on `float` are one rule."""
+    """Functions from several headers are included; those on `float` are one rule."""
     words = set(re.findall(r"\w+", PAGE))
     words |= {f"{name}f" for name in MATH} if "(also as `sqrtf`, …)" in PAGE else set()
     assert (

@@ -23,12 +23,12 @@ SECOND = 10**9
 
 
 def number(value: int) -> bytes:
-    """A `std_msgs/Int32`."""
+    """Return a `std_msgs/Int32`."""
     return message("std_msgs/Int32", data=value)
 
 
 def on(topic: str, name: str = "e", body: str = "", parameters: str = "") -> str:
-    """An event on a topic of `std_msgs/Int32`, its value bound to `x`."""
+    """Return an event on a topic of `std_msgs/Int32`, with its value bound to `x`."""
     return f"event {name}(int x{parameters}) {topic} std_msgs/Int32 '{{data:x}}' {{ {body} }}\n"
 
 
@@ -42,7 +42,7 @@ def printed(outcome: Outcome) -> list[str]:
 
 
 def test_a_message_without_events_keeps_its_buffer() -> None:
-    """The buffer that comes out is the one that went in."""
+    """The returned buffer is the received one."""
     monitors = load("a() {" + on("/t") + "}")
     buffer = bytearray(b"anything")
     outcome = monitors.process("/other", buffer, 0)
@@ -62,7 +62,7 @@ def test_a_message_without_events_keeps_its_buffer() -> None:
 def test_a_name_of_its_own_does_not_use_the_variable_of_another_specification(
     parameter: str, when: str, body: str
 ) -> None:
-    """So the two are switched, tried, moved and removed apart; only where it means the other's is it a use."""
+    """The two can be switched, tried, moved and removed separately, unless a name really means the other's variable."""
     event = f"event e(int {parameter}) /t std_msgs/Int32 '{{data:{parameter}}}' {when} {{ {body} }}"
     other = "other() { int shared = 0; event e() /u std_msgs/Empty '{}' { shared++; } }"
     for text, uses in (("", set()), ("event f() /u std_msgs/Empty '{}' when (shared > 1) { }", {"other"})):
@@ -70,11 +70,11 @@ def test_a_name_of_its_own_does_not_use_the_variable_of_another_specification(
         assert monitors.monitor("own").code.uses == uses
 
 
-# The author
+# The monitor that made a change
 
 
 def test_the_events_of_a_change_are_those_found_by_comparing_all_bytes() -> None:
-    """Random monitors: the bytes before and after each event say who changed what, and whether anything is changed."""
+    """For random monitors, comparing the bytes before and after each event gives the same authors of changes."""
     most = 0
     for seed in range(examples(60)):
         try:
@@ -106,7 +106,7 @@ def test_the_events_of_a_change_are_those_found_by_comparing_all_bytes() -> None
 def _compared(
     name: str, function: Callable[[WireMessage | None], bool], found: list[str]
 ) -> Callable[[WireMessage | None], bool]:
-    """The function of an event; its name is added to `found` when all bytes are not what they were."""
+    """Wrap the function of an event; add its name to `found` if any byte has changed."""
 
     def compared(seen: WireMessage | None) -> bool:
         assert seen is not None
@@ -127,7 +127,7 @@ def _compared(
 
 
 def test_timers_wait_for_messages_that_a_recording_has() -> None:
-    """In a recording with messages for the specification, the first tick waits for the first of them."""
+    """If a recording has messages for the specification, the first tick waits for the first of them."""
     monitors = MonitorSet.of(
         compiled_from({"x.rv": "a() { event tick() every 1s { }" + on("/t") + "}"}, definitions())
     )
@@ -148,7 +148,7 @@ def test_a_leap_of_the_clock_skips_ticks() -> None:
 
 
 def test_late_ticks_are_skipped_and_deadlines_wait() -> None:
-    """Otherwise late ticks would get ever later; the caller sets the limit."""
+    """Otherwise late ticks would pile up; the caller sets the limit."""
     text = """a() { int n; event e() /t std_msgs/Bool '{}' { } event tick() every 1ms { n++; ROS_INFO("%d", n); } }
     b() { event x() /t std_msgs/Bool '{}' { }
         tfsm: s [ x -> s, timeout 1ms -> late ] late [ ] @timeout { ROS_WARN("late"); } }"""
@@ -165,7 +165,7 @@ def test_late_ticks_are_skipped_and_deadlines_wait() -> None:
 
 
 def test_faults_are_counted() -> None:
-    """So that a monitor can be shown as failing."""
+    """Counting lets a monitor be shown as failing."""
     monitors = load("a() {" + on("/t", "e", "x = 1 / x;") + "}")
     seen = []
     for i in range(12):
@@ -176,7 +176,7 @@ def test_faults_are_counted() -> None:
 
 
 def test_each_message_has_a_whole_budget() -> None:
-    """The budget is for each message."""
+    """The budget applies to each message separately."""
     monitors = load(
         "a() {" + on("/t", "e", "for (int i = 0; i < 100000; i++) { x = i; } if (x == 3) while (1);") + "}"
     )
@@ -188,7 +188,7 @@ def test_each_message_has_a_whole_budget() -> None:
 
 
 def test_a_set_with_an_error_is_rejected_whole() -> None:
-    """The set in force stays as it was."""
+    """The set in force stays unchanged."""
     monitors = load("a() {" + on("/t", "e", "return;") + "}")
     with pytest.raises(SpecificationError):
         replaced(monitors, {"x.rv": "a() {"}, definitions(), 0)
@@ -196,7 +196,7 @@ def test_a_set_with_an_error_is_rejected_whole() -> None:
 
 
 def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() -> None:
-    """The set without it is refused, where its variable is used."""
+    """Without it the set is refused, at the position where its variable is used."""
     user = "b() {" + on("/u", "e", "n = 1;") + "}"
     monitors = load("a() { int n;" + on("/t") + "}", y=user)
     assert monitors.monitor("b").code.uses == {"a"}
@@ -211,7 +211,7 @@ def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() ->
 
 
 def test_a_changed_message_type_resets_the_state() -> None:
-    """Values of a type that is another now are not kept."""
+    """Values of a type whose definition changed are not kept."""
     text = "a() { own::T v; int n; event e(int x) /t own/T '{x:x}' { n++; ROS_INFO(\"%d\", n); } }"
     first = Definitions.from_files({"own/T.msg": "int32 x\n"})
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, first))
@@ -226,7 +226,7 @@ def test_a_changed_message_type_resets_the_state() -> None:
 
 
 def test_only_specifications_that_use_a_changed_message_type_are_reset() -> None:
-    """However deep it is in it, and however it is named; an unrelated definition ends no state."""
+    """The type may be deep inside another, under any of its names; an unrelated definition resets no state."""
     texts = {
         "deep": "nested() { int n; event e() /a own/Outer '{}' { n++; ROS_INFO(\"%d\", n); } }",
         "kept": "kept() { int n; event e() /b own/Other '{}' { n++; ROS_INFO(\"%d\", n); } }",
@@ -245,7 +245,7 @@ def test_only_specifications_that_use_a_changed_message_type_are_reset() -> None
 
 
 def test_a_set_knows_its_topics_services_and_publications() -> None:
-    """Also those of a specification that is switched off; but it wants no message then."""
+    """A set also knows those of a disabled specification, but then wants no message for it."""
     monitors = load("""a() { std_msgs::String s; event e() /t std_msgs/Int32 '{}' { PUBLISH("/said", "std_msgs::String", s); }
         event ask() service /set std_srvs/SetBool request '{}' { } }""")
     assert monitors.wants("/t")

@@ -1,4 +1,4 @@
-"""A set's module does what the interpreter does: bytes, drops, variables, states of properties; and what it leaves."""
+"""A set's module has the results of the interpreter: bytes, drops, variables, states; the rest it leaves."""
 
 import struct
 from collections import Counter
@@ -31,22 +31,22 @@ from rosmop.text.errors import SpecificationError
 FEW = settings(max_examples=examples(90), suppress_health_check=list(HealthCheck))
 PROGRAMS = Path(__file__).parent / "programs.txt"
 
-# The same as the interpreter
+# The same results as the interpreter
 
 
 @FEW
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """Actions, conditions, helper functions, loops, properties; messages of several topics, and bytes that are none.
+    """Covers actions, conditions, helper functions, loops and properties, on several topics, with invalid bytes.
 
-    The closeness of comparisons is also the same, where that is noted.
+    How close comparisons came is also the same, if it is recorded.
     """
     try:
         both = BothWays(
             *Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2], margins=seed % 4 > 1
         )
     except SpecificationError:
-        return  # a draw that means nothing
+        return  # the random text is not a valid specification
     messages = Messages(seed)
     for number in range(4):
         traffic = messages.traffic()
@@ -55,7 +55,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
 
 
 def test_the_random_messages_reach_every_outcome() -> None:
-    """The comparison above has something to compare."""
+    """All outcomes occur, so that the comparison above is meaningful."""
     came: Counter[str] = Counter()
     for seed in range(24):
         try:
@@ -71,7 +71,7 @@ def test_the_random_messages_reach_every_outcome() -> None:
 
 
 def test_only_changes_faults_and_large_messages_reach_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`judge` asks the engine for a change and a fault, and for what the module has no room for."""
+    """`judge` asks the engine about a change or a fault, and about data that the module has no room for."""
     both = BothWays("""s() { int n = 0; int m = 0;
         event a(int c) /plain own/Plain '{count:c}' { n++; if (c == 3) { c = 4; } }
         event b(int kind, int x) /plain own/Plain '{kind:kind, three[0]:x}' when (kind == 1) { m = 10 / (n - 5); } }""")
@@ -106,7 +106,7 @@ EXPRESSIONS = (
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
 def test_expressions_at_the_limits(expression: str) -> None:
-    """Numbers that overflow, do not fit, or are none."""
+    """Covers numbers that overflow or do not fit, and NaN."""
     before = "double d = 0; long n = 0; float f = 0;"
     both = BothWays(
         event(f"d = {expression}; n = d; f = d; x = n;", "int x, double y", "count:x, x:y", before)
@@ -123,10 +123,10 @@ def test_expressions_at_the_limits(expression: str) -> None:
 
 @table(PROGRAMS)
 def test_each_program_does_the_same_in_the_module_and_the_interpreter(case: Case) -> None:
-    """On random messages, several in a read; also cut after each byte, and with lengths that lie.
+    """The messages are random, several in a read, also cut after each byte, and with false lengths.
 
-    The module takes messages of those marked `module`, and none of those marked `engine`. A program in which module
-    and interpreter once differed, or might, is one more row.
+    The module handles messages of programs marked `module`, and none of those marked `engine`. For each difference
+    between module and interpreter that was found or suspected, one row is added.
     """
     both, random = BothWays(case.text), Random(case.beside)  # noqa: S311  draws examples, not keys
     ((topic, kind),) = both.monitors.topics.items()
@@ -150,7 +150,7 @@ ALWAYS_LEFT = (
 
 @pytest.mark.parametrize("case", LEFT, ids=lambda case: case.beside)
 def test_messages_that_do_not_need_the_engine_are_the_modules(case: Case) -> None:
-    """All of them, though others of the topic are left; a topic of which each message is left has no lane."""
+    """The module handles all of them, even if it leaves others of the topic; if it leaves all, there is no lane."""
     both = BothWays(case.text)
     both.check([stamped(count=1)] * 3, "/stamped")
     assert both.came == {"together": 1, "passed": 3}
@@ -159,7 +159,7 @@ def test_messages_that_do_not_need_the_engine_are_the_modules(case: Case) -> Non
 
 
 def test_an_array_with_too_many_strings_is_left_to_the_engine() -> None:
-    """The message is the engine's."""
+    """The module leaves the message to the engine."""
     both = BothWays(next(case.text for case in cases(PROGRAMS) if case.beside == "arrays of strings"))
     many = message("sensor_msgs/JointState", name=["b"] * (MOST_TEXTS + 1), position=[0.5] * (MOST_TEXTS + 1))
     few = message("sensor_msgs/JointState", name=["b"], position=[0.5])
@@ -168,21 +168,21 @@ def test_an_array_with_too_many_strings_is_left_to_the_engine() -> None:
 
 
 def test_more_output_than_the_module_stores_is_printed() -> None:
-    """Are put out all the same."""
+    """All output is printed."""
     both = BothWays(event('ROS_INFO("%d %d", count, n); n++;'))
     both.check([plain(number) for number in range(LINES // 24 + 50)])
     assert both.came["together"] >= 2
 
 
 def test_output_without_end_is_a_fault() -> None:
-    """End with the fault of the message that ran out of its budget."""
+    """It ends with the fault of a message that has used up its budget."""
     both = BothWays(event('while (true) { ROS_INFO("%1000d", count); }'))
     both.check([plain(1)])
     assert +both.came == {"fault": 1}
 
 
 def test_throttled_output_is_printed_when_it_is_due() -> None:
-    """The module knows when a line was last put out, and leaves the message at which the next one is."""
+    """The module knows when a line was last printed, and leaves the message at which the next one is due."""
     both = BothWays(event('n++; ROS_INFO_THROTTLE(2, "%d", n);'))
     second = 1_000_000_000
     for time in (
@@ -202,7 +202,7 @@ def test_throttled_output_is_printed_when_it_is_due() -> None:
 
 @pytest.mark.parametrize("text", ["", "a", "abc", "map_frame", "a name of thirty bytes exactly", "x" * 64])
 def test_strings_are_compared_to_the_last_byte(text: str) -> None:
-    """With constants of all lengths, in patterns and in conditions; others of the same length or nearly."""
+    """Covers constants of all lengths, in patterns and conditions, with strings of equal or similar length."""
     pattern = text.replace('"', "")
     both = BothWays(f"""s() {{ int n = 0; event a() /stamped own/Stamped '{{frame:"{pattern}"}}' {{ n++; }}
         event b(std::string f) /stamped own/Stamped '{{frame:f}}' {{ if (f != "{pattern}") {{ n += 100; }} }} }}""")
@@ -214,7 +214,7 @@ def test_strings_are_compared_to_the_last_byte(text: str) -> None:
 
 
 def test_seconds_of_every_size_are_rounded_once() -> None:
-    """As C++ and Python do, though the module divides in two steps."""
+    """The result equals that of C++ and Python, although the module divides in two steps."""
     both = BothWays(
         "s() { double d = 0; event e(ros::Time t) /plain own/Plain '{when:t}' { d = t.toSec(); } }"
     )
@@ -236,7 +236,7 @@ def test_seconds_that_overflow_wrap() -> None:
 
 
 def test_a_fault_in_the_middle_of_a_batch_undoes_its_message_only() -> None:
-    """Variables, fields and states that events before it have changed are as they were when the engine begins."""
+    """When the engine begins, variables, fields and states changed by earlier events have their old values."""
     both = BothWays(
         """a() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' { n += count; x = n; }
                fsm: one [ e -> two ] two [ e -> one ] @fail { } }
@@ -249,7 +249,7 @@ def test_a_fault_in_the_middle_of_a_batch_undoes_its_message_only() -> None:
 
 
 def test_a_message_without_fuel_is_left_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever it ends: what is done is done, what is begun is taken back."""
+    """Wherever the fuel ends, completed messages stay and the begun message is undone."""
     text = event("for (int i = 0; i < 50; i++) { n += i; } count = n;")
     for fuel in range(2000, 12000, 500):
         monkeypatch.setattr(wasm_runner, "FUEL", fuel)
@@ -259,7 +259,7 @@ def test_a_message_without_fuel_is_left_to_the_engine(monkeypatch: pytest.Monkey
 def test_fuel_lasts_for_many_calls_and_is_renewed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As if it had not been looked at; the next ones have fuel again."""
+    """The message is left as if it had not been begun; the next ones have fuel again."""
     monkeypatch.setattr(wasm_runner, "FUEL", 1000)
     both = BothWays(event("n++;"))
     lane, one = both.lane(), frames([plain()])
@@ -274,9 +274,9 @@ def test_fuel_lasts_for_many_calls_and_is_renewed(
 
 
 def test_only_the_beginning_of_a_long_message_is_copied() -> None:
-    """The module changes and drops long messages; an event that reads past the copied beginning is not handled there.
+    """The module changes and drops long messages; it leaves events that read past the copied beginning.
 
-    This does not apply to a message that is in the module's memory as a whole.
+    The limit does not apply to a message that is completely in the module's memory.
     """
     picture = bytes(range(256)) * (BEGINNING // 128)
     both = BothWays(event("if (count == 3) { return; } count = count + 1; n++;"))
@@ -295,7 +295,7 @@ def test_only_the_beginning_of_a_long_message_is_copied() -> None:
 
 
 def test_large_batches_are_processed_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Go in several pieces."""
+    """A large batch is processed in several pieces."""
     monkeypatch.setattr("rosmop.fast.wasm_runner.FUEL", 10**9)
     both = BothWays("""one() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
         n++; if (count % 2) { x = n; } } }
@@ -310,7 +310,7 @@ def test_large_batches_are_processed_in_pieces(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_module_and_the_engine_share_variables() -> None:
-    """Specifications that share messages agree, whichever takes the next one; so does a set that replaces another."""
+    """Specifications that share messages agree, whether module or engine handles the next; so does a replacing set."""
     first = """a() { int n = 0; double d = 0; bool b = false; unsigned int u = 1; long l = -1; float f = 0; ros::Time t;
         event e(int count) /plain own/Plain '{count:count}' {
             n += count; d = n / 3.0; b = n % 2; u = u * 5; l = l * 7; f = d; t = ros::Time(1, 2); }
@@ -329,7 +329,7 @@ def test_the_module_and_the_engine_share_variables() -> None:
 
 
 def test_events_and_drops_are_counted() -> None:
-    """For each event; what happened, once."""
+    """Each event is counted once."""
     both = BothWays("""s() { event a(int kind) /plain own/Plain '{kind:kind}' { }
         event b(int count) /plain own/Plain '{count:count}' when (count > 1) { if (count > 2) { return; } } }""")
     lane, view = both.lane(), memoryview(bytearray(frames(plain(number) for number in (1, 2, 3, 3, 1, 4))))
@@ -342,7 +342,7 @@ def test_events_and_drops_are_counted() -> None:
     assert [[*lane.happened()] for _ in range(2)] == [[6, 4], [0, 0]]
 
 
-# The rest, and its time
+# The remaining messages, and their time
 
 
 @pytest.mark.parametrize(
@@ -362,14 +362,14 @@ def test_events_and_drops_are_counted() -> None:
     ],
 )
 def test_a_topic_whose_messages_all_need_the_engine_has_no_lane(body: str, has: bool) -> None:
-    """One of which some would be has."""
+    """If the module can handle some of the messages, the topic has a lane."""
     before = "int n = 0; std::vector<int> v; int down(int i) { return i ? down(i - 1) : 0; }"
     both = BothWays(event(body, before=before))
     assert (both.monitors.lane("/plain") is not None) == has
 
 
 def test_lanes_wait_until_a_monitor_has_begun() -> None:
-    """Not before the first message, not while it is held."""
+    """A lane is not ready before the first message, or while the topic is held."""
     monitors = on_module(
         compiled_from({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
     )
@@ -386,7 +386,7 @@ def test_lanes_wait_until_a_monitor_has_begun() -> None:
 
 
 def test_lanes_wait_while_something_is_due() -> None:
-    """A tick that is due comes before the next message; it finds what walks have left."""
+    """A tick that is due precedes the next message, and sees the state that the fast path left."""
     both = BothWays(
         "s() { int n = 0; event e() /plain own/Plain '{}' { n++; } event t() every 1ms { n = n * 10; } }"
     )
@@ -415,9 +415,9 @@ CLOCKED = (
 
 @pytest.mark.parametrize("text", CLOCKED)
 def test_properties_with_clocks_do_the_same_in_the_module(text: str) -> None:
-    """States, clocks, deadlines, handlers and explanations, as of the interpreter; far more steps than are kept.
+    """States, clocks, deadlines, handlers and explanations equal the interpreter's, over far more steps than are kept.
 
-    Where a message brings an earlier deadline, that is due before the next one.
+    If a message sets an earlier deadline, that deadline precedes the next message.
     """
     both = BothWays(
         f"""s() {{ int n = 0; int m = 0; int k = 0;
@@ -452,7 +452,7 @@ HANDLED = (
 
 @pytest.mark.parametrize("text", HANDLED)
 def test_handlers_run_where_verdicts_are_only_counted(text: str) -> None:
-    """Variables, drops, restarts, faults, parts without a module, and the explanation of a repeated verdict agree."""
+    """Variables, drops, restarts, faults, parts without a module, and explanations of repeated verdicts agree."""
     both = BothWays(
         f"""s() {{ int n = 0; int m = 0; int k = 0; std::vector<int> v;
         event a(int c) /plain own/Plain '{{count:c}}' when (c % 2 == 0) {{ k++; if (c == 8) {{ k = 1 / (k - k); }} }}
@@ -488,7 +488,7 @@ def test_a_deadline_set_by_the_module_is_known_at_once() -> None:
 
 
 def test_a_disabled_monitor_is_not_in_the_lane() -> None:
-    """Its topic has none; where there are others, they alone."""
+    """If no other monitor needs the topic, it has no lane; otherwise the lane has only the others."""
     both = BothWays(event("n = count;"), event("n++;").replace("s()", "t()"))
     for one in (both.monitors, both.interpreter):
         one.switch({"s": False}, 5)
@@ -499,7 +499,7 @@ def test_a_disabled_monitor_is_not_in_the_lane() -> None:
 
 
 def test_a_batch_stops_before_a_change_or_drop_to_report() -> None:
-    """The module changes no message while changes are reported in full, and drops none while drops are."""
+    """The module leaves changes while they are reported in full, and likewise drops."""
     both = BothWays(event("count = 7; if (n > 2) { return; } n++;"))
     lane, given = both.lane(), frames([plain()] * 6)
     assert both.monitors.area is not None

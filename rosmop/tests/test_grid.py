@@ -1,4 +1,4 @@
-"""Each back end has a row for each kind of node, and what leaves the module has a place and a reason."""
+"""Each back end has a row for each kind of node, and everything left by the module has a position and a reason."""
 
 from collections.abc import Collection
 from types import UnionType
@@ -33,7 +33,7 @@ def test_each_back_end_has_a_row_for_each_kind_of_node(row: str) -> None:
 
 
 def test_each_kind_of_node_is_in_the_grid() -> None:
-    """A new class of nodes is an expression, a statement, or one of the known parts of these."""
+    """A new node class must be an expression, a statement, or one of their known parts."""
     parts = {
         "Spot",
         "Skipper",

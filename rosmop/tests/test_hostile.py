@@ -1,4 +1,4 @@
-"""Specifications that mean harm are refused, or fault, in bounded time and memory."""
+"""Hostile specifications are refused, or fault, in bounded time and memory."""
 
 import time
 import tracemalloc
@@ -11,7 +11,7 @@ from rosmop.runtime.action_context import BUDGET as BUDGET_SIZE
 from rosmop.tests.acting import act, definitions, load, message, refused, refused_action
 from rosmop.text.errors import SpecificationError
 
-PATIENCE = 20.0  # seconds of processor time; an endless loop is endless
+PATIENCE = 20.0  # seconds of processor time; an endless loop would take longer
 
 BUDGET = "more than 1000000 instructions for one message; is there an endless loop?"
 MEMORY = "the values of a specification may hold 16 MiB in total"
@@ -20,7 +20,7 @@ SPENT_WHOLE = (
     "for (;;) x++;",
     "f();",
     "f0();",
-)  # the others of BUDGET have a twentieth of it, and end the same way
+)  # the other loops get a twentieth of BUDGET, and end the same way
 
 BOMBS = [
     ("while (1);", "", BUDGET),
@@ -55,8 +55,8 @@ BOMBS = [
 
 @pytest.mark.parametrize(("body", "before", "text"), BOMBS)
 def test_a_bomb_is_a_fault(body: str, before: str, text: str) -> None:
-    """Loops, recursion and growth without end stop at the budget or the limit of memory, and drop the message."""
-    if text == MEMORY:  # it takes many times as long while memory is counted
+    """Endless loops, recursion and growth stop at the budget or the memory limit, and drop the message."""
+    if text == MEMORY:  # counting memory takes many times as long
         tracemalloc.start()
     most = BUDGET_SIZE if text != BUDGET or body in SPENT_WHOLE else BUDGET_SIZE // 20
     text = text.replace(str(BUDGET_SIZE), str(most))
@@ -104,7 +104,7 @@ LARGE_VALUES = """std::string s(1000000, 'x'), t(1000000, 'x'); char c[1000001];
 
 @pytest.mark.parametrize("body", COSTLY)
 def test_expensive_operations_are_charged(body: str) -> None:
-    """Whatever looks at a million bytes costs thousands of instructions, so that a loop of it ends in time."""
+    """An operation on a million bytes costs thousands of instructions, so that a loop of them ends in time."""
     text = f"s() {{ {LARGE_VALUES} event e() /t std_msgs/Empty '{{}}' {{ {body} }} }}"
     monitors = load(text)
     outcome = monitors.process("/t", b"", 1)
@@ -114,7 +114,7 @@ def test_expensive_operations_are_charged(body: str) -> None:
 
 
 def test_short_operations_are_not_charged() -> None:
-    """Names and the like are compared for nothing, as before: that is what monitors do all day."""
+    """Comparing names and other short strings is free, because monitors do it all the time."""
     body = 'if (s == "turret" || s == t || s < t || v == w) s = t;'
     text = (
         "s() { std::string s, t; std::vector<int> v, w; event e() /t std_msgs/Empty '{}' { " + body + " } }"
@@ -125,7 +125,7 @@ def test_short_operations_are_not_charged() -> None:
 
 
 def test_a_formatted_text_is_charged_before_it_is_made() -> None:
-    """A format that names a long text many times is a fault, not many times the memory."""
+    """A format that repeats a long text many times is a fault, and does not take many times the memory."""
     many = "%s" * 90
     body = f"std::string s(1000000, 'x'); ROS_INFO(\"{many}\"{', s' * 90});"
     streamed = f"std::string s(1000000, 'x'); ROS_INFO_STREAM(s{' << s' * 40});"
@@ -139,7 +139,7 @@ def test_a_formatted_text_is_charged_before_it_is_made() -> None:
 
 
 def test_memory_is_measured_over_all_variables() -> None:
-    """Many small values count together, and what was freed counts no more."""
+    """Many small values count together, and freed values no longer count."""
     many = "".join(f"std::string s{i}(1000000, 'x'); " for i in range(20))
     assert MEMORY in act(many).faults[0].text
     freed = "std::string s; for (int i = 0; i < 60; i++) { s = std::string(1000000, 'x'); }"
@@ -147,7 +147,7 @@ def test_memory_is_measured_over_all_variables() -> None:
 
 
 def test_a_value_of_less_than_the_limit_is_held() -> None:
-    """The limit is 16 MiB, not less."""
+    """A value just below the limit of 16 MiB is accepted."""
     assert act("std::string s(16000000, 'x'); ROS_INFO(\"%d\", (int) s.size());").log[0].text == "16000000"
 
 
@@ -159,14 +159,14 @@ GROWN = [
 
 @pytest.mark.parametrize("change", GROWN)
 def test_a_replaced_value_counts_once(change: str) -> None:
-    """A long string is changed up to the limit, though Python makes a new one of it."""
+    """A long string can be changed up to the limit, although Python makes a new string."""
     outcome = act(f"std::string s(15000000, 'x'); {change} ROS_INFO(\"%d\", (int) s.size());")
     assert outcome.faults == ()
     assert outcome.log[0].text == "15000001"
 
 
 def test_a_string_that_grows_beyond_the_limit_is_a_fault() -> None:
-    """A replacing value is counted itself."""
+    """The size of the new value counts."""
     assert MEMORY in act("std::string s(10000000, 'x'); s += std::string(7000000, 'y');").faults[0].text
 
 
@@ -185,7 +185,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("body", "text"), REFUSED)
 def test_texts_beyond_the_limits_are_rejected(body: str, text: str) -> None:
-    """Nesting, sizes and names that ask for more than the language has are errors at load, in bounded time."""
+    """Excessive nesting, sizes and names are errors at load, in bounded time."""
     began = time.process_time()
     findings = refused_action(body)
     assert any(text in finding.text for finding in findings)
@@ -228,7 +228,7 @@ HUGE_COUNTS = [
 
 @pytest.mark.parametrize(("kind", "parameter", "data"), HUGE_COUNTS)
 def test_a_count_beyond_the_message_is_a_fault(kind: str, parameter: str, data: bytes) -> None:
-    """A length in a message that promises more than there is makes no memory and no loop."""
+    """If a length in a message exceeds the message, it costs no memory and no loop."""
     field = {"nav_msgs/Path": "poses", "sensor_msgs/JointState": "name"}.get(kind, "data")
     text = f"a() {{ event e({parameter}) /t {kind} '{{{field}:x}}' {{ auto y = x; }} }}"
     outcome = load(text).process("/t", data, 0)
@@ -247,10 +247,10 @@ WALKS = [
 def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
     kind: str, pattern: str, data: bytes
 ) -> None:
-    """A publisher that puts more than a budget of elements before a field costs no time, nested or not."""
+    """A publisher that puts more elements than a budget before a field costs no time, nested or not."""
     monitors = load(f"a() {{ event e(auto x) /t {kind} '{{{pattern}}}' {{ auto y = x; }} }}")
     took = []
-    for at in range(3):  # the least: others may have had the caches
+    for at in range(3):  # the minimum, because other processes may disturb the caches
         began = time.process_time()
         outcome = monitors.process("/t", data, at)
         took.append(time.process_time() - began)
@@ -260,7 +260,7 @@ def test_a_walk_over_millions_of_elements_is_charged_before_it_is_made(
 
 
 def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> None:
-    """So that what reads a field of a robot's joint states has the budget that it always had."""
+    """So an event that reads a field of a robot's joint states keeps its full budget."""
     for names, cost in ((50, 0), (500, 500)):
         monitors = load(
             "a() { event e(double x) /t sensor_msgs/JointState '{position[1]:x}' { double y = x; } }"
@@ -272,14 +272,14 @@ def test_few_elements_before_a_field_cost_nothing_and_many_their_number() -> Non
 
 
 def test_an_array_of_too_many_strings_is_a_fault() -> None:
-    """Strings and messages in an array are read one by one, and so at most a million."""
+    """Strings and messages in an array are read one by one, so a million is the limit."""
     monitors = load("a() { event e(std::string[] x) /t sensor_msgs/JointState '{name:x}' { auto y = x; } }")
     outcome = monitors.process("/t", b"\0" * 16 + (1_500_000).to_bytes(4, "little") + bytes(6_000_012), 0)
     assert "an array of 1500000 elements; at most 1000000" in outcome.faults[0].text
 
 
 def test_unreadable_texts_are_rejected_with_a_position() -> None:
-    """Whatever a file contains, the answer is an error with a position."""
+    """For any file contents, the answer is an error with a position."""
     for text in (
         "\0",
         "\x1b[31m",

@@ -1,4 +1,4 @@
-"""For any specifications, module and interpreter agree on bytes, records, faults and state."""
+"""For any specification, module and interpreter agree on bytes, records, faults and state."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthChec
 
 
 def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
-    """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
+    """Fail if the two ways differ for any of these messages, or in the variables at the end."""
     other, monitors = beside(given), on_module(given.compiled, given.on_fault)
     for either in (monitors, other):
         MarginReader(either)
@@ -42,7 +42,7 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
     for one in monitors.compiled.specifications:
         for variable in one.variables:
             known, found = (each.value(one.name, variable) for each in (monitors, other))
-            assert repr(known) == repr(found)  # a NaN is also one
+            assert repr(known) == repr(found)  # a NaN equals a NaN here
     assert state_of(monitors) == state_of(other)
 
 
@@ -56,7 +56,7 @@ def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> 
 def test_single_messages_have_the_outcomes_of_the_interpreter(
     seed: int, on_fault: OnFault, step_ns: int, wild: list[bytes]
 ) -> None:
-    """Actions, conditions, helper functions, loops, timers and properties, on messages that are not always whole."""
+    """Covers actions, conditions, helper functions, loops, timers and properties, on whole and damaged messages."""
     sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     messages = Messages(seed)
     together = [
@@ -65,7 +65,7 @@ def test_single_messages_have_the_outcomes_of_the_interpreter(
     try:
         monitors = MonitorSet.of(compiled_from(sources, definitions(), margins=seed % 4 > 1), on_fault)
     except SpecificationError:
-        return  # a draw that means nothing
+        return  # the random text is not a valid specification
     check(monitors, together, step_ns)
 
 
@@ -82,7 +82,7 @@ def test_single_messages_have_the_outcomes_of_the_interpreter(
     ids=["kind", "type", "missing", "missing in a type", "statement as a value", "no value of the language"],
 )
 def test_data_that_is_not_a_form_is_rejected(wrong: list[object]) -> None:
-    """Whatever is sent in its place: what is read is what the form can be, throughout."""
+    """Only data that is completely a valid form is read; anything else is rejected."""
     statement = msgspec.msgpack.Decoder(nodes.Statement)
     assert statement.decode(msgspec.msgpack.encode(["Break", 1])) == nodes.Break(1)
     with pytest.raises(msgspec.ValidationError):
@@ -93,7 +93,7 @@ def test_data_that_is_not_a_form_is_rejected(wrong: list[object]) -> None:
 
 
 def shipped() -> MonitorSet:
-    """All specifications of `monitors/`."""
+    """Return all specifications of `monitors/`."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
@@ -101,7 +101,7 @@ def shipped() -> MonitorSet:
 
 
 def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any]:
-    """Any value of a type."""
+    """Draw any value of a type."""
     if isinstance(kind, value_types.RecordType):
         return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
     if isinstance(kind, value_types.VectorType):
@@ -123,7 +123,7 @@ def a_value(values: ValueCodec, kind: value_types.Type) -> st.SearchStrategy[Any
 @FEW
 @given(data=st.data())
 def test_shipped_specifications(data: st.DataObject) -> None:
-    """Any messages on their topics, cut short now and then."""
+    """The messages on their topics are random, and some are cut short."""
     monitors = shipped()
     values = ValueCodec(MessageTypes(monitors.definitions))
     traffic = []
@@ -155,7 +155,7 @@ def test_shipped_specifications(data: st.DataObject) -> None:
     ],
 )
 def test_growing_values_and_fields_of_any_size_do_the_same(body: str) -> None:
-    """Vectors, strings, whole messages, references, recursion, the bounds of memory and work."""
+    """Covers vectors, strings, whole messages, references, recursion, and the limits of memory and work."""
     text = f"""s() {{ int n = 0; sensor_msgs::JointState v;
     void f(int &x) {{ x = x * 3; }}
     void swap(double &a, double &b) {{ double c = a; a = b; b = c; }}

@@ -1,4 +1,4 @@
-"""A module runs within its bounds: what it may do, how it is stopped, and that nothing is left behind."""
+"""A module runs within its limits: what it may do, how it is stopped, and that nothing is left behind."""
 
 import contextlib
 import resource
@@ -36,24 +36,24 @@ TRAPS = {
 
 
 def run(code: bytes, limit: int = LIMIT) -> WasmInstance:
-    """A machine of this module."""
+    """Return a machine of this module."""
     return WasmInstance(translated(code, limit), limit)
 
 
 def made(text: str, limit: int = LIMIT, pages: str = "1") -> WasmInstance:
-    """A machine of these functions."""
+    """Return a machine of these functions."""
     return run(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
 
 
 def trap_of(one: WasmInstance, name: str | int, *arguments: int, fuel: int = FUEL) -> WasmTrap:
-    """The trap that ends this call."""
+    """Return the trap that ends this call."""
     with pytest.raises(WasmTrap) as caught:
         one.call(name, *arguments, fuel=fuel)
     return caught.value
 
 
 def test_arguments_and_results_by_name_and_number() -> None:
-    """Signed results of 32 and 64 bits, or none; functions with other types have no number."""
+    """Results are signed with 32 or 64 bits, or missing; functions of other types have no number."""
     one = made("""
         (func (export "first") (param f64))
         (func (export "mixed") (param i32 i64 i32) (result i64)
@@ -71,7 +71,7 @@ def test_arguments_and_results_by_name_and_number() -> None:
 
 @pytest.mark.parametrize("arguments", [(), (1, 2), (1 << 63,), (0.5,)])
 def test_other_arguments(arguments: tuple[int, ...]) -> None:
-    """Missing, surplus, oversized or non-integer values are refused before anything runs."""
+    """Missing, surplus, oversized or non-integer arguments are refused before any code runs."""
     one = made("""(func (export "mark") (param i64) (i32.store (i32.const 0) (i32.const 1)))""")
     with pytest.raises(struct.error):
         one.call("mark", *arguments, fuel=FUEL)
@@ -80,7 +80,7 @@ def test_other_arguments(arguments: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("reason", TRAPS)
 def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
-    """Writes before a trap stay."""
+    """Writes before a trap stay in memory."""
     one = made(f"""(type $none (func)) (table 2 funcref) (elem (i32.const 1) $other)
         (func $other (param i32))
         (func $self (export "fail") (i32.store (i32.const 8) (i32.const 7)) {TRAPS[reason]})
@@ -92,7 +92,7 @@ def test_every_trap_has_its_reason_and_the_machine_goes_on(reason: str) -> None:
 
 
 def test_each_call_has_its_own_fuel() -> None:
-    """The same work needs the same fuel; a call neither saves for the next nor owes."""
+    """The same work needs the same fuel; a call neither saves fuel for the next call nor owes any."""
     one = made("""(func (export "turns") (param i32)
         (loop (br_if 0 (local.tee 0 (i32.sub (local.get 0) (i32.const 1))))))""")
 
@@ -111,21 +111,21 @@ def test_each_call_has_its_own_fuel() -> None:
 
 
 def test_bytes_that_are_copied_use_fuel() -> None:
-    """One instruction cannot run for long."""
+    """A single instruction cannot run for long."""
     one = made("""(func (export "fill") (memory.fill (i32.const 0) (i32.const 1) (i32.const 65536)))""")
     assert trap_of(one, "fill", fuel=60_000).reason == "out of fuel"
     one.call("fill", fuel=70_000)
 
 
 def test_an_unknown_wasmtime_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A different layout would be read wrongly."""
+    """Another version may have another memory layout, which would be read wrongly."""
     monkeypatch.setattr(wasm_instance, "VERSION", "49.")
     with pytest.raises(WasmError, match="wasmtime 49"):
         wasm_instance.load.__wrapped__()
 
 
 def test_the_memory_grows_in_place_and_views_stay_right() -> None:
-    """By the module or from outside; up to the limit and not beyond."""
+    """The module or the host may grow the memory, up to the limit and not beyond."""
     one = made("""(func (export "grow") (param i32) (result i32) (memory.grow (local.get 0)))
         (func (export "at") (param i32) (result i32) (i32.load8_u (local.get 0)))""")
     first = one.memory
@@ -149,7 +149,7 @@ def test_the_memory_grows_in_place_and_views_stay_right() -> None:
 
 @pytest.mark.parametrize("limit", [PAGE, 3 * PAGE, 5 * PAGE + 1])
 def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
-    """Whatever is reserved for it."""
+    """The limit is rounded down to whole pages."""
     one = made("", limit)
     one.reserve(limit // PAGE * PAGE)
     with pytest.raises(WasmError):
@@ -182,7 +182,7 @@ def test_the_start_function_of_a_module_is_bounded() -> None:
 
 
 def test_other_threads_go_on_while_a_module_is_translated() -> None:
-    """The compiler's process answers its supervisor meanwhile: a large set takes seconds."""
+    """Translating a large set takes seconds, in which the compiler's process must answer its supervisor."""
     step = "(local.set 0 (i64.add (i64.mul (local.get 0) (i64.const 3)) (i64.const 7)))"
     functions = "".join(f'(func (export "f{number}") (param i64) {step * 400})' for number in range(600))
     code = bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") 1) {functions})'))
@@ -202,7 +202,7 @@ def test_other_threads_go_on_while_a_module_is_translated() -> None:
 
 
 def test_a_view_outlives_its_machine() -> None:
-    """A view of closed memory still has its bytes."""
+    """A view of a closed machine's memory still has its bytes."""
     one = made("")
     view = one.memory[10:20]
     view[0] = 3
@@ -216,7 +216,7 @@ def test_a_view_outlives_its_machine() -> None:
 
 
 def test_machines_share_an_engine_and_nothing_else() -> None:
-    """One that traps, or is closed, is nothing to the others."""
+    """A machine that traps or is closed does not affect the others."""
     text = """(global $n (mut i32) (i32.const 0))
         (func (export "count") (result i32) (global.set $n (i32.add (global.get $n) (i32.const 1))) (global.get $n))
         (func (export "trap") unreachable)"""
@@ -249,7 +249,7 @@ RICH = bytes(
     argument=st.sampled_from([0, 1, -1, 5, PAGE - 4, PAGE, 1 << 31, (1 << 63) - 1]),
 )
 def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: int) -> None:
-    """They are refused, trap, or do something else within their own memory."""
+    """Damaged modules are refused, trap, or only affect their own memory."""
     code = bytearray(RICH)
     for at, value in changes:
         code[at] = value
@@ -266,12 +266,12 @@ def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: 
 
 
 def resident() -> int:
-    """Bytes of memory that this process has."""
+    """Return the resident bytes of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def test_calls_and_traps_leave_nothing_behind() -> None:
-    """Nor do machines that are gone."""
+    """Closed machines also leave nothing behind."""
     one = made("""(func $deep (export "fail") (param i32)
             (if (local.get 0) (then (call $deep (i32.sub (local.get 0) (i32.const 1))))) unreachable)
         (func (export "fine"))""")
@@ -293,7 +293,7 @@ def test_calls_and_traps_leave_nothing_behind() -> None:
 
 
 def test_many_machines_need_few_addresses() -> None:
-    """As many as their limits say, not gigabytes each; in a process that may not have more."""
+    """Machines reserve as many addresses as their limits need, even in a process with little address space."""
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import resource, wasmtime
@@ -315,7 +315,7 @@ print(len(machines))
 
 
 def test_traps_come_without_signals() -> None:
-    """With a handler put in place afterwards, which ends the process at its first signal."""
+    """A signal handler installed later, which would end the process, is never called."""
     fails = "".join(f'(func (export "{name}") {TRAPS[name]})' for name in list(TRAPS)[:5])
     done = subprocess.run(
         [sys.executable, "-c", f"""

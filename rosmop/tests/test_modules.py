@@ -44,19 +44,19 @@ print(hashlib.sha256(encoded_part(part_of(compiled("b", "a"), ["a"], []))).hexdi
 
 
 def rule(name: str) -> str:
-    """A specification of that name, with a bit of all."""
+    """Return a specification of this name, with one part of every kind."""
     head, _, rest = RULE.format(name).partition("event")
     body, _, said = rest.partition("    std_msgs::Int32 said;\n")
     return f"{head}std_msgs::Int32 said; event{body}{said}"
 
 
 def compiled(*names: str) -> Compiled:
-    """A set of such specifications."""
+    """Compile a set of such specifications."""
     return compiled_from({f"{name}.rv": rule(name) for name in names}, definitions())
 
 
 def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
-    """All that these specifications did."""
+    """Yield all effects of these specifications."""
     for earlier in outcome.before:
         yield from story(earlier, names)
     yield [one for one in outcome.events if one.partition(".")[0] in names]
@@ -71,7 +71,7 @@ def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
 
 
 def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
-    """Bytes and machine code: so a relay is given nothing new when others change."""
+    """Bytes and machine code stay the same, so a relay gets nothing new when others change."""
     alone = encoded_part(part_of(compiled("a"), ["a"], []))
     assert encoded_part(part_of(compiled("a", "b", "c"), ["a"], [])) == alone
     assert encoded_part(part_of(compiled("c", "b", "a"), ["a"], [])) == alone
@@ -80,7 +80,7 @@ def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
 
 
 def test_another_process_makes_the_same_module() -> None:
-    """String hashes differ in the other process."""
+    """The other process has different string hashes."""
     hashes = {
         subprocess.run(
             [sys.executable, "-c", PROGRAM],
@@ -96,12 +96,12 @@ def test_another_process_makes_the_same_module() -> None:
 @FEW
 @given(seed=st.integers(0, 1 << 30))
 def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
-    """Random specifications have the same reported places in the text and the same sent module."""
+    """Random specifications have the same effects with their own, sent module as in the whole set."""
     texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     try:
         whole = compiled_from(texts, definitions())
     except SpecificationError:
-        return  # a draw that means nothing
+        return  # the random text is not a valid specification
     for names in whole.groups([one.name for one in whole.specifications]):
         part = encoded_part(part_of(whole, names, ()))
         sent = decoded_part(part)
@@ -120,7 +120,7 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
 
 
 def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
-    """The others are given copies; those that share variables with them are also in shadow mode."""
+    """Specifications in shadow mode get copies; those that share variables with them are in shadow mode as well."""
     part = part_of(compiled("a", "b"), ["a", "b"], ["b"])
     assert list(part.module.feeds) == ["/a"]
     assert {one.name for one in part.compiled.specifications} == {"a", "b"}
@@ -128,7 +128,7 @@ def test_only_what_is_not_in_shadow_mode_has_a_module() -> None:
 
 @pytest.mark.parametrize("wrong", [b"", b"\x7fELF", b"\0asm\1\0\0\0"])
 def test_foreign_machine_code_is_refused(wrong: bytes) -> None:
-    """None of it is run."""
+    """Foreign machine code is never run."""
     part = part_of(compiled("a"), ["a"], [])
     with pytest.raises(WasmError):
         MonitorSet.of(part.compiled, fast=WasmFastPath(replace(part.module, code=wrong)))
@@ -136,6 +136,6 @@ def test_foreign_machine_code_is_refused(wrong: bytes) -> None:
 
 @pytest.mark.parametrize("length", [0, 1, 100])
 def test_a_part_that_is_cut(length: int) -> None:
-    """It is not a part."""
+    """A part with missing bytes is rejected."""
     with pytest.raises(msgspec.MsgspecError):
         decoded_part(encoded_part(part_of(compiled("a"), ["a"], []))[:length])

@@ -1,4 +1,4 @@
-"""The writer of modules has its opcodes in one file, and they are those that the proofs decode."""
+"""The generator of modules has its opcodes in one file, and they are the opcodes that the proofs decode."""
 
 import ast
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ FAMILIES = ("i32", "i64", "f32", "f64", "local", "memory")
 
 
 def literals(source: str) -> Iterator[str]:
-    """Yield bytes in a file that instructions may be built from: literals, and numbers that are made bytes of."""
+    """Yield the bytes in a file that may become instructions: literals, and numbers converted to bytes."""
     tree = ast.parse(source)
     compared = {
         id(part) for node in ast.walk(tree) if isinstance(node, ast.Compare) for part in ast.walk(node)
@@ -40,7 +40,7 @@ def literals(source: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", sorted(set(TABLE.parent.glob("*.py")) - {TABLE}), ids=lambda path: path.stem)
 def test_opcodes_are_in_the_table(path: Path) -> None:
-    """Other files of the writer name their instructions."""
+    """All other files of the generator use the names of instructions."""
     assert list(literals(path.read_text())) == []
 
 
@@ -52,7 +52,7 @@ def test_opcodes_are_in_the_table(path: Path) -> None:
     ],
 )  # fmt: skip
 def test_literals_are_found(source: str) -> None:
-    """Each way to write an opcode without its name."""
+    """Covers each way to write an opcode without its name."""
     assert list(literals(source))
 
 
@@ -61,19 +61,19 @@ def test_literals_are_found(source: str) -> None:
     ['part.value == b"sec"', "bytes(memory[at:end])", 'b"".join(parts)', "br(1)", "unsigned(len(raw))"],
 )
 def test_other_bytes_are_not_opcodes(source: str) -> None:
-    """Empty bytes, copies, comparisons with a string, and operands."""
+    """Covers empty bytes, copies, comparisons with a string, and operands."""
     assert not list(literals(source))
 
 
 def named(name: str) -> str:
-    """Return the name of an instruction as the specification of WebAssembly has it; the name itself for no family."""
+    """Return the name of an instruction as in the WebAssembly specification, or the given name if it has no family."""
     family, _, rest = name.lower().partition("_")
     return f"{family}.{rest}" if rest and family in FAMILIES else name.lower()
 
 
 @pytest.mark.parametrize("name", [name for name in vars(wasm) if "." in named(name) or name in OTHERS])
 def test_instructions_have_their_names(name: str) -> None:
-    """The decoder of the proofs, which has a table of its own, reads every instruction back."""
+    """The decoder of the proofs, which has its own table, reads every instruction back."""
     instruction = getattr(wasm, name)
     code = instruction if isinstance(instruction, bytes) else instruction(300)
     reader = decoding.Reader(code)

@@ -1,4 +1,4 @@
-"""The state of a property outlives its process (of whole monitors: `relay/monitors/test_state_keeper.py`)."""
+"""The state of a property outlives its process (for whole monitors: `relay/monitors/test_state_keeper.py`)."""
 
 from random import Random
 from typing import Any
@@ -33,7 +33,7 @@ FORMULAS = {
 
 
 def compiled(formula: str) -> MonitorSet:
-    """A specification with this property over three events on /e0, /e1, /e2."""
+    """Return a specification with this property over three events, on /e0, /e1 and /e2."""
     events = " ".join(f"event e{n}() /e{n} std_msgs/Empty '{{}}' {{ }}" for n in range(3))
     if formula.startswith("ptcaret"):
         events = events.replace("event e0", "event begin").replace("event e1", "event end")
@@ -44,7 +44,7 @@ def compiled(formula: str) -> MonitorSet:
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("seed", range(20))
 def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
-    """A run of each kind that is written and read after any step or deadline tells what it would have told."""
+    """A run of each kind, saved and loaded after any step or deadline, continues with the same verdicts."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     [declared] = compiled(FORMULAS[name]).compiled.specifications[0].properties
     formula = declared.property
@@ -62,21 +62,21 @@ def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
 
 
 def again(formula: Any, run: Any) -> Any:
-    """The run as another process reads it."""
+    """Return the run as another process reads it."""
     return run_of(formula, msgspec.msgpack.decode(msgspec.msgpack.encode(kept(run))), 0)
 
 
 @pytest.mark.parametrize("name", FORMULAS)
 @pytest.mark.parametrize("data", [[], [[], []], [["x"], []], [[["o", 3]], []], 7, [[10**6, 0, 0], []], None])
 def test_an_invalid_state_of_a_property_is_refused(name: str, data: object) -> None:
-    """Whatever is stored in place of a run, no run is made of it, and only ValueError is raised."""
+    """For any stored data in place of a run, only ValueError is raised."""
     formula = compiled(FORMULAS[name]).compiled.specifications[0].properties[0].property
     with pytest.raises(ValueError):
         run_of(formula, data, 0)
 
 
 def test_a_deep_stack_is_too_large_to_keep() -> None:
-    """The data written with each message is bounded: a deeply nested grammar is not kept, which is reported."""
+    """The data written with each message is limited, so a deeply nested grammar is not kept, and this is reported."""
     formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
     run = formula.start(0)
     for _ in range(2 * MOST_PARTS):

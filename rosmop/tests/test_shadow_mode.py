@@ -34,12 +34,12 @@ PROPERTIES = {
 
 
 def number(data: int) -> bytes:
-    """A std_msgs/UInt8."""
+    """Return a std_msgs/UInt8."""
     return bytes([data])
 
 
 class Both:
-    """Return specifications with one enabled, with that one in shadow mode, and without it."""
+    """Three sets: with one specification enabled, with it in shadow mode, and without it."""
 
     def __init__(self, texts: dict[str, str], shadowed: str, on_fault: OnFault = "drop") -> None:
         self.shadowed, self.on_fault = shadowed, on_fault
@@ -59,7 +59,7 @@ class Both:
         assert not self.story(outcome)
 
     def give(self, topic: str, body: bytes, time: int) -> None:
-        """Give all a message; it passes as it does without the one in shadow mode."""
+        """Send a message to all three; it passes as it does without the specification in shadow mode."""
         done = self.enabled.process(topic, bytearray(body), time)
         self.stories[0] += self.story(done)
         left = self.with_shadow.process(topic, bytearray(body), time)
@@ -75,7 +75,7 @@ class Both:
                 assert bytes(would.buffer) == bytes(done.buffer)
 
     def promote(self, time: int) -> None:
-        """Promote the one in shadow mode, with its state."""
+        """Promote the specification in shadow mode, with its state."""
         self.check(time)
         following = MonitorSet.of(compiled_from(self.texts, definitions()), self.on_fault)
         following.succeed(self.with_shadow, time)
@@ -83,12 +83,12 @@ class Both:
         self.with_shadow = following
 
     def go_on(self, topic: str, body: bytes, time: int) -> None:
-        """A message for those that are all enabled now."""
+        """Send a message to the sets in which all specifications are now enabled."""
         self.stories[0] += self.story(self.enabled.process(topic, bytearray(body), time))
         self.stories[1] += self.story(self.with_shadow.process(topic, bytearray(body), time))
 
     def check(self, time: int) -> list[object]:
-        """Until now both have told the same of it; that."""
+        """Fail if both reports differ so far; return them."""
         for place, sets in enumerate(([self.enabled], [self.with_shadow, *self.with_shadow.shadows])):
             for outcome in [outcome for one in sets for outcome in one.advance(time)]:
                 self.stories[place] += self.story(outcome)
@@ -96,7 +96,7 @@ class Both:
         return self.stories[0]
 
     def story(self, outcome: Outcome) -> list[object]:
-        """All that it did, in order."""
+        """Return all effects of the specification, in order."""
         before = [told for earlier in outcome.before for told in self.story(earlier)]
         did: list[object] = [one for one in outcome.events if one.startswith(f"{self.shadowed}.")]
         did += [one for one in outcome.verdicts if one.monitor == self.shadowed]
@@ -115,15 +115,15 @@ class Both:
 
 
 @FEW
-@example(seed=11435, wild=[])  # it publishes, and others that publish stand before it
+@example(seed=11435, wild=[])  # this one publishes, and follows others that publish
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=3))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """Bytes, drops and verdicts of the others are as without it, its own as with it; and it goes on after `promote`."""
+    """Effects of the others are as without it, and its own reports as if enabled; this continues after `promote`."""
     texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
     try:
         both = Both(texts, f"s{seed % len(texts)}", ("drop", "pass")[seed % 2])
     except SpecificationError:
-        return  # a draw that means nothing
+        return  # the random text is not a valid specification
     messages, time = Messages(seed), 0
     for _ in range(4):
         traffic = messages.traffic()
@@ -139,7 +139,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
 
 
 def test_the_random_specifications_reach_every_outcome() -> None:
-    """Drops, changes, verdicts, faults and ticks come up."""
+    """Drops, changes, verdicts, faults and ticks all occur."""
     found: set[str] = set()
     for seed in range(40):
         try:
@@ -160,7 +160,7 @@ def test_the_random_specifications_reach_every_outcome() -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_every_logic(logic: str) -> None:
-    """Events in any order, with deadlines that pass, while an enabled one changes and drops messages before it."""
+    """Events come in any order and deadlines pass, while an enabled specification changes and drops messages."""
     names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
     events = "".join(
         f"event {name}() /n std_msgs/UInt8 '{{data:{at}}}' {{ }} " for at, name in enumerate(names)
@@ -182,7 +182,7 @@ def test_every_logic(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", ["fsm", "ere", "cfg", "ltl", "ptltl", "ptcaret", "tick"])
 def test_every_parametric_logic(logic: str) -> None:
-    """Each slice has its own state, variables and ticks, from the first message that it sees."""
+    """Each slice has its own state, variables and ticks, from its first message on."""
     names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
     events = "".join(
         f"event {name}(int n) /n{at} std_msgs/UInt8 '{{data:n}}' {{ seen++; }} "
@@ -209,7 +209,7 @@ def test_every_parametric_logic(logic: str) -> None:
 
 @pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
 def test_publications_enforced_at_a_deadline(handler: str) -> None:
-    """Withheld publications equal real ones, at the same times, with the same variables."""
+    """Withheld publications equal real ones, at the same times and with the same variables."""
     remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
     events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))
     rule = f"pattern: globally: e0 causes e1 within 3ms enforced by help {handler}"
@@ -225,13 +225,13 @@ def test_publications_enforced_at_a_deadline(handler: str) -> None:
     assert "Publi" in str(both.check(time + 10_000_000))
 
 
-# What it stands between, and with whom
+# Its position among other specifications
 
 NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"
 
 
 def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
-    """A set, started."""
+    """Return a started set."""
     found = MonitorSet.of(
         compiled_from({f"{at}.rv": text for at, text in enumerate(texts)}, definitions()), shadows=shadowed
     )
@@ -240,7 +240,7 @@ def shadow(*texts: str, shadowed: Collection[str]) -> MonitorSet:
 
 
 def test_requests_and_responses() -> None:
-    """This holds for services also; their definition is decided by the others."""
+    """Shadow mode also works for services; only the other specifications decide about their definition."""
     text = """s() { event asked(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } } }"""
     monitors = shadow(text, shadowed=["s"])
     assert monitors.process_service("/mode", "request", b"\x01", 1).result == "passed"
@@ -250,7 +250,10 @@ def test_requests_and_responses() -> None:
 
 
 def test_specifications_that_share_variables_are_in_shadow_mode_together() -> None:
-    """However indirectly, in the order they have; what one would have dropped the next does not see."""
+    """This also holds for indirect sharing, in the same order.
+
+    A message that one would have dropped is hidden from the next.
+    """
     monitors = shadow(
         f"a() {{ int k = 0; event e({NUMBER} {{ k = n; if (n == 3) {{ return; }} }} }}",
         f"b() {{ event e({NUMBER} when (k > 1) {{ return; }} }}",
@@ -265,7 +268,7 @@ def test_specifications_that_share_variables_are_in_shadow_mode_together() -> No
 
 
 def test_a_disabled_specification_sees_nothing_and_holds_nothing() -> None:
-    """A specification that is declared `hold` holds no topic in shadow mode, nor after its promotion."""
+    """A disabled specification declared `hold` holds no topic in shadow mode, nor after its promotion."""
     text = f"hold a() {{ event e({NUMBER} {{ return; }} }}"
     monitors = MonitorSet.of(compiled_from({"0.rv": text}, definitions()), shadows=["a"])
     monitors.start(0, restarted=True)
@@ -281,7 +284,7 @@ def test_a_disabled_specification_sees_nothing_and_holds_nothing() -> None:
 
 
 def test_an_incomplete_state_is_reset_when_it_is_enforced() -> None:
-    """It does not while it stays in shadow mode; faults there do not count as faults in force."""
+    """In shadow mode the incomplete state is kept; faults there do not count after the promotion."""
     text = f"a() {{ int k = 0; event e({NUMBER} {{ k += 1; if (n == 9) {{ n = n / (n - 9); }} }} }}"
     sources = {"0.rv": text}
     monitors = shadow(text, shadowed=["a"])
@@ -300,7 +303,7 @@ def test_an_incomplete_state_is_reset_when_it_is_enforced() -> None:
 
 
 def test_a_topic_of_shadow_mode_only_has_a_type_there_only() -> None:
-    """A publisher with another definition is not refused for its sake."""
+    """A publisher with another definition is not refused because of such a topic."""
     monitors = shadow("s() { event e() /chatter std_msgs/String '{}' { } }", shadowed=["s"])
     assert monitors.wants("/chatter")
     assert (monitors.type_of("/chatter"), monitors.type_of("/chatter", shadowed=True)) == (

@@ -1,4 +1,4 @@
-"""The specifications in `monitors/` do what they say on the topics of the LandShark."""
+"""The specifications in `monitors/` keep their promises on the topics of the LandShark."""
 
 import gc
 import math
@@ -38,12 +38,12 @@ TRIGGER = message("std_msgs/Header", frame_id="ocu") + b"\x01"
 
 
 def joints(tilt: float) -> bytes:
-    """Where the gun points."""
+    """Return the joint states for a direction of the gun."""
     return message("sensor_msgs/JointState", name=["turret_pan", "turret_tilt"], position=[0.1, tilt])
 
 
 def drive(forward: float) -> bytes:
-    """A velocity command."""
+    """Return a velocity command."""
     return message("geometry_msgs/TwistStamped", twist__linear__x=forward, twist__angular__z=0.5)
 
 
@@ -69,7 +69,7 @@ def test_the_gun_fires_only_in_a_safe_pose(tilt: float | None, result: str) -> N
 
 
 def test_the_gun_is_watched_all_the_time() -> None:
-    """A pose that becomes unsafe forbids what was allowed before."""
+    """If a pose becomes unsafe, a shot that was allowed before is forbidden."""
     monitors = shipped("safe_triggering")
     seen = []
     for time, tilt in enumerate((0.2, -0.7, 0.1)):
@@ -79,13 +79,13 @@ def test_the_gun_is_watched_all_the_time() -> None:
 
 
 def odometry(x: float, y: float = 0.0, speed: float = 0.0) -> bytes:
-    """Where the robot is, and how fast."""
+    """Return an odometry message with position and speed."""
     return message("nav_msgs/Odometry", pose__pose__position__x=x, pose__pose__position__y=y,
                    twist__twist__linear__x=speed, child_frame_id="base_link")  # fmt: skip
 
 
 def fix(latitude: float, longitude: float) -> bytes:
-    """Return a message of the GPS."""
+    """Return a GPS message."""
     return message("sensor_msgs/NavSatFix", latitude=latitude, longitude=longitude)
 
 
@@ -99,7 +99,7 @@ def fix(latitude: float, longitude: float) -> bytes:
     ],
 )
 def test_the_robot_stays_in_its_zone(topic: str, inside: bytes, outside: bytes) -> None:
-    """Outside by either measure, forward commands are dropped; backing up and turning are not."""
+    """Outside by either measure, forward commands are dropped; commands to back up and turn pass."""
     monitors = shipped("safe_zone")
     command = "/landshark_control/base_velocity"
     monitors.process(topic, inside, 1)
@@ -114,7 +114,7 @@ def test_the_robot_stays_in_its_zone(topic: str, inside: bytes, outside: bytes) 
 
 
 def scan(distance: float, beams: int = 61) -> bytes:
-    """A laser scan with one thing straight ahead."""
+    """Return a laser scan with one object straight ahead."""
     ranges = [math.inf] * beams
     ranges[beams // 2] = distance
     step = math.radians(120) / (beams - 1)
@@ -127,7 +127,7 @@ def commanded(monitors: MonitorSet, time: int, forward: float = 1.0) -> Outcome:
 
 
 def test_the_robot_stops_before_an_obstacle() -> None:
-    """The way ahead that must be free grows with the speed; an alarm is published on a topic of its own."""
+    """The free distance that is required grows with the speed; an alarm is published on its own topic."""
     monitors = shipped("obstacle_avoidance")
     monitors.process("/landshark/odom", odometry(0, speed=1.0), 1)
     monitors.process("/landshark/scan", scan(5.0), 2)
@@ -146,7 +146,7 @@ def test_the_robot_stops_before_an_obstacle() -> None:
 
 
 def test_an_obstacle_beside_the_robot_does_not_stop_it() -> None:
-    """Only what is ahead counts."""
+    """Only objects ahead of the robot count."""
     monitors = shipped("obstacle_avoidance")
     ranges = [0.2] * 5 + [9.0] * 51 + [0.2] * 5
     step = math.radians(120) / 60
@@ -156,7 +156,7 @@ def test_an_obstacle_beside_the_robot_does_not_stop_it() -> None:
 
 
 def test_a_silent_laser_stops_the_robot() -> None:
-    """Half a second without a scan counts as an obstacle, until scans come again; also before the first one."""
+    """Half a second without a scan, also before the first one, counts as an obstacle until scans arrive again."""
     monitors = shipped("obstacle_avoidance")
     assert commanded(monitors, 1).result == "changed"
     monitors.process("/landshark/scan", scan(9.0), SECOND)
@@ -167,7 +167,7 @@ def test_a_silent_laser_stops_the_robot() -> None:
 
 
 def test_logging_changes_nothing() -> None:
-    """The diary is written, and every message passes as it was."""
+    """The log is written, and every message passes unchanged."""
     monitors = shipped("logging")
     lines = []
     for time, charge in enumerate((1.0, 0.98, 0.94, 0.2)):
@@ -188,7 +188,7 @@ def test_logging_changes_nothing() -> None:
 
 
 def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
-    """A message of the action `/count` about the goal of this id."""
+    """Return a message of the action `/count` about the goal with this id."""
     types = {
         "goal": "actionlib/TestActionGoal",
         "result": "actionlib/TestActionResult",
@@ -200,7 +200,7 @@ def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
 
 
 def test_each_goal_is_answered_within_its_cancel() -> None:
-    """The cancelled goal without an answer within three seconds is named, the other is not."""
+    """If one of two cancelled goals has no answer within three seconds, only that goal is reported."""
     monitors = shipped("goals")
     for number, name in enumerate(("a", "b", "c")):
         goal(monitors, "goal", name, number)
@@ -212,7 +212,7 @@ def test_each_goal_is_answered_within_its_cancel() -> None:
 
 
 def test_an_id_is_that_of_one_goal() -> None:
-    """The second goal of an id is reported with it; after the answer nothing is kept but the id."""
+    """A second goal with the same id is reported; after the answer only the id is kept."""
     monitors = shipped("goals")
     goal(monitors, "goal", "a", 1)
     (verdict,) = goal(monitors, "goal", "a", 2).verdicts
@@ -224,7 +224,7 @@ def test_an_id_is_that_of_one_goal() -> None:
 
 
 def test_a_set_that_is_gone_leaves_nothing_to_the_garbage_collector() -> None:
-    """It would hold up all messages for as long as it looks: a tenth of a second after some loads of fifty."""
+    """Otherwise the collector would delay all messages: by a tenth of a second after some loads of fifty."""
     monitors = shipped(*(path.stem for path in MONITORS.glob("*.rv")), made=on_module)
     monitors.process("/landshark_control/base_velocity", drive(1.0), SECOND)
     assert monitors.process("/landshark_control/base_velocity", b"", SECOND).faults

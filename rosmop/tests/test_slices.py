@@ -1,4 +1,4 @@
-"""Parametric specifications: the same as one specification for each binding, within bounds, wherever they run."""
+"""Parametric specifications equal one specification for each binding, within limits, in module and interpreter."""
 
 # ruff: noqa: E501  the rows of tables
 
@@ -46,7 +46,7 @@ TWO = {"ere": ("match", "fail"), "fsm": ("match", "fail"), "cfg": ("match", "fai
 
 @dataclass(frozen=True)
 class Made:
-    """A random specification: the parameters that each event binds, the events that create a slice, and its body."""
+    """A random specification: the parameters of each event, the events that create a slice, and the body."""
 
     parameters: str
     binds: dict[str, str]
@@ -55,7 +55,7 @@ class Made:
     actions: dict[str, str]
 
     def text(self, binding: bool) -> str:
-        """The specification with its parameters, or the same without."""
+        """Return the specification, with or without its parameters."""
         head = ", ".join(f"{FIELDS[one][0]} {one}" for one in self.parameters)
         lines = [f"s({head if binding else ''}) {{ int n = 0;"]
         for event, bound in self.binds.items():
@@ -69,7 +69,7 @@ class Made:
 
 
 def a_property(random: Random) -> str:
-    """A random formula with handlers."""
+    """Draw a random formula with handlers."""
     logic = random.choice(list(FORMULAS))
     body = ['ROS_INFO("%d", n);', "n = n * 2;", 'ROS_INFO("%d", n); __RESET;', ""]
     handlers = [
@@ -79,7 +79,7 @@ def a_property(random: Random) -> str:
 
 
 def made(random: Random) -> Made:
-    """A random specification that is right."""
+    """Draw a valid random specification."""
     parameters = random.choice(["p", "p", "q", "pq", "pq", "rp", "pqr"])
     while True:
         binds = {event: "".join(one for one in parameters if random.random() < 0.7) for event in "abc"}
@@ -99,7 +99,7 @@ Trace = Sequence[tuple[str, dict[str, object]]]
 
 
 def trace(random: Random, length: int) -> Trace:
-    """Events with the values of all fields; which of these are bound says the specification."""
+    """Draw events with the values of all fields; the specification decides which of them are bound."""
     few = random.randint(1, 3)
     return [
         (
@@ -111,7 +111,7 @@ def trace(random: Random, length: int) -> Trace:
 
 
 def body(values: dict[str, object]) -> bytes:
-    """The message of an event."""
+    """Return the message of an event."""
     return message("std_msgs/Header", frame_id=values["p"], seq=values["q"], stamp__sec=values["r"])
 
 
@@ -128,7 +128,7 @@ def told(outcome: Outcome) -> Told:
 
 
 def naive(one: Made, trace: Trace) -> list[Told]:
-    """By definition: for each binding of all parameters the slice is given to the specification without parameters."""
+    """Return the effects by definition: each binding's part of the trace is given to the plain specification."""
     expected: list[Told] = [[] for _ in trace]
     values = [dict.fromkeys(values[name] for _, values in trace) for name in one.parameters]
     for choice in itertools.product(*values):
@@ -151,7 +151,7 @@ def naive(one: Made, trace: Trace) -> list[Told]:
 
 @pytest.mark.parametrize("seed", range(60))
 def test_slices_equal_one_specification_for_each_binding(seed: int) -> None:
-    """Random specifications and traces: verdicts, output and variables as by definition; so does the interpreter."""
+    """Verdicts, output and variables of random specifications equal the definition, also in the interpreter."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
     one = made(random)
     monitors = load(one.text(binding=True))
@@ -166,7 +166,7 @@ def test_slices_equal_one_specification_for_each_binding(seed: int) -> None:
 
 
 def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
-    """Given to the specification without parameters they tell the category; and each of them is of the slice."""
+    """These events alone, given to the specification without parameters, have the verdict, and all are of the slice."""
     random, explained = seeded(44), 0
     for _ in range(examples(60)):
         one = replace(made(random), actions=dict.fromkeys("abc", ""))
@@ -193,7 +193,7 @@ def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
 
 
 def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence[int]:
-    """The places of the events that bind nothing else, from the first on that may begin a slice."""
+    """Return the positions of the events that bind no other value, from the first that may begin a slice."""
     shown = {name: str(given) for name, given in binding.items()}
     own = [
         place
@@ -213,7 +213,7 @@ def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence
     ids=["a condition", "a drop"],
 )
 def test_an_event_that_did_not_happen_in_a_slice_does_not_explain_it(look: str, handler: str) -> None:
-    """An event without the parameter happens in one slice and not in the other: there it is not named, nor guessed."""
+    """An event without the parameter may happen in one slice only; then no explanation is guessed."""
     text = f"""s(int id) {{
         int n = 0;
         creation event go(int id) /go std_msgs/Int32 '{{data:id}}' {{ n = n + id - 1; }}
@@ -242,24 +242,24 @@ goals(std::string id) {
     @fail { ROS_WARN("%s", id.c_str()); DROP; }
 }
 """
-# The same without what keeps a slice that is over.
+# The same specification without the part that keeps a finished slice.
 ANSWERED = GOALS.replace('@fail { ROS_WARN("%s", id.c_str()); DROP; }', "")
 
 
 def text(value: str) -> bytes:
-    """A `std_msgs/String`."""
+    """Return a `std_msgs/String`."""
     return message("std_msgs/String", data=value)
 
 
 def live(monitors: MonitorSet) -> int:
-    """How many slices there are."""
+    """Return the number of slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     return slices.live
 
 
 def test_a_long_binding_is_a_fault() -> None:
-    """A binding of more bytes than a slice may have is a fault."""
+    """If a binding has more bytes than a slice may have, it is a fault."""
     monitors = load(GOALS)
     assert not monitors.process("/goal", text("x" * MAX_BINDING), 1).faults
     outcome = monitors.process("/goal", text("x" * (MAX_BINDING + 1)), 2)
@@ -269,7 +269,7 @@ def test_a_long_binding_is_a_fault() -> None:
 
 
 def test_finished_slices_are_collected_and_do_not_begin_again() -> None:
-    """No memory for a goal that is answered, but its id is not taken for another one's; as many as the bound are known."""
+    """An answered goal uses no memory, but its id cannot be reused; the number of known ids is limited."""
     counted = ANSWERED.replace("again = again + 1;", "if (again < 1) again = again + 1;")
     monitors = MonitorSet.of(compiled_from({"x.rv": counted}, definitions()), slices=3)
     monitors.start(0)
@@ -283,7 +283,7 @@ def test_finished_slices_are_collected_and_do_not_begin_again() -> None:
 
 
 def test_a_slice_in_its_initial_state_is_forgotten() -> None:
-    """Hosts that connect and leave again use no memory, however many there are."""
+    """Hosts that connect and leave again use no memory, whatever their number."""
     clients = (
         "clients(std::string id) {"
         "event connect(std::string id) /c std_msgs/String '{data:id}' { }"
@@ -301,7 +301,7 @@ def test_a_slice_in_its_initial_state_is_forgotten() -> None:
 
 
 def test_slices_stay_when_specifications_are_loaded_again() -> None:
-    """With the same text they go on; with another they begin again."""
+    """Slices of an unchanged text continue; slices of a changed text begin again."""
     monitors = load(GOALS)
     monitors.process("/goal", text("a"), 1)
     other = "other() { event e() /o std_msgs/Empty '{}' { } }"
@@ -316,7 +316,7 @@ def test_slices_stay_when_specifications_are_loaded_again() -> None:
 
 
 def test_nan_is_one_binding() -> None:
-    """NaN equals nothing, and is one slice all the same."""
+    """NaN equals no value, but still has only one slice."""
     monitors = load(
         "s(double x) { event e(double x) /e std_msgs/Float64 '{data:x}' { } ere: e e @match { } @fail { } }"
     )
@@ -326,7 +326,7 @@ def test_nan_is_one_binding() -> None:
 
 
 def test_the_automaton_of_a_slice_is_certified() -> None:
-    """It is the one of the formula, as without parameters."""
+    """The automaton is the same as for the formula without parameters."""
     with_, without = (
         certificates_of(load(one).monitors)[0]["goals"]
         for one in (GOALS, GOALS.replace("goals(std::string id)", "goals()").replace("id.c_str()", '"x"'))
@@ -336,7 +336,7 @@ def test_the_automaton_of_a_slice_is_certified() -> None:
 
 
 def test_a_slice_takes_less_than_a_kilobyte() -> None:
-    """With ids of 36 characters, counted by Python's own count of what it has allocated: 100,000 fit into 100 MB."""
+    """With ids of 36 characters, 100,000 slices fit into 100 MB, by Python's count of allocations."""
     monitors = load(GOALS)
     slices = monitors.monitors[0].slices
     assert slices is not None
@@ -351,7 +351,7 @@ def test_a_slice_takes_less_than_a_kilobyte() -> None:
 
 
 def test_runs_that_may_grow_have_a_lower_limit() -> None:
-    """A run of a grammar has no bound of its own that would hold for each of 100,000."""
+    """The run of a grammar has no size limit that would allow 100,000 of them."""
     slices = (
         load(
             "s(std::string id) { event e(std::string id) /t std_msgs/String '{data:id}' { }"
@@ -365,7 +365,7 @@ def test_runs_that_may_grow_have_a_lower_limit() -> None:
 
 
 def test_topics_of_parametric_specifications_have_no_lane() -> None:
-    """The module does not know slices; it takes the messages of other topics."""
+    """The module does not support slices, but it handles the messages of other topics."""
     other = "other() { bool b = false; event e(bool x) /o std_msgs/Bool '{data:x}' { b = x; } }"
     monitors = on_module(compiled_from({"x.rv": GOALS, "y.rv": other}, definitions()))
     monitors.start(0)
@@ -375,7 +375,7 @@ def test_topics_of_parametric_specifications_have_no_lane() -> None:
 
 
 def test_one_message_may_concern_all_slices() -> None:
-    """Verdicts of hundreds at once, in the order in which the slices began."""
+    """Hundreds of verdicts come at once, in the order in which the slices began."""
     monitors = load(ANSWERED)
     for number in range(200):
         monitors.process("/goal", text(str(number)), 1)

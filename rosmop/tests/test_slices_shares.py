@@ -1,4 +1,4 @@
-"""Slices are charged to the hosts whose messages make them: none uses up what others need, in number or in time."""
+"""Slices are charged to the hosts whose messages create them: no host uses up the number or time of others."""
 
 # ruff: noqa: E501  the rows of tables
 
@@ -27,19 +27,19 @@ ACTING, OBSERVING = GOALS % "DROP;", GOALS % 'ROS_WARN("twice");'
 
 
 def begun(text: str, slices: int) -> MonitorSet:
-    """A set in which each source is a host."""
+    """Return a started set in which each source is a host."""
     monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()), slices=slices, holder_of=HOSTS.get)
     monitors.start(0)
     return monitors
 
 
 def send(monitors: MonitorSet, topic: str, name: str, sender: MessageSender, time: int = 1) -> Outcome:
-    """A message about a goal."""
+    """Send a message about a goal."""
     return monitors.process(topic, message("std_msgs/String", data=name), time, sender)
 
 
 def live(monitors: MonitorSet) -> int:
-    """How many slices there are."""
+    """Return the number of slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     return slices.live
@@ -51,7 +51,7 @@ def of_host(slices: Slices, host: str) -> list[Binding]:
 
 
 def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
-    """Where a specification acts, the guest's own new ids fault; the robot's goals are judged as before."""
+    """If a specification acts, the guest's new ids are faults; the robot's goals are judged as before."""
     monitors = begun(ACTING, 100)
     assert not send(monitors, "/goal", "r", ROBOT).faults
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
@@ -61,11 +61,11 @@ def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
     for number in range(20):
         assert not send(monitors, "/goal", f"r{number}", ROBOT).faults
     assert send(monitors, "/goal", "r", ROBOT).verdicts
-    assert send(monitors, "/goal", "g0", GUEST).verdicts  # what it owes is not forgotten
+    assert send(monitors, "/goal", "g0", GUEST).verdicts  # its debt is not forgotten
 
 
 def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
-    """Where a specification only observes, the oldest goals of the guest are dropped and reported; others stay."""
+    """If a specification only observes, the guest's oldest goals are dropped and reported; other hosts' goals stay."""
     monitors = begun(OBSERVING, 100)
     send(monitors, "/goal", "r", ROBOT)
     outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
@@ -80,7 +80,7 @@ def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
 
 
 def test_hosts_that_are_not_told_apart_have_the_whole() -> None:
-    """A recording has no hosts: there all slices are one's."""
+    """A recording has no hosts, so all slices count for one host."""
     monitors = begun(ACTING, 100)
     for number in range(100):
         assert not send(monitors, "/goal", str(number), MessageSender(9)).faults
@@ -89,7 +89,7 @@ def test_hosts_that_are_not_told_apart_have_the_whole() -> None:
 
 @pytest.mark.parametrize("text", [ACTING, OBSERVING])
 def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
-    """For any senders and order the bound holds, and a host's slices end by its own messages only."""
+    """For any senders and order the limit holds, and only a host's own messages end its slices."""
     for seed in range(examples(60)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         monitors = begun(text, 12)
@@ -110,7 +110,7 @@ def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
 
 
 def test_a_guest_has_no_binding_of_the_robot_forgotten() -> None:
-    """However many goals of a guest end, the robot's late messages begin none of its own goals again."""
+    """However many goals of a guest end, late messages of the robot never restart one of the robot's goals."""
     monitors = begun(ACTING, 10)
     send(monitors, "/goal", "r", ROBOT)
     send(monitors, "/result", "r", ROBOT)
@@ -132,7 +132,7 @@ STOPPED = """goals(std::string id) {
 
 
 def states(monitors: MonitorSet) -> list[object]:
-    """The states and variables of all slices."""
+    """Return the states and variables of all slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
     found = [slices.state(binding) for _host, binding in slices.quota.all()]
@@ -144,7 +144,7 @@ def states(monitors: MonitorSet) -> list[object]:
 
 
 def test_one_message_concerns_a_bounded_number_of_slices() -> None:
-    """Where an event does not bind all parameters the number of slices is bounded, whatever the setting."""
+    """If an event does not bind all parameters, the number of its slices is limited, whatever the setting."""
     monitors = begun(STOPPED % "{ }", 100_000)
     for number in range(TOGETHER_LIMIT):
         send(monitors, "/goal", str(number), MessageSender(9))
@@ -156,7 +156,7 @@ def test_one_message_concerns_a_bounded_number_of_slices() -> None:
 
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> None:
-    """The budget ends in the middle of the slices: one fault, nothing put out, and all slices as before."""
+    """If the budget ends in the middle of the slices, there is one fault, no output, and all slices are unchanged."""
     action = '{ times = times + 1; ROS_INFO("stop"); for (int i = 0; i < 300000; i++) { times = times; } }'
     monitors = MonitorSet.of(compiled_from({"x.rv": STOPPED % action}, definitions()), on_fault)
     monitors.start(0)
@@ -170,7 +170,7 @@ def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> No
 
 
 def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
-    """At a tick each slice has a budget of its own: the robot's stop is published, however many slices loop."""
+    """Each slice has its own budget at a tick: the robot's stop is published, however many other slices loop."""
     text = """goals(std::string id) {
         static std_msgs::Empty stop; int loops = 0; bool waits = true;
         creation event goal(std::string id, int seq) /goal std_msgs/Header '{frame_id:id, seq:seq}' { loops = seq; }
@@ -186,7 +186,7 @@ def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
 
 
 def test_the_time_limit_of_a_message_grows_with_its_slices() -> None:
-    """The robot's stop for all its goals is not cut off, though each handler takes some microseconds."""
+    """The robot's stop for all its goals is not cut off, although each handler takes some microseconds."""
     text = STOPPED.replace("@again { DROP; }", '@stopped { ROS_INFO("stopped"); }') % "{ }"
     monitors = begun(text, 1000)
     for number in range(200):
@@ -198,7 +198,7 @@ def test_the_time_limit_of_a_message_grows_with_its_slices() -> None:
 
 
 def test_slices_of_a_guest_take_no_time_of_a_tick_from_those_of_the_robot() -> None:
-    """Each also has its own processor time at a tick."""
+    """At a tick each slice also has its own processor time."""
     text = """goals(std::string id) {
         static std_msgs::Empty stop; bool waits = true;
         creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }

@@ -1,4 +1,4 @@
-"""Time for each binding: the same as one specification for each binding, deadlines included, within bounds."""
+"""Time for each binding equals one specification for each binding, deadlines included, within limits."""
 
 # ruff: noqa: E501  the rows of tables
 
@@ -49,7 +49,7 @@ def compiled(text: str) -> Compiled:
 
 
 def running(text: str, start: int, deadlines: int = sys.maxsize) -> MonitorSet:
-    """A set that has begun."""
+    """Return a started set."""
     monitors = MonitorSet.of(compiled(text), deadlines=deadlines)
     monitors.start(start)
     return monitors
@@ -61,7 +61,7 @@ Entry = tuple[int, int, tuple[tuple[str, str], ...]]
 
 
 def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
-    """Return the reports of these, and of the deadlines before them."""
+    """Return the reports of these events, and of the deadlines before them."""
     found: list[Entry] = []
     for outcome in outcomes:
         found += entries(outcome.before, -1)
@@ -72,7 +72,7 @@ def entries(outcomes: Iterable[Outcome], place: int) -> list[Entry]:
 
 
 def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
-    """Return the deadlines until the end, which may take several goes."""
+    """Return the reports of the deadlines until the end, which may take several calls."""
     found: list[Outcome] = []
     for _ in range(1000):
         found += monitors.advance(end)
@@ -82,9 +82,9 @@ def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
 
 
 def naive(one: Made, trace: Timed, end: int) -> list[Entry]:
-    """By definition: each binding's part of the trace is given to the specification without parameters.
+    """Return the reports by definition: each binding's part of the trace is given to the plain specification.
 
-    Where there are only formulas a slice has not begun with a message that is dropped.
+    If there are only formulas, a dropped message does not begin a slice.
     """
     formulas = all(LOGICS[each.split(":")[0]].suppresses for each in one.properties)
     expected: list[Entry] = []
@@ -118,7 +118,7 @@ def naive(one: Made, trace: Timed, end: int) -> list[Entry]:
 
 
 def agree(one: Made, trace: Timed, deadlines: int = sys.maxsize) -> None:
-    """Fail where the slices differ from the definition."""
+    """Fail if the slices differ from the definition."""
     end = trace[-1][0] + 20 * SECOND
     monitors = running(one.text(binding=True), 0, deadlines)
     found: list[Entry] = []
@@ -129,7 +129,7 @@ def agree(one: Made, trace: Timed, deadlines: int = sys.maxsize) -> None:
 
 
 def joined(found: Iterable[Entry]) -> list[Entry]:
-    """The effects of one message in several slices are one entry; deadlines are one for each slice."""
+    """Return the reports with one message's effects in several slices joined; deadlines stay separate by slice."""
     whole: dict[int, Entry] = {}
     rest: list[Entry] = []
     for time, place, said in found:
@@ -142,7 +142,7 @@ def joined(found: Iterable[Entry]) -> list[Entry]:
 
 
 def a_timed_property(random: Random) -> str:
-    """A random formula with time, with handlers."""
+    """Draw a random formula with time bounds and handlers."""
     logic = random.choice(list(TIMED))
     handled = random.sample(HANDLED[logic], 2)
     formula = random.choice(TIMED[logic])
@@ -153,14 +153,14 @@ def a_timed_property(random: Random) -> str:
 
 
 def timed(random: Random) -> Made:
-    """A random specification with a property that has time, and perhaps another."""
+    """Draw a random specification with a timed property, and perhaps another property."""
     one = made(random)
     others = one.properties[:1] if random.random() < 0.4 else ()
     return replace(one, properties=(a_timed_property(random), *others))
 
 
 def trace_of(random: Random, length: int) -> Timed:
-    """Events with the values of all fields, often exactly at a bound."""
+    """Draw events with the values of all fields, often exactly at a time bound."""
     few, time, found = random.randint(1, 3), SECOND, []
     for _ in range(length):
         time += random.choice((0, 0, SECOND, SECOND, SECOND // 2, 2 * SECOND, 3 * SECOND + 1))
@@ -174,7 +174,7 @@ def trace_of(random: Random, length: int) -> Timed:
 @pytest.mark.parametrize("part", range(4))
 @pytest.mark.parametrize("deadlines", [1, 1_000_000])
 def test_each_binding_has_a_time_of_its_own(part: int, deadlines: int) -> None:
-    """Verdicts, their times and output are as by definition, also where deadlines pass one at a time."""
+    """Verdicts, times and output equal the definition, also if deadlines pass one at a time."""
     for seed in range(part, 4 * examples(60), 4):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         agree(timed(random), trace_of(random, 14), deadlines=deadlines)
@@ -182,7 +182,7 @@ def test_each_binding_has_a_time_of_its_own(part: int, deadlines: int) -> None:
 
 @pytest.mark.parametrize("formula", [*TIMED["pattern"][:3], *TIMED["tfsm"], *TIMED["mtl"][:4]])
 def test_all_short_traces_of_two_bindings(formula: str) -> None:
-    """All traces of three events of two bindings, each before a bound, at it, and just behind it."""
+    """Covers all traces of three events and two bindings, each before a bound, at it, and just after it."""
     logic = next(name for name, formulas in TIMED.items() if formula in formulas)
     handlers = " ".join(
         f'@{one} {{ ROS_INFO("%d", n); }}' for one in HANDLED[logic] if one != "late" or "late" in formula
@@ -210,12 +210,12 @@ STOP = """goals(std::string id) {
 
 
 def text(value: str) -> bytes:
-    """A `std_msgs/String`."""
+    """Return a `std_msgs/String`."""
     return message("std_msgs/String", data=value)
 
 
 def test_a_goal_without_a_result_publishes_the_stop_once_at_its_deadline() -> None:
-    """Five goals, four results: one stop, for the fifth, after its 30 s; then no slice is left."""
+    """Five goals with four results give one stop, for the fifth goal after its 30 s; then no slice is left."""
     monitors = running(STOP, 0)
     for number in range(5):
         monitors.process("/goal", text(str(number)), number * SECOND)
@@ -238,7 +238,7 @@ def test_a_goal_without_a_result_publishes_the_stop_once_at_its_deadline() -> No
 
 
 def test_deadlines_beyond_the_limit_wait_but_precede_messages_of_their_slice() -> None:
-    """A bounded number of deadlines pass at once; a message of a goal still comes after the goal's own deadline."""
+    """A limited number of deadlines pass at once; a message of a goal still follows the goal's own deadline."""
     monitors = running(STOP, 0, deadlines=10)
     for number in range(40):
         monitors.process("/goal", text(str(number)), SECOND)
@@ -252,13 +252,13 @@ def test_deadlines_beyond_the_limit_wait_but_precede_messages_of_their_slice() -
 
 
 def slices_in_memory() -> int:
-    """Return how many slices there are in this process, with those that only a deadline refers to."""
+    """Return the number of slices in this process, including those that only a deadline refers to."""
     gc.collect()
     return sum(isinstance(thing, Slice) for thing in gc.get_objects())
 
 
 def test_finished_slices_leave_no_deadlines() -> None:
-    """Goals that are answered leave nothing behind, however many there are within their bound."""
+    """Goals answered within their bound leave no deadline behind, whatever their number."""
     monitors = running(STOP, 0)
     slices = monitors.monitors[0].slices
     assert slices is not None
@@ -271,7 +271,7 @@ def test_finished_slices_leave_no_deadlines() -> None:
 
 
 def test_a_slice_lives_while_its_timer_may_act() -> None:
-    """A timer that publishes the stop goes on, though no handler can run any more."""
+    """A timer that publishes the stop continues, even if no handler can run any more."""
     watched = """goals(std::string id) {
         static std_msgs::Empty stop; bool waits = false; ros::Time since;
         creation event goal(std::string id) /goal std_msgs/String '{data:id}' { waits = true; since = ros::Time::now(); }
@@ -293,7 +293,7 @@ def test_a_slice_lives_while_its_timer_may_act() -> None:
 
 
 def test_deadlines_name_the_events_of_their_own_slice() -> None:
-    """A verdict at a deadline is explained by events of the binding, and they alone give it."""
+    """A verdict at a deadline is explained by events of its binding, and those alone have the verdict."""
     explained = 0
     for seed in range(examples(120)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
@@ -339,7 +339,7 @@ WAITING = ["pattern: globally: a causes b within 2s @violation { %s }", "mtl: a 
 
 
 def test_a_drop_is_undone_in_its_slice() -> None:
-    """Messages are dropped now and then, beside deadlines: as by definition, for each binding."""
+    """With drops beside deadlines, each binding has the effects of the definition."""
     for seed in range(examples(400)):
         random = Random(seed)  # noqa: S311  draws examples, not keys
         formula = random.choice(DROPPING)
@@ -359,7 +359,7 @@ def test_a_drop_is_undone_in_its_slice() -> None:
 
 
 def test_a_remedy_is_published_for_each_binding() -> None:
-    """`enforced by`: at the deadline of each goal its result is published, and the goal is over."""
+    """With `enforced by`, the result is published at the deadline of each goal, and the goal is over."""
     enforced = STOP.replace(
         "within 30s\n    @violation { PUBLISH(/stop, std_msgs/Empty, stop); __RESET; }",
         "within 30s enforced by halt",

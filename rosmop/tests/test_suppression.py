@@ -1,4 +1,4 @@
-"""A dropped message has not happened for formulas: their trace is the one that subscribers saw."""
+"""For formulas, a dropped message has not happened: their trace is the one that subscribers saw."""
 
 from collections.abc import Iterator, Sequence
 from itertools import product
@@ -41,18 +41,18 @@ FORMULAS = [
 
 
 def guard(formula: str, handler: str = "DROP;", name: str = "s", event: str = "") -> str:
-    """A specification over the topics /a, /b and /c whose property's handler may drop."""
+    """Return a specification over the topics /a, /b and /c whose property's handler may drop."""
     events = "".join(f"event {name} () /{name} std_msgs/Empty '{{}}' {{ {event} }}\n" for name in ABC)
     return f"{name}() {{ {events} {formula} @violation {{ {handler} }} }}"
 
 
 def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
-    """Whether each message of a trace goes on."""
+    """Return whether each message of a trace passes."""
     return [monitors.process(f"/{event}", b"", time).result == "passed" for time, event in trace]
 
 
 def violates(tree: Tree, before: Timed, event: tuple[int, str]) -> bool:
-    """By definition: whether a violation becomes certain with an event, after what subscribers saw."""
+    """Whether, by definition, a violation becomes certain with an event after the messages that subscribers saw."""
     trace, now = (*before, event), event[0] - 1
     return any(
         worth(tree, [*trace], place, now) is False
@@ -73,7 +73,7 @@ def told(property_: CompiledProperty, trace: Timed) -> tuple[str, ...]:
 
 
 def projected(property_: CompiledProperty, trace: Timed) -> list[bool]:
-    """Whether each message goes on, if each is judged by a run that has seen those before it that went on."""
+    """Return whether each message passes, if a run judges it that has seen only the earlier messages that passed."""
     seen: Timed = []
     found = []
     for event in trace:
@@ -83,7 +83,7 @@ def projected(property_: CompiledProperty, trace: Timed) -> list[bool]:
 
 
 def timed(random: Random, length: int, most: int = 2) -> Timed:
-    """A random trace."""
+    """Draw a random timed trace."""
     time, trace = 1, []
     for _ in range(length):
         time += random.randint(0, most)
@@ -93,7 +93,7 @@ def timed(random: Random, length: int, most: int = 2) -> Timed:
 
 @pytest.mark.parametrize("handler", ["DROP;", "DROP; __RESET;", "__RESET; DROP;"])
 def test_an_interlock_neither_sticks_nor_forgets(handler: str) -> None:
-    """A halt forbids motion for 5 s, again and again: nothing else is dropped, and no drop makes it forget."""
+    """A halt forbids motion for 5 s, repeatedly: nothing else is dropped, and no drop makes the monitor forget."""
     monitors = load(guard("pattern: globally: a forbids b within 5s", handler))
     trace = [(0, "b"), (1, "a"), (2, "b"), (3, "b"), (4, "a"), (8, "b"), (10, "b"), (20, "a"), (21, "b")]
     assert passed(monitors, [(time * SECOND, event) for time, event in trace]) == [
@@ -103,7 +103,7 @@ def test_an_interlock_neither_sticks_nor_forgets(handler: str) -> None:
 
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_all_short_traces(formula: str) -> None:
-    """A message goes on if the formula is not violated by it after those that went on; time passes for the others."""
+    """A message passes if it does not violate the formula after the messages that passed; time always passes."""
     logic, _, text = formula.partition(": ")
     property_ = compiled(logic, text)
     for length in (3, 5):
@@ -143,7 +143,7 @@ def test_random_metric_formulas_by_definition(operators: Sequence[str]) -> None:
 
 
 def test_random_patterns_by_definition() -> None:
-    """The same of patterns."""
+    """Random patterns behave as in the test above."""
     random, dropped = seeded(27), 0
     for _ in range(examples(600)):
         kind, within = random.choice(("no", "requires", "forbids")), random.choice((None, 1, 3))
@@ -164,7 +164,7 @@ def test_random_patterns_by_definition() -> None:
 
 
 def test_random_linear_formulas() -> None:
-    """The same of `ltl`: by runs that have seen what went on only."""
+    """Random `ltl` formulas behave the same, compared with runs that have seen only the passed messages."""
     random, dropped = seeded(28), 0
     for _ in range(examples(300)):
         tree = draw(
@@ -187,7 +187,7 @@ def test_random_linear_formulas() -> None:
 
 
 def test_a_run_goes_on_as_if_it_had_never_stepped() -> None:
-    """Several steps are taken back together, then the run tells at each event and deadline what its twin tells."""
+    """After several steps are undone together, the run has the same verdicts as its twin at each event and deadline."""
     random = seeded(29)
     for _ in range(examples(400)):
         _, text = _bounded(random, (*PAST, *FUTURE))
@@ -216,7 +216,7 @@ def _dropping(how: str) -> str:
 
 @pytest.mark.parametrize("how", ["action", "fault", "handler"])
 def test_whatever_drops_the_message_formulas_of_all_specifications_have_not_seen_it(how: str) -> None:
-    """Also those before the one that drops; a machine has seen it, and variables keep what was assigned."""
+    """Specifications before the dropping one are included; a machine has seen it, and variables stay assigned."""
     machine = "fsm: idle [b -> moved] moved [default moved] @moved { moved = true; }"
     formula = "ptltl: !(<*> b) @violation { seen = true; }"
     events = "".join(f"event {name} () /{name} std_msgs/Empty '{{}}' {{ }}\n" for name in ABC)
@@ -241,7 +241,7 @@ def test_a_reset_by_a_message_that_is_dropped_later_is_none() -> None:
 
 
 def test_in_shadow_mode_the_trace_is_the_one_that_there_would_be() -> None:
-    """A specification in shadow mode drops nothing, and goes on as if it had."""
+    """A specification in shadow mode drops nothing, and continues as if it had dropped."""
     monitors = MonitorSet.of(
         compiled_from({"s.rv": guard("pattern: globally: a forbids b within 5s")}, definitions()),
         shadows=["s"],
@@ -256,7 +256,7 @@ def test_in_shadow_mode_the_trace_is_the_one_that_there_would_be() -> None:
 
 
 def test_a_dropped_request_has_not_happened() -> None:
-    """The same of the parts of services."""
+    """The parts of services behave in the same way."""
     text = """s() { event on() service /set std_srvs/SetBool request '{data:true}' { }
         event off() service /set std_srvs/SetBool request '{data:false}' { }
         pattern: globally: on forbids on within 5s @violation { DROP; } }"""
@@ -300,7 +300,7 @@ def _formulas(random: Random) -> Iterator[str]:
 
 
 def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
-    """Several properties, specifications and events on one message: bytes, drops, states and variables are the same."""
+    """For several properties, specifications and events, bytes, drops, states and variables are the same."""
     random, came = seeded(30), 0
     for _ in range(examples(60)):
         texts = []
@@ -326,7 +326,7 @@ def test_the_module_takes_back_what_the_interpreter_takes_back() -> None:
 
 @pytest.mark.parametrize("creation", ["", "creation "])
 def test_slices_take_back_theirs(creation: str) -> None:
-    """Each binding of a parametric specification is guarded alone, as without parameters."""
+    """Each binding of a parametric specification is handled alone, as without parameters."""
     random, dropped = seeded(31), 0
 
     def text(formula: str, parameters: str) -> str:
@@ -339,7 +339,7 @@ def test_slices_take_back_theirs(creation: str) -> None:
     for _ in range(examples(80)):
         formula = random.choice(
             [each for each in FORMULAS if "until b: no" not in each and "1ns" not in each]
-        )  # from its beginning on
+        )  # from the trace's beginning on
         monitors = load(text(formula, "int id"))
         interpreter = beside(monitors)
         interpreter.start(0)
@@ -361,7 +361,7 @@ def test_slices_take_back_theirs(creation: str) -> None:
 
 
 def test_a_fault_of_the_run_itself_drops_and_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More open events than a run may have: the message is dropped, and no formula has seen it."""
+    """With more open events than a run may have, the message is dropped, and no formula has seen it."""
     monkeypatch.setattr("rosmop.logics.bounded.BoundedProperty.most", 2)
     monitors = load(guard("mtl: a => always[0,9s] !b"))
     assert passed(monitors, [(1, "a"), (2, "a"), (3, "a"), (4, "b")]) == [True, True, False, False]

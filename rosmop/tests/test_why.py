@@ -1,6 +1,6 @@
-"""The explanation of a verdict is sufficient: the named events alone, in a new run, give the verdict.
+"""The explanation of a verdict is sufficient: in a new run, the named events alone give the verdict.
 
-For each logic, over random formulas and traces. None of them can be left out (`fewest`).
+Tested for each logic over random formulas and traces. No named event can be left out (`fewest`).
 """
 
 import copy
@@ -35,7 +35,7 @@ _PTLTL = Printer(
 
 
 def machine(random: Random, *, timed: bool) -> str:
-    """A random machine of four states."""
+    """Draw a random machine of four states."""
     text = ""
     for state in range(4):
         moves = [f"{event} -> s{random.randrange(4)}" for event in EVENTS if random.random() < 0.8]
@@ -47,7 +47,7 @@ def machine(random: Random, *, timed: bool) -> str:
 
 
 def expression(random: Random, depth: int) -> str:
-    """A random regular expression."""
+    """Draw a random regular expression."""
     if depth == 0:
         return random.choice(EVENTS)
     one, other = expression(random, depth - 1), expression(random, depth - 1)
@@ -55,12 +55,12 @@ def expression(random: Random, depth: int) -> str:
 
 
 def past(random: Random) -> str:
-    """A formula of ptltl."""
+    """Draw a formula of ptltl."""
     return _PTLTL.show(draw(random, 4, _PAST, _UNARY, EVENTS), random)
 
 
 def caret(random: Random) -> str:
-    """A formula of ptcaret, with an operator about calls."""
+    """Draw a formula of ptcaret, with an operator about calls."""
     inner = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
     other = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
     return random.choice(
@@ -70,7 +70,7 @@ def caret(random: Random) -> str:
 
 
 def metric(random: Random) -> str:
-    """A formula of mtl about the past."""
+    """Draw a formula of mtl about the past."""
 
     def part(depth: int) -> str:
         if depth == 0:
@@ -87,7 +87,7 @@ def metric(random: Random) -> str:
 
 
 def ahead(random: Random) -> str:
-    """A formula of mtl about the future."""
+    """Draw a formula of mtl about the future."""
     one, other = random.sample(EVENTS, 2)
     bounds = f"[{random.choice([0, 1])}ms,{random.randrange(2, 6)}ms]"
     return random.choice([
@@ -97,14 +97,14 @@ def ahead(random: Random) -> str:
 
 
 def pattern(random: Random) -> str:
-    """A pattern, with a time bound or without."""
+    """Draw a pattern, with or without a time bound."""
     scope = random.choice(["globally", "after a", "until b", "after a until b"])
     body = random.choice(["no c", "some c", "c causes b", "c requires a", "c forbids c", "a causes c"])
     return f"{scope}: {body}{random.choice(['', ' within 3ms'])}"
 
 
 def grammar(random: Random) -> str:
-    """A context-free grammar."""
+    """Draw a context-free grammar."""
     return random.choice([
         "S -> a S b | epsilon", "S -> a S b S | c", "S -> S S | a b | c", "S -> a S a | b S b | c",
         "S -> A B, A -> a A | epsilon, B -> b B c | epsilon",
@@ -112,7 +112,7 @@ def grammar(random: Random) -> str:
 
 
 def rewriting(random: Random) -> str:
-    """A rewriting system."""
+    """Draw a rewriting system."""
     return random.choice([
         "a b -> #epsilon . ^ b -> #fail .", "a a -> b . b b -> #fail . c -> #epsilon .",
         "a c -> #epsilon . ^ c -> #fail . b b b -> #succeed .", "^ a $ -> a a . a a a a -> #fail . c -> #succeed .",
@@ -120,7 +120,7 @@ def rewriting(random: Random) -> str:
 
 
 def future(random: Random) -> str:
-    """A formula of ltl."""
+    """Draw a formula of ltl."""
     return random.choice([
         "[] (a => o b)", "[] !(a and b) and <> c", "!b U a", "[](a => <> b)", "<> c", "[] (c => !a U b)",
     ])  # fmt: skip
@@ -148,7 +148,7 @@ def gives(
     target: EventOccurrence,
     category: str,
 ) -> bool:
-    """Whether events give a category, as a reader would try it: with the last of them, or by the target's deadline."""
+    """Whether events give a category, as a reader would try: with the last event, or at the target's deadline."""
     run = made.start(0) if before is None else copy.copy(before)
     told: tuple[str, ...] = ()
     for one in explanation:
@@ -167,7 +167,7 @@ def gives(
 def explained(
     made: CompiledProperty, random: Random, length: int
 ) -> list[tuple[Explanation | None, EventOccurrence, str, Run | None]]:
-    """A random trace and each explanation of a verdict on it: of what, and (where it is cut) the run before it."""
+    """Return each explanation of a verdict on a random trace and, if the explanation is cut, the run before it."""
     run, history, now = made.start(0), history_of(made, 0), 0
     found = []
     copies: dict[int, Run] = {}
@@ -193,7 +193,7 @@ def explained(
 
 @pytest.mark.parametrize("logic", ["tfsm", "pattern"])
 def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
-    """They use a fixed amount of memory, whatever the length of the trace."""
+    """Clocked steps use a fixed amount of memory for traces of any length."""
     random, compared = seeded(43), 0
     for _ in range(12):
         made = compiled(logic, MAKERS[logic](random), EVENTS)
@@ -219,7 +219,7 @@ def test_clocked_steps_explain_the_same_as_steps(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", MAKERS)
 def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
-    """And none of them can be left out; they are messages that came, in their order."""
+    """No named event can be left out; all of them are received messages, in order."""
     random = seeded(41)
     count = cut = 0
     for _ in range(40):
@@ -287,7 +287,7 @@ def test_a_long_path_is_explained_in_full() -> None:
 
 
 def test_the_latest_of_equal_explanations() -> None:
-    """An explanation has the present events, not equally bad ones of an hour ago."""
+    """An explanation prefers recent events to equally good ones of an hour ago."""
     made = compiled("ere", "(a b)* c")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((0, 1, 0, 1, 2)):
@@ -298,7 +298,7 @@ def test_the_latest_of_equal_explanations() -> None:
 
 
 def test_a_verdict_of_now_is_not_explained_by_one_of_before() -> None:
-    """The last event is named unless the others do without it."""
+    """The last event is named unless the other events suffice without it."""
     made = compiled("ptltl", "!c and (a -> <*> b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((2, 0)):
@@ -310,7 +310,7 @@ def test_a_verdict_of_now_is_not_explained_by_one_of_before() -> None:
 
 @pytest.mark.parametrize("logic", ["ptltl", "mtl", "ptcaret"])
 def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
-    """The plain meaning that names what decides is the monitors' own, on random formulas and traces."""
+    """On random formulas, the meaning that names the deciding parts equals the monitors' meaning."""
     random = seeded(43)
     syntax = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}[logic]
     events = CALLS if logic == "ptcaret" else EVENTS
@@ -328,7 +328,7 @@ def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
 
 
 def test_sub_formulas_that_decide_a_formula() -> None:
-    """Sub-formulas are named as they are written, with their values."""
+    """Sub-formulas are named as written, with their values."""
     made = compiled("mtl", "a -> once[0,500ms] b and !c")
     run, history = made.start(0), history_of(made, 0)
     for event, time in ((1, 1), (0, 700 * MILLISECOND)):
@@ -340,7 +340,7 @@ def test_sub_formulas_that_decide_a_formula() -> None:
 
 
 def test_an_old_event_is_explained_by_its_effect() -> None:
-    """Without tables only the last events are kept; the deciding one is older, and the explanation says so."""
+    """Without tables only the last events are kept; the deciding event is older, and the explanation says so."""
     made = compiled("mtl", "a -> !(once[0,10s] b)")
     run, history = made.start(0), history_of(made, 0)
     for number, event in enumerate((1, *[0] * 4 * explain.KEPT)):
@@ -360,7 +360,7 @@ def test_an_old_event_is_explained_by_its_effect() -> None:
     ids=["by a deadline", "by an event"],
 )
 def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int], between: int) -> None:
-    """The event that the formula was asked at explains it, with what decides it, however many came between the two."""
+    """The explanation has the event that the verdict is for and the deciding events, however many came in between."""
     made = compiled("mtl", formula)
     run, history, now = made.start(0), history_of(made, 0), 0
     for event in [1, *[2] * 30, 0, *[2] * between, last]:
@@ -375,7 +375,7 @@ def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int],
 
 
 def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
-    """Not by those of another binding, though they came between, and though most of them need no more than a table."""
+    """Events of another binding are not named, even if they came in between."""
     text = """goals(int id) {
         event start(int id) /start std_msgs/Int32 '{data:id}' { }
         event end(int id) /end std_msgs/Int32 '{data:id}' { }
@@ -396,7 +396,7 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
 
 
 def test_compared_values_and_the_statement_that_dropped() -> None:
-    """The values are those of the comparison, though the action changes them after it."""
+    """The values are those at the comparison, even if the action changes them afterwards."""
     text = """gun() {
         int count = 0;
         event fire(int x) /fire std_msgs/Int32 '{data:x}' when (x > 3 && count < 5) {

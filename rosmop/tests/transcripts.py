@@ -1,8 +1,8 @@
-"""Read the tables of texts and their results that stand beside the tests (`*.txt`).
+"""Read the tables of texts and results in the `*.txt` files beside the tests.
 
     # The title of a section
-    | the text around each source of the section, of one line or several,
-    | with … for the source, and ‥ for those of its lines that begin with `+`
+    | the text around each source of the section, one or more lines,
+    | where … is the source, and ‥ its lines that begin with `+`
     a source
     of one line or several
     ==> a line of its result
@@ -36,7 +36,7 @@ class Case:
 
     @property
     def text(self) -> str:
-        """The source in its frame."""
+        """Return the source in its frame."""
         return self.frame.replace("‥", self.beside).replace("…", self.source)
 
 

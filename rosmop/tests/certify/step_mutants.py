@@ -1,4 +1,4 @@
-"""Modules that are wrong in one place of a walk or a table: what a fault in the writer of walks may bring about."""
+"""Modules with one fault in a walk or a table, as a defect in the generator of walks may cause."""
 
 import struct
 from collections.abc import Iterator
@@ -15,14 +15,14 @@ _PAIRS = (("add", "sub"), ("and", "or"), ("eq", "ne"), ("shl", "shr_u"), ("lt_s"
 
 
 class _Reader(decoding.Reader):
-    """Notes where each instruction stands."""
+    """Records the position of each instruction."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
         self.found: list[tuple[int, int, decoding.WasmInstruction]] = []
 
     def instruction(self, code: int) -> decoding.WasmInstruction:
-        """Read one, and note it."""
+        """Read one instruction and record its position."""
         begin = self.at - 1
         one = super().instruction(code)
         if not one.body and not one.otherwise:
@@ -31,7 +31,7 @@ class _Reader(decoding.Reader):
 
 
 def _others(one: decoding.WasmInstruction, kinds: list[str]) -> Iterator[tuple[str, bytes]]:
-    """An instruction made wrong: the kind of the fault, and the bytes."""
+    """Yield faulty forms of an instruction, as kind of fault and bytes."""
     yield from _calculations(one)
     yield from _places(one, kinds)
     yield from _ways(one)
@@ -74,13 +74,13 @@ def _ways(one: decoding.WasmInstruction) -> Iterator[tuple[str, bytes]]:
                     (b"\x0c" if one.name == "br" else b"\x0d") + unsigned(int(one.operands[0]) + step),
                 )
         if one.name == "br_if":
-            yield "branch", b"\x1a"  # the condition is not looked at
+            yield "branch", b"\x1a"  # the condition is ignored
     if one.name == "call":
         yield "call", b"\x10" + unsigned(int(one.operands[0]) ^ 1)
 
 
 def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
-    """The kind of each fault in the code of the first walk, the instruction, and the module that has it."""
+    """Yield each fault in the code of the first walk: its kind, the instruction, and the module that has it."""
     code = module.code
     at = 8
     while code[at] != 10:
@@ -117,7 +117,7 @@ def walks(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
 
 
 def tables(module: WasmModule) -> Iterator[tuple[str, str, WasmModule]]:
-    """The same of each cell (2 bytes) of all data."""
+    """Yield the same for each cell (2 bytes) of all data."""
     code = module.code
     reader = _Reader(code)
     reader.at = 8

@@ -1,4 +1,4 @@
-"""The certifier proves what the compilers make, and refuses what a broken compiler would make."""
+"""The certifier proves the output of the compilers, and rejects the output of a broken compiler."""
 
 import ast
 from collections.abc import Callable, Sequence
@@ -42,7 +42,7 @@ def drawn(unary: Sequence[str], binary: Sequence[str], leaves: Sequence[str]) ->
 
 
 def expression(random: Random, depth: int, events: Sequence[str]) -> str:
-    """A regular expression."""
+    """Draw a regular expression."""
     if depth == 0 or random.random() < 0.15:
         return random.choice([*events, *events, "epsilon", "empty"])
     inner = f"({expression(random, depth - 1, events)})"
@@ -52,7 +52,7 @@ def expression(random: Random, depth: int, events: Sequence[str]) -> str:
 
 
 def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
-    """A pattern without a bound of time; no event both opens and closes its scope."""
+    """Draw a pattern without a time bound; no event both opens and closes its scope."""
     a, b, c, d = (random.choice(events) for _ in range(4))
     scopes = ["globally", f"after {a}", f"until {b}"] + [f"after {a} until {b}"] * (a != b)
     bodies = [f"no {c}", f"some {c}", *(f"{c} {verb} {d}" for verb in ("causes", "requires", "forbids"))]
@@ -60,7 +60,7 @@ def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
 
 
 def machine(random: Random, _depth: int, events: Sequence[str]) -> str:
-    """A state machine."""
+    """Draw a state machine."""
     states = [f"s{number}" for number in range(random.randint(1, 5))]
     text = ""
     for state in states:
@@ -74,7 +74,7 @@ def machine(random: Random, _depth: int, events: Sequence[str]) -> str:
 
 
 def timed_machine(random: Random, depth: int, events: Sequence[str]) -> str:
-    """A state machine of which some states are left after a time."""
+    """Draw a state machine with some states that are left after a time."""
     states = machine(random, depth, events).split("] ")
     limits = ["timeout 2s -> s0", "timeout 0.5 ms -> fail", "timeout 3 -> s0"]
     return "] ".join(
@@ -107,7 +107,7 @@ LOGICS: dict[str, Draw] = {
 
 
 def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
-    """Random properties that the compiler takes."""
+    """Draw random properties that the compiler accepts."""
     random = Random(seed)  # noqa: S311  no secret
     found: list[CompiledProperty] = []
     while len(found) < count:
@@ -118,7 +118,7 @@ def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
         try:
             found.append(compile_property(logic.removesuffix(" with past"), formula, events, ORIGIN))
         except FormulaError:
-            continue  # too large, only about the past, the machine with no second member for its alias, for instance
+            continue  # for example: too large, only about the past, or no second member for the machine's alias
     return found
 
 
@@ -139,7 +139,7 @@ def tables_of(compiled: CompiledProperty) -> AutomatonTables:
 
 
 def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
-    """Whether two automata say the same after every trace, and after the same times."""
+    """Whether two automata have the same verdicts after every trace, and after the same times."""
     seen = {(one.initial, other.initial)}
     waiting = list(seen)
     for left, right in waiting:
@@ -159,7 +159,7 @@ def same_verdicts(one: AutomatonTables, other: AutomatonTables) -> bool:
 
 
 def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
-    """With one fault of a compiler: a wrong way on, two states that became one, a verdict that is not right."""
+    """Return an automaton with one compiler fault: a wrong transition, two merged states, or a wrong verdict."""
     table, verdicts = [list(row) for row in tables.table], list(tables.verdicts)
     state, other = random.randrange(len(table)), random.randrange(len(table))
     timeouts = list(tables.timeouts)
@@ -179,7 +179,7 @@ def broken(random: Random, tables: AutomatonTables) -> AutomatonTables:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_an_invalid_automaton_is_refused(logic: str) -> None:
-    """Python counts a negative state from the end; the relay's module would read outside its table."""
+    """Python would count a negative state from the end; the relay's module would read outside its table."""
     compiled = next(iter(properties(logic, 5, 5)))
     made = tables_of(compiled)
     states = len(made.table)
@@ -199,7 +199,7 @@ def test_an_invalid_automaton_is_refused(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
-    """Two hundred for each logic with all examples, each with a trace; a change that changes no verdict is none."""
+    """Each logic has two hundred faults, each found with a trace; a change that changes no verdict does not count."""
     random = Random(2)  # noqa: S311  no secret
     refused = 0
     for compiled in properties(logic, 3, 1000):
@@ -217,7 +217,7 @@ def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
 
 
 def test_a_fault_is_shown_by_a_trace() -> None:
-    """As short as there is one."""
+    """The trace is the shortest possible one."""
     wrong = AutomatonTables(0, [[0, 1], [1, 1]], [(), ("violation",)])
     certificate = certify("ltl", "[](a => o (!b U a))", ["a", "b"], wrong)
     assert certificate.wrong
@@ -234,7 +234,7 @@ def test_a_fault_is_shown_by_a_trace() -> None:
     ],
 )
 def test_unproved_properties_have_a_reason(logic: str, formula: str, why: str) -> None:
-    """With the reason, and never as if it were."""
+    """Each reason is given, and the property never counts as proved."""
     certificate = certificate_of(compile_property(logic, formula, ["a", "b"], ORIGIN))
     assert not certificate.proved
     assert not certificate.wrong
@@ -253,7 +253,7 @@ def test_a_machine_that_is_too_large_is_not_proved() -> None:
 
 
 def test_an_expression_that_is_too_large_is_not_proved() -> None:
-    """Its automaton has one state too few, at the very end: that is not reached."""
+    """Its automaton lacks one state at the very end, which the proof does not reach."""
     certificate = certify(
         "ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], AutomatonTables(0, [[0, 0, 0]], [()])
     )
@@ -290,7 +290,7 @@ def test_each_property_has_a_certificate() -> None:
 
 
 def test_a_wrong_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error has the position of the formula, a trace, and the owner of the defect."""
+    """The error has the formula's position, a trace, and the component with the defect."""
 
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
@@ -303,7 +303,7 @@ def test_a_wrong_compiler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_certifier_shares_no_code_with_the_compilers() -> None:
-    """Only the files that receive results import the compilers, and none imports an encoder of the writer."""
+    """Only the files that receive results import the compilers, and none imports an encoder of the generator."""
     receiving = {"properties.py", "steps.py", "expected_steps.py", "scripted_module.py"}
     pure = 0
     folder = Path(rosmop.certify.__file__).parent

@@ -1,4 +1,4 @@
-"""The steps of a finished module are run in every state, and modules that are wrong in one place are rejected."""
+"""The steps of a finished module are run in every state; modules with one fault are rejected."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -35,14 +35,14 @@ GUARD = """s() { int n = 0;
 
 
 def compiled(*texts: str) -> Compiled:
-    """Specifications as one set."""
+    """Compile specifications as one set."""
     return MonitorSet.of(
         compiled_from({f"{place}.rv": text for place, text in enumerate(texts)}, definitions())
     ).compiled
 
 
 def module(of: Compiled) -> WasmModule:
-    """Their module, before it is translated."""
+    """Return their module before its translation to machine code."""
     return written(
         of.functions, [each.component for each in groups(of.specifications)], ValueCodec(of.messages)
     )
@@ -62,7 +62,7 @@ def test_the_modules_of_random_specifications_pass() -> None:
 
 
 def test_a_large_table_is_run_in_all_of_its_states() -> None:
-    """Cells are not sampled."""
+    """All cells of the table are run, not a sample."""
     states = " ".join(f"q{n} [a -> q{(n + 1) % 900}, b -> q{n * 7 % 900}]" for n in range(900))
     of = compiled(f"{GUARD.split('ptltl', maxsplit=1)[0]} fsm: {states} @q5 {{ DROP; }} }}")
     assert check_steps(of, module(of)) > 900 * 2
@@ -75,9 +75,9 @@ def test_a_large_table_is_run_in_all_of_its_states() -> None:
 
 
 def test_mutants_of_walks_and_tables_are_rejected() -> None:
-    """Hundreds of faults: cells, indexes, states that are written, verdicts, drops, order, what begins again.
+    """Hundreds of faults are found in cells, indexes, written states, verdicts, drops, order and restarts.
 
-    The others change nothing but explanations, budgets, places that are written twice, or cannot come up here.
+    The remaining mutants only change explanations, budgets or cells that are overwritten, or cannot occur here.
     """
     of = compiled(GUARD)
     whole, came = module(of), Counter[str]()
@@ -114,7 +114,7 @@ def _advance(**fields: Callable[[nodes.Advance], object]) -> Callable[..., nodes
     )
 
 
-# `local.get` and `local.set`: the walk goes on at the next message, and writes nothing.
+# `local.get` and `local.set`: the walk continues at the next message, and writes nothing.
 NEXT_MESSAGE = bytes((0x20, 6, 0x21, 0))
 ADVANCE = (specification_groups, "event_of")
 FAULTS: dict[str, tuple[object, str, object]] = {
@@ -147,7 +147,7 @@ TWO = """s() { event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_of_one_line_are_rejected(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """No module is built with a fault of the writer."""
+    """If the generator has a fault, no module is built."""
     of = compiled(TWO)
     assert wasm_build.part_of(of, ["s"], [])
     monkeypatch.setattr(*FAULTS[fault])

@@ -1,7 +1,7 @@
-"""Random expressions and assignments give what a C++ compiler makes of the same text.
+"""Random expressions and assignments have the results of a C++ compiler for the same text.
 
-An option of the compiler makes integers wrap. The examples avoid other undefined results of C++: shifts by
-more than the width, conversions out of range, division by zero.
+A compiler option makes integers wrap. The examples avoid other undefined results of C++: shifts by more than the width,
+conversions out of range, and division by zero.
 """
 
 import os
@@ -47,7 +47,7 @@ HEADERS = (
 
 
 def expression(random: Random, depth: int) -> str:
-    """A random expression over the variables."""
+    """Return a random expression over the variables."""
     if depth == 0 or random.random() < 0.15:
         return random.choice((random.choice(NAMES), random.choice(LITERALS)))
     a, b, c = (expression(random, depth - 1) for _ in range(3))
@@ -70,7 +70,7 @@ def expression(random: Random, depth: int) -> str:
 
 
 def program(random: Random) -> str:
-    """Declarations, expressions that are printed, and assignments after which the variable is printed."""
+    """Return declarations, expressions to print, and assignments after which the variable is printed."""
     first = ("3", "-5", "120", "0", "1", "77", "-128", "1000000")
     lines = [f"{kind} {name} = {random.choice(first)};" for kind, name in zip(TYPES, NAMES, strict=True)]
     lines += [f'printf("%.9g\\n", (double) ({expression(random, 4)}));' for _ in range(60)]
@@ -84,7 +84,7 @@ def program(random: Random) -> str:
 
 
 def vector_program(random: Random) -> str:
-    """Changes of two vectors that are kept, of copies of them, and of an array, and what is in them after each."""
+    """Return changes of two kept vectors, their copies and an array, with their contents printed after each change."""
     lines = []
     for _ in range(80):
         a, b = random.sample(("v", "w"), 2)
@@ -134,7 +134,7 @@ def vector_program(random: Random) -> str:
 
 
 def float_program(random: Random) -> str:
-    """Every function of `<math.h>` on floats, by its plain name and with `f`; and with a double or an int beside."""
+    """Return every function of `<math.h>` on floats, by its plain name and with `f`, also with a double or an int."""
     lines = []
     for name, (count, _) in MATH.items():
         for _ in range(20):
@@ -166,7 +166,7 @@ def compiler_of_cpp() -> str:
 
 
 def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
-    """C++ takes the overload for floats, whose results are not those for doubles, rounded; here, to the last bit."""
+    """C++ takes the overload for floats, which differs from a rounded double; results are equal to the last bit."""
     compiler = compiler_of_cpp()
     body = float_program(Random(1))  # noqa: S311  draws examples, not keys
     source = tmp_path / "program.cpp"
@@ -182,7 +182,7 @@ def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
 
 
 def in_module(body: str) -> list[str]:
-    """Return the output of a program in a module, with its values in variables."""
+    """Return the output of a program in a module that keeps its values in variables."""
     begins = 'printf("%.9g\\n", '
     lines: list[str] = []
     names: list[str] = []
@@ -221,8 +221,9 @@ def printed(body: str, before: str, directory: Path, *options: str) -> list[str]
 def test_the_language_agrees_with_a_compiler(
     seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
 ) -> None:
-    """More than a hundred values of each random program are the compiler's: by the interpreter, and of numbers by the
-    module.
+    """More than a hundred values of each random program equal the compiler's.
+
+    The interpreter computes all of them, the module the numbers.
     """
     write, before = make
     body = write(Random(seed))  # noqa: S311  draws examples, not keys

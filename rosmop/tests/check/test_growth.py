@@ -1,4 +1,4 @@
-"""The time to compile a text is linear in its length."""
+"""The time to compile a text grows linearly with its length."""
 
 import sys
 from collections import Counter
@@ -45,8 +45,8 @@ def lines_run(number: int) -> Counter[str]:
 
 
 def test_twice_as_many_specifications_take_twice_as_long() -> None:
-    """None is looked at again for each of the others."""
-    lines_run(1)  # what is made once
+    """Compiling one specification does not visit the others again."""
+    lines_run(1)  # made once for all specifications
     few, some, many = (lines_run(number) for number in (10, 20, 40))
     for file in many:
         assert many[file] - some[file] <= 2.1 * (some[file] - few[file]) + 20, file

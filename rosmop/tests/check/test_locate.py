@@ -1,5 +1,6 @@
-"""Fields are found where they are: a bound parameter is what decoding the whole message gives, and a change of it
-is what encoding the whole changed message gives.
+"""Fields are found at their positions.
+
+A bound parameter equals the decoded field, and changing it equals encoding the whole changed message.
 """
 
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ KINDS = (
 
 
 def content(random: Random, kind: value_types.Type) -> object:
-    """A random value of a type, for the other library's encoder."""
+    """Return a random value of a type, for the other library's encoder."""
     if isinstance(kind, value_types.RecordType):
         slots = MessageTypes(definitions()).slots(kind.name)
         return {name: content(random, slot.type) for name, slot in slots.items()}
@@ -42,7 +43,7 @@ def content(random: Random, kind: value_types.Type) -> object:
 
 
 def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tuple[str, value_types.Type]]:
-    """Every path to a value in a message, and the type there."""
+    """Yield every path to a value in a message, with the value's type."""
     if path:
         yield path, kind
     if isinstance(kind, value_types.RecordType) and isinstance(value, dict):
@@ -54,7 +55,7 @@ def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tup
 
 
 def change(kind: value_types.Type, name: str) -> str:
-    """A statement that gives a variable of this type another value; nothing for whole messages and fixed arrays."""
+    """Return a statement that changes a variable of this type; empty for whole messages and fixed arrays."""
     if isinstance(kind, value_types.StringType):
         return f'{name} += "longer";'
     if isinstance(kind, value_types.BoolType):
@@ -69,7 +70,7 @@ def change(kind: value_types.Type, name: str) -> str:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", range(3))
 def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
-    """Bound one by one, each field is read right, and changed right."""
+    """Each field, bound alone, is read correctly and changed correctly."""
     random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
     value = content(random, value_types.RecordType(kind))
     data = _encoded(kind, value)

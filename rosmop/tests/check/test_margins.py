@@ -1,4 +1,4 @@
-"""How close comparisons of numbers came: what is noted, and that nothing else is different for it."""
+"""Margins record how close comparisons of numbers came, and change nothing else."""
 
 import struct
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ NEAR = """near() {
 
 
 def started(text: str, *, margins: bool = True) -> tuple[MonitorSet, MarginReader]:
-    """The specifications in `text`, begun, with the module where there is one; and their margins."""
+    """Start the specifications in `text`, with their module if there is one; return them with their margins."""
     monitors = on_module(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
     reader = MarginReader(monitors)
     monitors.start(0)
@@ -33,7 +33,7 @@ def started(text: str, *, margins: bool = True) -> tuple[MonitorSet, MarginReade
 
 
 def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = True) -> list[str]:
-    """Messages with these numbers on /t; what came of them."""
+    """Send messages with these numbers on /t; return the results."""
     judge = monitors.judge if walking else monitors.process
     return [
         judge("/t", bytearray(struct.pack(form, value)), time).result for time, value in enumerate(values, 1)
@@ -41,7 +41,7 @@ def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = 
 
 
 def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float | None]]:
-    """Line, whether it held, the sides, and where the constant would have to stand."""
+    """Return the line, whether the comparison held, both sides, and the threshold that would change the result."""
     return [
         (one.position.line, one.holds, one.left, one.right, one.threshold_at)
         for one in sorted(margins, key=lambda one: (one.position, not one.holds))
@@ -50,7 +50,7 @@ def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float
 
 @pytest.mark.parametrize("walking", [True, False])
 def test_the_nearest_on_both_sides_since_it_was_asked_last(walking: bool) -> None:
-    """By the module and by the engine; a constant is a threshold. Not of loops, `when`, `==` and what is known."""
+    """Module and engine record them for constants, but not in loops or `when`, nor for `==` or known results."""
     monitors, margins = started(NEAR)
     assert (monitors.lane("/t") is not None) is True
     give(monitors, "<i", 1, 9, 5, walking=walking)
@@ -61,7 +61,7 @@ def test_the_nearest_on_both_sides_since_it_was_asked_last(walking: bool) -> Non
 
 
 def test_answers_are_those_of_the_text_as_it_is() -> None:
-    """Integers beyond what a double tells apart, unsigned ones, not-a-number: compared as C++ does."""
+    """Covers large integers that a double cannot distinguish, unsigned ones and NaN: compared as in C++."""
     text = """big() { event e(%s x) /t std_msgs/%s '{data:x}' { if (x %s %s) { return; } } }"""
     for kind, message, code, operator, side, values in (
         ("uint64_t", "UInt64", "<Q", ">", "18446744073709551614u", (2**64 - 1, 2**64 - 2, 0)),
@@ -78,7 +78,7 @@ def test_answers_are_those_of_the_text_as_it_is() -> None:
 
 
 def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
-    """The module leaves it to the engine: it is not noted twice in different ways, and states are as without."""
+    """The module leaves such a message to the engine: it is not recorded twice, and states are as without margins."""
     text = """s() { int n = 0; event e(int x) /t std_msgs/Int32 '{data:x}' {
         n = n + 1;
         if (x > 10) { x = 1 / (x - 12); }
@@ -97,7 +97,7 @@ def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
 
 
 def test_no_more_is_noted_than_is_bounded() -> None:
-    """The rest of a long specification is compared as ever."""
+    """Comparisons beyond the limit still work, but are not recorded."""
     lines = "\n".join(f"if (x > {number}) {{ n = n + 1; }}" for number in range(MOST_NOTED + 9))
     text = f"s() {{ int n = 0; event e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{lines}\n}} }}"
     monitors, margins = started(text)

@@ -1,4 +1,4 @@
-"""Order of evaluation: random statements with side effects have the results of C++17, compared with g++."""
+"""Order of evaluation: random statements with side effects have the results of g++ for C++17."""
 
 import re
 from pathlib import Path
@@ -52,23 +52,23 @@ LOOK_AT_MESSAGES = """h = h * 31 + (long) (p.x * 3 + p.y * 5 + p.z * 7);
 """
 
 
-# The module leaves these to the engine: vectors, strings, messages, and functions that take one.
+# The module leaves these to the engine: vectors, strings, messages, and functions with such arguments.
 _NOT_PLAIN = re.compile(r"\b(v|w|f|s|t|ss|p|q|ps)\b|\b(h|k|far|add|both|move|same)\(")
-_PLAIN_FUNCTIONS = 2  # of g0 to g4, in programs that have others
+_PLAIN_FUNCTIONS = 2  # of g0 to g4, in programs that also have other functions
 
 
 class Programs:
     """Random programs: of numbers, of numbers and vectors, or of all types. Each has statements of numbers only."""
 
     def __init__(self, seed: int, kind: Kind, *, orders: bool = True) -> None:
-        """`orders`: C++ says which order everything has."""
+        """Prepare a program; with `orders`, C++ specifies every order."""
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
         self._kind = kind
-        self._plain = False  # whether the next statement is of numbers only
+        self._plain = False  # whether the next statement has numbers only
         self._orders = orders
 
     def declarations(self) -> str:
-        """Variables, and functions that change them."""
+        """Return variables, and functions that change them."""
         others, random = self._kind == "others", self._random
         changes = [*CHANGES, *(OF_TEXTS + OF_MESSAGES if others else ())]
         text = NUMBERS + VECTORS + (TEXTS + MESSAGES if others else "")
@@ -92,11 +92,11 @@ class Programs:
         return f"{text}{look} return h % 1000003; }}\n"
 
     def statements(self, count: int) -> list[str]:
-        """Statements that change what their own parts look at."""
+        """Return statements that change values which their own parts read."""
         return [self._statement() for _ in range(count)]
 
     def _draw(self, choices: list[str]) -> str:
-        """One of these; in a statement of numbers only, one that is."""
+        """Draw one of these; in a statement of numbers only, draw one with numbers only."""
         return self._random.choice([one for one in choices if not (self._plain and _NOT_PLAIN.search(one))])
 
     def _call(self) -> str:
@@ -107,7 +107,7 @@ class Programs:
         return f"({one} & 3)"
 
     def _value(self) -> str:
-        """One number, by what has effects in an order that C++ knows."""
+        """Return a number from parts with effects, in an order that C++ specifies."""
         call = self._call
         choices = [
             call(), call(), f"{call()} + 2", "i++", "--j", "b", f"v[{self._index()}]", f"f[{self._index()}]",
@@ -183,7 +183,7 @@ class Programs:
 def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
     """Fail unless the compiler, interpreter and module have the same state after each of this number of statements.
 
-    Without a directory nothing is compiled.
+    Without a directory, the program is not compiled.
     """
     before, statements = programs.declarations(), programs.statements(count)
     body = "\n".join(f'{one} printf("%ld\\n", look());' for one in statements)
@@ -203,7 +203,7 @@ def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
 @pytest.mark.parametrize(("kind", "taken"), [("numbers", 60), ("vectors", 10), ("others", 10)])
 @pytest.mark.parametrize("seed", range(examples(12)))
 def test_effects_are_in_the_order_of_the_compiler(seed: int, kind: Kind, taken: int, tmp_path: Path) -> None:
-    """By the interpreter, and by the module where it does not leave the statement to it."""
+    """The interpreter has this order; the module has it for every statement that it does not leave to the engine."""
     fed = check(Programs(seed, kind), 60, tmp_path)
     assert fed.came["together"] >= taken
 

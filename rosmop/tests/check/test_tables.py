@@ -1,4 +1,4 @@
-"""Findings of the check, and values of actions, by tables of sources and results (`rosmop/tests/transcripts.py`)."""
+"""Findings of the check, and values of actions, from tables of sources and results (`rosmop/tests/transcripts.py`)."""
 
 import re
 from contextlib import suppress
@@ -17,7 +17,7 @@ TABLES = Path(__file__).parent
 
 @table(TABLES / "findings.txt")
 def test_the_check_reports_these_findings_at_these_places(case: Case) -> None:
-    """All errors and warnings of a source, with line, column and text; `accepted` if there is none."""
+    """The row lists all errors and warnings of a source with line, column and text; `accepted` if there are none."""
     try:
         found = MonitorSet.of(compiled_from({"x.rv": case.text}, definitions())).warnings
     except SpecificationError as error:
@@ -28,19 +28,19 @@ def test_the_check_reports_these_findings_at_these_places(case: Case) -> None:
 
 @table(TABLES / "values.txt")
 def test_an_action_prints_what_cpp_prints(case: Case) -> None:
-    """The interpreter prints the lines of C++ or the text of the fault; the module does what the interpreter does."""
+    """The interpreter prints the lines of C++ or the text of the fault; the module has the same output."""
     outcome = act(case.text, before=case.beside)
     lines = " ".join(line.text for line in outcome.log)
     fault = "".join(f"fault: {one.text}" for one in outcome.faults)
     assert (fault or lines,) == case.expected
     assert not fault or (outcome.result, lines) == ("dropped", "")
     for text in (case.text, unfolded(case)):
-        with suppress(SpecificationError):  # a size or case label stops being a constant
+        with suppress(SpecificationError):  # a size or a case label must stay a constant
             BothWays(action(text, before=case.beside)).check([message("std_msgs/Int32")], "/t", 1_500_000_000)
 
 
 def unfolded(case: Case) -> str:
-    """Return the text with `x`, which is 0, added to its numbers: nothing is calculated before a message comes."""
+    """Return the text with `x`, which is 0, added to its numbers, so that no value is computed before a message."""
     if '"' in case.source:
         return case.text
     return case.frame.replace("…", re.sub(r"(?<![\w.])(\d+(\.\d+)?)(?![\w.])", r"(\1 + x)", case.source))
@@ -48,7 +48,7 @@ def unfolded(case: Case) -> str:
 
 @table(TABLES / "messages.txt")
 def test_an_event_reads_and_changes_its_message(case: Case) -> None:
-    """Messages by their fields, as another library reads them, each with its outcome (`rosmop/tests/stories.py`)."""
+    """Messages are given by fields, as another library reads them, with outcomes (`rosmop/tests/stories.py`)."""
     for line in case.expected:
         given, _, expected = line.partition(" -> ")
         step = Step(f"0s /t {given}".replace(" (zero)", ""), "", ())
@@ -58,6 +58,6 @@ def test_an_event_reads_and_changes_its_message(case: Case) -> None:
 
 @table(TABLES / "enforcement.txt")
 def test_the_line_about_enforcement_says_how_or_what_it_would_take(case: Case) -> None:
-    """`check` prints it for each property."""
+    """`check` prints this line for each property."""
     [monitor] = load(case.text).monitors
     assert (monitor.properties[0].code.enforcement,) == case.expected

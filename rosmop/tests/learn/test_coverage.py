@@ -1,4 +1,4 @@
-"""Coverage of specifications by recordings, line by line."""
+"""Coverage of specifications by recordings, by line."""
 
 from collections.abc import Sequence
 
@@ -31,7 +31,7 @@ TEXT = """gate() {
 
 
 def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
-    """A recording of numbers, a second apart."""
+    """Return a recording of numbers, one second apart."""
     rows = tuple(
         (topic, START + place * 10**9, message("std_msgs/Int32", data=value))
         for place, (topic, value) in enumerate(messages)
@@ -40,13 +40,13 @@ def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
 
 
 def exercised(*recordings: Recorded) -> dict[str, int]:
-    """How often each `line kind what` was exercised."""
+    """Return how often each `line kind what` was exercised."""
     found = covered({"gate.rv": TEXT}, standard_definitions(), recordings)
     return {f"{item.position.line} {item.kind} {item.what}": count for item, count in found.items()}
 
 
 def test_each_thing_has_its_line_and_its_count() -> None:
-    """One recording that opens twice and shuts once; what it never did has 0."""
+    """The recording opens twice and shuts once; parts that never happened have count 0."""
     counts = exercised(recorded("a", [("/open", 7), ("/open", 0), ("/shut", 0)]))
     assert counts == {
         "3 function big": 2,
@@ -89,7 +89,7 @@ def test_recordings_add_up() -> None:
 
 
 def test_a_timeout_is_a_transition() -> None:
-    """The passing of a deadline moves the machine, and counts."""
+    """The end of a deadline moves the machine and is counted."""
     text = """quiet() {
     event a() /a std_msgs/Int32 '{}' { }
     event b() /b std_msgs/Int32 '{}' { }
@@ -111,7 +111,7 @@ def test_a_timeout_is_a_transition() -> None:
 
 
 def test_an_error_is_that_of_the_text() -> None:
-    """An error in a specification has its original position and names."""
+    """An error in a specification has the positions and names of the original text."""
     with pytest.raises(SpecificationError) as caught:
         covered({"gate.rv": TEXT.replace("n--", "m--")}, standard_definitions(), [])
     assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: unknown variable `m`")

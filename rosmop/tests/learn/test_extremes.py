@@ -1,4 +1,4 @@
-"""Bounds beyond what was seen: on samples whose extremes are known."""
+"""Learnt bounds lie slightly beyond the observed values; tested on samples with known extremes."""
 
 import random
 
@@ -20,7 +20,7 @@ def test_a_bound_holds_on_ten_times_as_many_windows() -> None:
 
 
 def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
-    """Uniform noise between 0 and 1 gets bounds that a value of 1.5 or -0.5 passes."""
+    """For uniform noise between 0 and 1, the bounds exclude 1.5 and -0.5."""
     chance = random.Random(2)  # noqa: S311  no secret
     windows = [[chance.random() for _ in range(50)] for _ in range(24)]
     above, below = upper(map(max, windows), 1e6), upper((-min(window) for window in windows), 1e6)
@@ -29,7 +29,7 @@ def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
 
 
 def test_a_value_reached_exactly_by_several_windows_is_the_bound() -> None:
-    """A joint that is stopped at 0.6 has no margin."""
+    """The bound on a joint that stops at 0.6 has no margin."""
     highs = [0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4]
     assert upper(highs, 1e6, stops=True) == 0.6
     margin = upper(highs, 1e6)
@@ -38,5 +38,5 @@ def test_a_value_reached_exactly_by_several_windows_is_the_bound() -> None:
 
 @pytest.mark.parametrize("count", [0, 1, FEWEST_WINDOWS - 1])
 def test_too_few_windows_give_no_bound(count: int) -> None:
-    """Extremes of a few windows say nothing about the next one."""
+    """The extremes of a few windows do not predict the next window."""
     assert upper([float(number) for number in range(count)], 100) is None

@@ -1,4 +1,4 @@
-"""Learning from known recordings, and the warnings of the learnt text."""
+"""Learning from known recordings, and the warnings of the learnt specification."""
 
 import math
 import random
@@ -34,26 +34,26 @@ class Recorded:
 
     @property
     def began(self) -> int:
-        """The time of the first message."""
+        """Return the time of the first message."""
         return self.rows[0][1]
 
     @property
     def ended(self) -> int:
-        """The time of the last message."""
+        """Return the time of the last message."""
         return self.rows[-1][1]
 
     def messages(self) -> Iterator[Row]:
-        """All messages."""
+        """Return all messages."""
         return iter(self.rows)
 
 
 def number(value: float) -> bytes:
-    """A `std_msgs/Float64`."""
+    """Return a `std_msgs/Float64`."""
     return message("std_msgs/Float64", data=value)
 
 
 def drive(seed: int, seconds: float = 60.0) -> Recorded:
-    """A speed that swings slowly at about 20 Hz, a mode that goes round, and questions that are answered at once."""
+    """Return a speed that swings slowly at about 20 Hz, a mode that cycles, and questions that are answered at once."""
     chance = random.Random(seed)  # noqa: S311  no secret
     modes = ["idle", "armed", "firing"]
     rows: list[Row] = []
@@ -82,7 +82,7 @@ def learnt() -> LearningResult:
 
 
 def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
-    """Return the warnings of the text in a recording."""
+    """Return the warnings that the learnt text gives for a recording."""
     monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions()))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
@@ -94,12 +94,12 @@ def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
 
 
 def test_a_new_drive_gives_no_alarm(learnt: LearningResult) -> None:
-    """Drives outside of the training data are quiet, and nothing is dropped or changed."""
+    """Other drives of the same kind give no warning, and no message is dropped or changed."""
     assert [warnings(learnt, drive(seed).rows) for seed in (20, 21)] == [[], []]
 
 
 def test_the_recordings_are_split_and_named(learnt: LearningResult) -> None:
-    """The comment at the head says what was learnt from, and what tested it."""
+    """The comment at the head names the recordings for learning and for testing."""
     assert {part.name for part in learnt.held_out}.isdisjoint(part.name for part in learnt.trained)
     assert len(learnt.held_out) == 2
     head = learnt.text.split("\n\n", maxsplit=1)[0]
@@ -107,7 +107,7 @@ def test_the_recordings_are_split_and_named(learnt: LearningResult) -> None:
 
 
 def faulty(kind: str) -> list[Row]:
-    """A drive with something wrong from its twentieth second on."""
+    """Return a drive with a fault that begins at its twentieth second."""
     rows = list(drive(30).rows)
     from_then = rows[0][1] + 20 * 10**9
     at = next(place for place, row in enumerate(rows) if row[0] == "/speed" and row[1] >= from_then)
@@ -146,12 +146,12 @@ def faulty(kind: str) -> list[Row]:
     ],
 )
 def test_a_fault_is_warned_of(learnt: LearningResult, kind: str, says: str) -> None:
-    """Each kind of fault gives the warning that names it."""
+    """Each kind of fault gives the warning that names the fault."""
     assert any(text.startswith(says) for text in warnings(learnt, faulty(kind)))
 
 
 def test_contradictions_of_held_out_recordings_are_listed() -> None:
-    """A bound that is passed there is widened, a value that is new there leaves the set out; both with their alarms."""
+    """A bound that is exceeded there is widened, a set with a new value there is omitted; both list their alarms."""
     odd = [drive(seed) for seed in range(1, 5)]
     rows = [(topic, time, number(50.0) if place == 600 else data) if topic == "/speed" else (topic, time, data)
             for place, (topic, time, data) in enumerate(odd[2].rows)]  # fmt: skip
@@ -171,7 +171,7 @@ def test_contradictions_of_held_out_recordings_are_listed() -> None:
 
 
 def test_a_recording_alone_is_divided_in_time() -> None:
-    """The end of a single recording tests what its beginning taught."""
+    """The end of a single recording tests the conditions learnt from its beginning."""
     learnt = learn([drive(1, 200.0)], standard_definitions(), 0.3, lambda _: None)
     (trained,), (held_out,) = learnt.trained, learnt.held_out
     assert trained.ended < held_out.began
@@ -179,7 +179,7 @@ def test_a_recording_alone_is_divided_in_time() -> None:
 
 
 def test_nothing_to_learn_from_is_an_error() -> None:
-    """Recordings that disagree about a type, or have nothing on the topics, are refused with the reason."""
+    """Recordings that disagree about a type, or have no message on the topics, are refused with the reason."""
     other = replace(DRIVES[1], topics={**TYPES, "/speed": "std_msgs/Float32"})
     with pytest.raises(
         LearningError, match="/speed carries std_msgs/Float64 in one recording and std_msgs/Float32"
@@ -193,7 +193,7 @@ def test_nothing_to_learn_from_is_an_error() -> None:
 
 
 def test_omitted_conditions_are_listed() -> None:
-    """Eighteen numbers of one topic get no more conditions than a person reads; the comment counts the others."""
+    """Eighteen numbers of one topic get no more conditions than a person can read; the comment counts the others."""
     chance = random.Random(7)  # noqa: S311  no secret
 
     def joints() -> bytes:

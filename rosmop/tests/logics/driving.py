@@ -1,4 +1,4 @@
-"""Compiles and drives properties for the tests of the logics."""
+"""Compile and drive properties for the tests of the logics."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
@@ -10,7 +10,7 @@ from rosmop.logics.interface import CompiledProperty, FormulaError, Run
 
 
 def seeded(seed: int) -> Random:
-    """Random examples, the same in every run."""
+    """Return settings for random examples that are the same in every run."""
     return Random(seed)  # noqa: S311  # draws examples, not keys
 
 
@@ -19,12 +19,12 @@ ABC = ("a", "b", "c")
 
 
 def compiled(logic: str, formula: str, events: Sequence[str] = ABC) -> CompiledProperty:
-    """The property, its formula beginning at line 7, column 11."""
+    """Return the property; its formula begins at line 7, column 11."""
     return compile_property(logic, formula, events, ORIGIN)
 
 
 def told(compiled: CompiledProperty, trace: Iterable[str]) -> list[tuple[str, ...]]:
-    """The categories after each event of an untimed trace."""
+    """Return the categories after each event of an untimed trace."""
     run = compiled.start(0)
     return [run.step(compiled.events.index(event), 0) for event in trace]
 
@@ -48,13 +48,13 @@ def _expired(run: Run, time: int) -> list[tuple[int, tuple[str, ...]]]:
 
 
 def traces(events: Sequence[str], longest: int) -> Iterator[tuple[str, ...]]:
-    """All traces of one event up to ``longest``."""
+    """Yield all traces of up to ``longest`` events."""
     for length in range(1, longest + 1):
         yield from product(events, repeat=length)
 
 
 def refusal(logic: str, formula: str, events: Sequence[str] = ABC) -> list[str]:
-    """The findings of a refused formula, as ``line:column: text``."""
+    """Return the findings of a refused formula, as ``line:column: text``."""
     try:
         compile_property(logic, formula, events, ORIGIN)
     except FormulaError as error:

@@ -1,4 +1,4 @@
-"""``fsm``: what the machine does is what was written."""
+"""``fsm``: the machine behaves as it is written."""
 
 from random import Random
 
@@ -6,7 +6,7 @@ from rosmop.tests.logics.driving import ABC
 
 
 class Written:
-    """A random machine, kept as it was drawn, and walked by looking it up."""
+    """A random machine, kept as drawn; each step is a lookup."""
 
     def __init__(self, random: Random) -> None:
         self.states = [f"s{number}" for number in range(random.randint(1, 4))]
@@ -22,7 +22,7 @@ class Written:
         }
 
     def text(self, random: Random) -> str:
-        """The machine in the syntax of the logic; commas come and go."""
+        """Return the machine in the syntax of the logic, with or without commas."""
         parts = []
         for state in self.states:
             clauses = [f"{event} -> {target}" for event, target in self.moves[state].items()]
@@ -33,7 +33,7 @@ class Written:
         return "\n".join(parts)
 
     def after(self, trace: tuple[str, ...]) -> tuple[str, ...]:
-        """The categories after a trace."""
+        """Return the categories after a trace."""
         state = self.states[0]
         for event in trace:
             if state != "fail":

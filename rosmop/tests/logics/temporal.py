@@ -1,4 +1,4 @@
-"""Random temporal formulas as trees, and their text with as few parentheses as the stated precedence allows."""
+"""Random temporal formulas as trees, and their text with as few parentheses as the precedence allows."""
 
 from collections.abc import Mapping, Sequence
 from random import Random
@@ -21,7 +21,7 @@ SPELLED = {
 def draw(
     random: Random, depth: int, operators: Sequence[str], arity: Mapping[str, int], events: Sequence[str]
 ) -> Tree:
-    """A random formula over some temporal operators and all boolean ones."""
+    """Draw a random formula with some temporal operators and all boolean ones."""
     if depth == 0 or random.random() < 0.12:
         return random.choice(
             [
@@ -42,7 +42,7 @@ ARITY = {"not": 1}
 
 
 class Printer:
-    """Prints with ``levels``: the operators of each strength, the tightest binary level first."""
+    """Prints formulas; ``levels`` lists the operators of each strength, the tightest binary level first."""
 
     def __init__(
         self, spelled: Mapping[str, Sequence[str]], levels: Sequence[Sequence[str]], once: Sequence[str]
@@ -52,7 +52,7 @@ class Printer:
         self._once = set(once)
 
     def show(self, tree: Tree, random: Random) -> str:
-        """The text of a formula."""
+        """Return the text of a formula."""
         operator = tree[0]
         if operator == "event":
             return str(tree[1])

@@ -1,4 +1,4 @@
-"""Automata as tables: the smallest one with the same verdicts, and components of graphs."""
+"""Automata as tables: the smallest automaton with the same verdicts, and components of graphs."""
 
 from random import Random
 
@@ -10,7 +10,7 @@ from rosmop.tests.logics.driving import seeded
 
 
 def drawn(random: Random) -> Automaton:
-    """A random automaton of which all states can be entered."""
+    """Return a random automaton whose states can all be entered."""
     size, letters = random.randint(1, 9), random.randint(1, 3)
     table = [[random.randrange(size) for _ in range(letters)] for _ in range(size)]
     for state in range(1, size):
@@ -20,7 +20,7 @@ def drawn(random: Random) -> Automaton:
 
 
 def classes_by_refinement(automaton: Automaton) -> list[int]:
-    """The equivalence of states by splitting until nothing splits any more, as it is defined."""
+    """Return the classes of equivalent states by definition: split until no class splits any more."""
     known: list[object] = list(automaton.verdicts)
     while True:
         signatures = [(known[s], tuple(known[t] for t in row)) for s, row in enumerate(automaton.table)]
@@ -32,7 +32,7 @@ def classes_by_refinement(automaton: Automaton) -> list[int]:
 
 
 def reached(automaton: Automaton) -> set[int]:
-    """The initial state and all that follow it."""
+    """Return the initial state and all its successors."""
     found = {automaton.initial}
     while fresh := {target for state in found for target in automaton.table[state]} - found:
         found |= fresh
@@ -40,7 +40,7 @@ def reached(automaton: Automaton) -> set[int]:
 
 
 def test_minimal_and_equivalent() -> None:
-    """The result has one state per class of states that can be reached, and tells the same on every trace."""
+    """The result has one state for each class of reachable states, and the same verdicts on every trace."""
     random = seeded(18)
     for _ in range(1500):
         automaton = drawn(random)
@@ -56,7 +56,7 @@ def test_minimal_and_equivalent() -> None:
 
 
 def test_a_long_chain_is_minimised_in_time() -> None:
-    """Ten thousand states that can only be distinguished one after the other take no quadratic time."""
+    """Ten thousand states that can only be distinguished one after the other do not take quadratic time."""
     size = 10_000
     table = tuple((min(state + 1, size - 1),) for state in range(size))
     verdicts = tuple(("v",) if state == size - 1 else () for state in range(size))
@@ -64,18 +64,18 @@ def test_a_long_chain_is_minimised_in_time() -> None:
 
 
 def test_exploring_stops_at_the_limit() -> None:
-    """States are counted while they are found."""
+    """States are counted as they are found, so that exploring can stop."""
     with pytest.raises(TooManyStatesError, match="more than 100 states"):
         explore(0, 1, lambda state, _: state + 1, lambda _: (), 100)
 
 
 def test_events_that_are_not_named_are_one_class() -> None:
-    """Classes are numbered by their first event; -1 stands for what is not named."""
+    """Classes are numbered by their first event; unnamed events have class -1."""
     assert letter_classes(("x", "a", "y", "b"), ("b", "a")) == ([0, 1, 0, 2], [-1, 1, 0])
 
 
 def test_components_against_reachability() -> None:
-    """Two nodes are in one component exactly if each leads to the other; components come after those they lead to."""
+    """Two nodes are in one component if and only if each leads to the other; successors' components come first."""
     random = seeded(19)
     for _ in range(300):
         size = random.randint(1, 8)
@@ -93,6 +93,6 @@ def test_components_against_reachability() -> None:
 
 
 def test_many_states_with_many_ways_out_are_refused() -> None:
-    """Memory is bounded by the transitions, not by the states alone: each takes room while minimising."""
+    """Memory is limited by the number of transitions, because minimising stores each of them."""
     with pytest.raises(TooManyStatesError, match="more than 500000 transitions"):
         explore(0, 1000, lambda state, _letter: min(state + 1, 9_000), lambda _state: ())

@@ -1,4 +1,4 @@
-"""``mtl`` about the future: against its definition in three values, and against what really came of it."""
+"""``mtl`` about the future: compared with its three-valued definition, and with the complete trace."""
 
 import importlib
 import sys
@@ -30,22 +30,22 @@ Truth = bool | None
 
 
 def least(values: list[Truth]) -> Truth:
-    """Whether all hold; None where that is open."""
+    """Return whether all hold; None if that is undecided."""
     return False if False in values else None if None in values else True
 
 
 def most(values: list[Truth]) -> Truth:
-    """Whether one holds."""
+    """Return whether one holds; None if that is undecided."""
     return negated(least([negated(value) for value in values]))
 
 
 def negated(value: Truth) -> Truth:
-    """The opposite; of what is open, that is open."""
+    """Return the opposite; None stays None."""
     return None if value is None else not value
 
 
 def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
-    """Return the value of a formula at event ``i`` after ``trace``, if no event comes up to ``passed``."""
+    """Return the value of a formula at event ``i`` of ``trace``, if no event follows until ``passed``."""
     operator, *rest = tree
     low, high = 0, OVER
     if operator in (*PAST, *FUTURE):
@@ -99,7 +99,7 @@ def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0
 
 
 def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
-    """Return the verdicts with their events by the definition: each is due when it is first certain."""
+    """Return the verdicts with their events by the definition: each is due when it first becomes certain."""
     record: list[tuple[int, str]] = []
     known: set[int] = set()
 
@@ -131,7 +131,7 @@ def told(text: str, trace: Timed, end: int) -> list[tuple[int, str]]:
 
 
 def with_bounds(tree: Tree, random: Random) -> Tree:
-    """The formula with random bounds on all its temporal operators."""
+    """Return the formula with random bounds on all its temporal operators."""
     operands = tuple(with_bounds(part, random) if isinstance(part, tuple) else part for part in tree[1:])
     if tree[0] not in (*PAST, *FUTURE):
         return (tree[0], *operands)
@@ -141,12 +141,12 @@ def with_bounds(tree: Tree, random: Random) -> Tree:
 
 
 def is_about_the_future(tree: Tree) -> bool:
-    """Whether it has an operator about the future."""
+    """Whether the formula has an operator about the future."""
     return tree[0] in FUTURE or any(is_about_the_future(part) for part in tree[1:] if isinstance(part, tuple))
 
 
 def rtamt_text(tree: Tree) -> str:
-    """The formula in the language of the other monitor, over signals that are 1 where the event is, else -1."""
+    """Return the formula in the language of the other monitor; a signal is 1 at its event, else -1."""
     operator, *rest = tree
     if operator == "event":
         return f"({rest[0]} >= 0)"
@@ -158,7 +158,7 @@ def rtamt_text(tree: Tree) -> str:
 
 
 def rtamt_knows(tree: Tree) -> bool:
-    """Whether it has all operators: `xor` and `iff` are distances there, and what is before the first event holds."""
+    """Whether the other monitor has all operators. (There `xor` and `iff` are distances, and the time before holds.)"""
     if tree[0] == "event":
         return True
     endless = tree[0] in PAST and tree[-1][1] is None
@@ -171,7 +171,7 @@ def rtamt_knows(tree: Tree) -> bool:
     sys.version_info >= (3, 12), reason="the parser of rtamt needs typing.io, which Python 3.12 has not"
 )
 def test_against_another_monitor() -> None:
-    """With one event per unit of time, what a formula is worth once all is over is what another monitor says."""
+    """With one event in each unit of time, the final value of a formula equals the other monitor's."""
     rtamt = importlib.import_module("rtamt")
     random = seeded(44)
     compared = 0
@@ -188,7 +188,7 @@ def test_against_another_monitor() -> None:
         other.parse()
         signals = {name: [1.0 if event == name else -1.0 for _, event in trace] for name in ("a", "b")}
         theirs = [value > 0 for _, value in other.evaluate({"time": [*range(40)], **signals})]
-        # no formula of this depth looks further ahead than fifteen units
+        # no formula of this depth looks more than fifteen units ahead
         ours = [worth(tree, trace, place, 40) for place in range(25)]
         assert ours == theirs[:25], PRINTER.show(tree, random)
 
@@ -208,7 +208,7 @@ def test_no_verdict_is_taken_back() -> None:
 
 
 def test_only_needed_values_are_kept() -> None:
-    """A decided event leaves no deadline."""
+    """A decided event leaves no deadline behind."""
     run = compiled("mtl", "eventually[0,9ns] a or eventually[0,1s] (b and next[0,1s] b)").start(0)
     run.step(ABC.index("c"), 0)
     waiting = run.deadline
@@ -217,7 +217,7 @@ def test_only_needed_values_are_kept() -> None:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Events that wait are bounded in number; beyond that is a fault, and the run goes on."""
+    """The number of waiting events is bounded; beyond the bound is a fault, and the run continues."""
     monkeypatch.setattr(bounded.BoundedProperty, "most", 100)
     run = compiled("mtl", "a => eventually[0,1s] b").start(0)
     for time in range(100):
@@ -241,7 +241,7 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 @pytest.mark.parametrize("events", ["a", "ab", "b"])
 def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events: str) -> None:
-    """A decision about one event decides others without visiting all of them."""
+    """A decision about one event decides others without visiting each of them."""
 
     def lines_run(each_second: int) -> float:
         run, counted = compiled("mtl", text).start(0), 0
@@ -266,7 +266,7 @@ def test_the_cost_of_a_step_does_not_grow_with_waiting_events(text: str, events:
 
 
 def test_deadlines_bring_no_verdict_that_may_drop() -> None:
-    """Handlers may not drop for verdicts that deadlines of random formulas cause."""
+    """Handlers may not drop for verdicts that a deadline of a random formula can cause."""
     random = seeded(44)
     for _ in range(600):
         tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
@@ -279,7 +279,7 @@ def test_deadlines_bring_no_verdict_that_may_drop() -> None:
 
 
 def test_an_undecided_part_that_is_not_needed_is_forgotten() -> None:
-    """It may hear, in the same step, of what it had waited for."""
+    """In the same step, the part may still receive the value that it waited for."""
     text = (
         "next[0ns,1ns] previously[0ns,inf] (b -> a)"
         " or historically[0ns,inf] eventually[0ns,1ns] false and next[1ns,4ns] eventually[0ns,2ns] true"

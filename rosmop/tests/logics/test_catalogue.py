@@ -1,4 +1,4 @@
-"""The way in: names of logics, positions of findings, and what no formula may do."""
+"""The entry point of the logics: their names, positions of findings, and limits of every formula."""
 
 import json
 import subprocess
@@ -58,7 +58,7 @@ def test_every_logic_in_any_case(logic: str) -> None:
 def test_every_property_can_be_rebuilt_from_data(
     logic: str, formula: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its arguments can be encoded, decoded by another process, and give the same verdicts."""
+    """Its arguments can be encoded and decoded in another process, and give the same verdicts."""
     given: list[Any] = []
 
     def noting(begin: Callable[..., None]) -> Callable[..., None]:
@@ -89,7 +89,7 @@ def test_every_property_can_be_rebuilt_from_data(
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_categories_that_may_block(logic: str) -> None:
-    """Every category whose verdict comes with the message may block; of these, only a timeout may not."""
+    """A category may block if its verdict comes with the message; a verdict by timeout may not."""
     monitor = compiled(logic, ROWS[logic][0])
     refused = {category for category in monitor.categories if monitor.blocking_refused(category)}
     assert refused == ({"timeout"} if logic == "tfsm" else set())
@@ -114,14 +114,14 @@ def test_an_unknown_logic_has_the_position_of_its_name() -> None:
 
 
 def test_differential_dynamic_logic_is_refused_by_name() -> None:
-    """With what to write instead."""
+    """The error says which logics to use instead."""
     with pytest.raises(FormulaError, match=r"`dL` .* is not supported: .* as `mtl` or `pattern`"):
         compile_property("dL", "x", ("a",), ORIGIN)
 
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_an_empty_formula_is_refused(logic: str) -> None:
-    """An empty formula says what was expected."""
+    """The error for an empty formula says what is expected."""
     assert "expected" in refusal(logic, "  ")[0]
 
 
@@ -153,7 +153,7 @@ WORDS = [
 @settings(max_examples=examples(300), derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(st.sampled_from(WORDS), max_size=14), tail=st.text(max_size=3))
 def test_any_text_is_compiled_or_refused(logic: str, words: list[str], tail: str) -> None:
-    """Whatever the text, the answer is a property or findings inside the text; never another error."""
+    """Any text gives a property, or findings inside the text, and no other error."""
     formula = " ".join(words) + tail
     try:
         monitor = compile_property(logic, formula, ABC, ORIGIN)
@@ -208,7 +208,7 @@ except (FormulaError, RunFaultError) as error:
     ("logic", "number"), [(logic, i) for logic, texts in HOSTILE.items() for i in range(len(texts))]
 )
 def test_hostile_formulas_stay_within_bounds(logic: str, number: int) -> None:
-    """A formula made to exhaust the compiler is compiled or refused within a gigabyte and twenty seconds of CPU."""
+    """A formula made to exhaust the compiler is compiled or refused within a gigabyte and twenty CPU seconds."""
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         input=json.dumps([logic, HOSTILE[logic][number]]),

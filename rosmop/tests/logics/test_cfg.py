@@ -1,4 +1,4 @@
-"""``cfg``: recognisers against a table of spans that knows nothing of positions, stacks or continuations."""
+"""``cfg``: recognisers are compared with a table of spans, which has no positions, stacks or continuations."""
 
 from random import Random
 
@@ -13,7 +13,7 @@ Rules = dict[str, list[tuple[str, ...]]]
 
 
 def draw(random: Random) -> Rules:
-    """A random small grammar: empty right sides, cycles, ambiguity and useless symbols included."""
+    """Draw a small random grammar, including empty right sides, cycles, ambiguity and useless symbols."""
     heads = ["S", "T", "U"][: random.randint(1, 3)]
     symbols = [*heads, *ABC[: random.randint(1, 3)]]
     return {
@@ -26,7 +26,7 @@ def draw(random: Random) -> Rules:
 
 
 def show(rules: Rules, random: Random) -> str:
-    """The grammar in the syntax of the logic."""
+    """Return the grammar in the syntax of the logic."""
     comma = random.choice([",", ""])
     return f"{comma}\n".join(
         f"{head} -> {' | '.join(' '.join(body) or 'epsilon' for body in bodies)}"
@@ -35,7 +35,7 @@ def show(rules: Rules, random: Random) -> str:
 
 
 def derives(rules: Rules, start: str, word: tuple[str, ...]) -> bool:
-    """Whether a word is in the language: the least table of spans closed under the rules."""
+    """Whether a word is in the language, by the least table of spans closed under the rules."""
     size = len(word)
     spans: dict[str, set[tuple[int, int]]] = {head: set() for head in rules}
     for event in (*ABC, *word):
@@ -55,7 +55,7 @@ def derives(rules: Rules, start: str, word: tuple[str, ...]) -> bool:
 
 
 def prefixes(rules: Rules) -> Rules:
-    """The grammar of all prefixes: ``A'`` derives those of what ``A`` derives. All symbols must be productive."""
+    """Return the grammar of all prefixes: ``A'`` derives the prefixes of ``A``. All symbols must be productive."""
     made = dict(rules)
     for head, bodies in rules.items():
         made[head + "'"] = [()]
@@ -67,7 +67,7 @@ def prefixes(rules: Rules) -> Rules:
 
 
 def productive(rules: Rules) -> Rules:
-    """Only the rules all of whose symbols derive some word."""
+    """Return only the rules whose symbols all derive some word."""
     good: set[str] = set(ABC)
     while fresh := {
         h for h, bodies in rules.items() if h not in good and any(good.issuperset(b) for b in bodies)
@@ -81,7 +81,7 @@ def productive(rules: Rules) -> Rules:
 
 
 def expected(rules: Rules, word: tuple[str, ...]) -> tuple[str, ...]:
-    """The categories after a trace, by definition."""
+    """Return the categories after a trace, by definition."""
     useful = productive(rules)
     if "S" not in useful:
         return ("fail",)
@@ -117,7 +117,7 @@ def test_longer_traces(text: str) -> None:
 
 
 def _walk(monitor: object, random: Random) -> tuple[str, ...]:
-    """A trace that avoids failing where it can, so that it goes deep."""
+    """Return a trace that avoids failing where possible, so that it goes deep."""
     trace: tuple[str, ...] = ()
     for _ in range(12):
         choices = [event for event in ABC if told(monitor, (*trace, event))[-1] != ("fail",)]  # type: ignore[arg-type]  # a property
@@ -126,7 +126,7 @@ def _walk(monitor: object, random: Random) -> tuple[str, ...]:
 
 
 def test_left_and_right_recursive_grammars_agree_on_long_traces() -> None:
-    """The same language written in four ways gives the same verdicts on random traces of three hundred events."""
+    """The same language, written in four ways, has the same verdicts on random traces of three hundred events."""
     ways = [
         "S -> S a S b | epsilon",
         "S -> a S b S | epsilon",
@@ -147,7 +147,7 @@ def test_left_and_right_recursive_grammars_agree_on_long_traces() -> None:
 
 
 def test_regular_grammars_become_tables() -> None:
-    """A grammar of a regular language that says so plainly is stepped by a table."""
+    """A grammar that is visibly regular is stepped by a table."""
     for text in (
         "S -> a S | b",
         "S -> S a | b",
@@ -158,7 +158,7 @@ def test_regular_grammars_become_tables() -> None:
 
 
 def test_flat_traces_take_no_memory() -> None:
-    """Right recursion does not pile up: after ten thousand balanced pairs nothing waits but the end of the trace."""
+    """After ten thousand balanced pairs, right recursion has stored nothing but the end of the trace."""
     run = compiled("cfg", "S -> a S b S | epsilon", ("a", "b")).start(0)
     assert isinstance(run, GrammarRun)
     for _ in range(10_000):
@@ -169,7 +169,7 @@ def test_flat_traces_take_no_memory() -> None:
 
 
 def test_deep_traces() -> None:
-    """A nesting of two hundred thousand is followed down and up again."""
+    """A nesting of two hundred thousand levels can be entered and left again."""
     run = compiled("cfg", "S -> a S b | c", ABC).start(0)
     told_last = [run.step(0, 0) for _ in range(200_000)][-1]
     assert told_last == ()
@@ -179,7 +179,7 @@ def test_deep_traces() -> None:
 
 
 def test_a_run_that_would_grow_too_far_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beyond the limits of nesting and of ambiguity a step is a fault, and the run stays where it was."""
+    """Beyond the limits of nesting and ambiguity a step is a fault, and the run keeps its state."""
     nested, ambiguous = compiled("cfg", "S -> a S b | c"), compiled("cfg", "S -> a S a | a")
     monkeypatch.setattr(parsing, "MAX_DEPTH", 50)
     run = nested.start(0)

@@ -1,4 +1,4 @@
-"""``ere``: monitors against the definition of the operators, and against another library's automata."""
+"""``ere``: monitors are compared with the definition of the operators, and with another library's automata."""
 
 from functools import cache
 from random import Random
@@ -15,7 +15,7 @@ Tree = tuple[Any, ...]
 
 
 def draw(random: Random, depth: int) -> Tree:
-    """A random expression as a tree."""
+    """Draw a random expression as a tree."""
     if depth == 0 or random.random() < 0.15:
         return (random.choice(["a", "b", "c", "a", "b", "c", "epsilon", "empty"]),)
     kind = random.choice(["|", "&", "cat", "cat", "~", "*", "+", "^"])
@@ -30,7 +30,7 @@ STRENGTH = {"|": 0, "&": 1, "cat": 2, "~": 3, "*": 4, "+": 4, "^": 4}
 
 
 def show(tree: Tree, random: Random) -> str:
-    """The tree as text, with no more parentheses than the stated precedence needs (and sometimes more)."""
+    """Return the tree as text, with the parentheses that the precedence needs (and sometimes more)."""
     kind = tree[0]
     if len(tree) == 1:
         return str(kind)
@@ -86,7 +86,7 @@ ALPHABET = [*LETTERS.values(), REST]
 
 
 def machine(finals: set[int], moves: dict[int, dict[str, int]]) -> Fsm:
-    """A small automaton of the other library; state 9 is dead."""
+    """Return a small automaton of the other library; state 9 is dead."""
     states = {*moves, *finals, 9}
     table = {
         state: dict.fromkeys(ALPHABET, 9)
@@ -97,7 +97,7 @@ def machine(finals: set[int], moves: dict[int, dict[str, int]]) -> Fsm:
 
 
 def other_library(tree: Tree) -> Fsm:  # noqa: PLR0911  # one per operator
-    """The expression, built with the operations of the other library."""
+    """Return the expression, built with the operations of the other library."""
     kind = tree[0]
     if kind in ABC:
         return machine({1}, {0: {kind: 1}, 1: {}})
@@ -118,7 +118,7 @@ def other_library(tree: Tree) -> Fsm:  # noqa: PLR0911  # one per operator
 
 
 def test_match_and_fail_against_another_library() -> None:
-    """Monitor and library agree in every pair of states: on match, and on whether one is still possible."""
+    """Monitor and library agree in every pair of states on a match, and on whether a match is still possible."""
     random = seeded(4)
     for _ in range(500):
         tree = draw(random, 3)
@@ -145,5 +145,5 @@ def test_match_and_fail_against_another_library() -> None:
     ["(a|b)* a (a|b)^40", "a^999999", "((a^70)^70)^70", "(" * 5000 + "a", "~" * 5000 + "a", "a " * 400_000],
 )
 def test_hostile_expressions_are_refused(text: str) -> None:
-    """Expressions whose monitor would be huge are refused with a reason, not built."""
+    """An expression whose monitor would be huge is refused with a reason before it is built."""
     assert len(refusal("ere", text)) == 1

@@ -26,7 +26,7 @@ def test_violated_at_once_shows_a_trace() -> None:
 
 
 def test_shortest_traces_are_shortest() -> None:
-    """No shorter trace reaches the category, and the one given does."""
+    """The given trace reaches the category, and no shorter trace does."""
     random = seeded(17)
     formulas = ["[](a => o (b U c))", "<>(a and o (b and o c))", "(a U b) or [] c", "[](a => o o !a)"]
     for formula in [*formulas, *(f"o {random.choice(formulas)}" for _ in range(4))]:
@@ -43,7 +43,7 @@ def test_shortest_traces_are_shortest() -> None:
 
 
 def test_shortest_traces_of_bounded_past_formulas_lead_to_the_category() -> None:
-    """By the definition, with the time that it says has passed; where there is none no trace does."""
+    """The definition confirms the trace and the time that passes; if none is given, no trace reaches the category."""
     random, clocked, none = seeded(18), 0, 0
     while clocked < 200:
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 3)

@@ -1,4 +1,4 @@
-"""``ltl``: verdicts against the meaning of the formula on ultimately periodic traces."""
+"""``ltl``: verdicts are compared with the meaning of the formula on ultimately periodic traces."""
 
 from collections.abc import Callable
 from itertools import product
@@ -27,7 +27,7 @@ Lasso = tuple[tuple[str, ...], int]
 
 
 def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
-    """Yield all with at most this number of positions before and in the loop."""
+    """Return all traces with at most this number of positions before and in their loop."""
     return [
         (word, length)
         for length in range(stem + 1)
@@ -37,7 +37,7 @@ def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
 
 
 def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per kind of operator
-    """The truth of a formula at each position, by the definition of each operator; fixed points by iteration."""
+    """Return a formula's truth at each position, by the definition of each operator; fixed points are iterated."""
     word, back = lasso
     size = len(word)
     after = [*range(1, size), back]
@@ -79,7 +79,7 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per k
 
 
 def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
-    """The truth of an operator about the past at each position, by its definition."""
+    """Return the truth of an operator about the past at each position, by its definition."""
     truth: list[bool] = []
     for i, value in enumerate(values[-1]):
         if operator in ("previously", "dual previously"):
@@ -97,7 +97,7 @@ def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
 
 
 def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[str, ...], tuple[str, ...]]:
-    """The verdict for each prefix: what the continuations that were enumerated have in common."""
+    """Return the verdict for each prefix that all enumerated continuations have in common."""
     verdicts: dict[tuple[str, ...], set[bool]] = {}
     for lasso in words:
         truth = holds(tree, lasso)[0]
@@ -115,19 +115,19 @@ def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[s
 
 
 def unrolled(lasso: Lasso, turns: int) -> Lasso:
-    """The same trace, its loop written down several times before it leads back."""
+    """Return the same trace with its loop repeated several times before it leads back."""
     word, back = lasso
     loop = word[back:]
     return word + loop * turns, len(word) + len(loop) * (turns - 1)
 
 
 def has(tree: Tree, operators: tuple[str, ...]) -> bool:
-    """Whether the formula has one of these."""
+    """Whether the formula has one of these operators."""
     return tree[0] in operators or any(has(part, operators) for part in tree[1:] if isinstance(part, tuple))
 
 
 def test_many_operators_about_the_past() -> None:
-    """A formula about past events only costs no more than its memory."""
+    """A formula that is only about the past costs no more than its memory."""
     monitor = compiled("ltl", "[](a => " + "(*) " * 7 + "b)", AB)
     assert told(monitor, "bbbbbbbab")[-2:] == [(), ()]
     assert told(monitor, "abbbbbbaa") == [("violation",)] * 9
@@ -135,7 +135,7 @@ def test_many_operators_about_the_past() -> None:
 
 
 def test_long_traces_of_random_formulas() -> None:
-    """On a long prefix the verdict is that of looping on for ever, as far as there is one; and it is for good."""
+    """On a long prefix, a verdict equals that of looping forever, and it is final."""
     random = seeded(6)
     for _ in range(400):
         tree = draw(random, 4, TEMPORAL, UNARY, ("a", "b", "c"))
@@ -171,7 +171,7 @@ def test_hostile_formulas_are_refused(text: str) -> None:
 
 
 def test_nested_parity_is_small() -> None:
-    """`xor` and `<=>` nested to the limit do not blow up the construction."""
+    """`xor` and `<=>`, nested to the limit, do not make the automaton explode."""
     text = "[] a"
     for number in range(60):
         text = f"({text}) {'xor' if number % 2 else '<=>'} b"

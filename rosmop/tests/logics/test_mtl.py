@@ -1,4 +1,4 @@
-"""``mtl`` over the past: against the definition of its operators, and against another monitor."""
+"""``mtl`` over the past: compared with the definition of its operators, and with another monitor."""
 
 from copy import copy
 from random import Random
@@ -28,7 +28,7 @@ Timed = list[tuple[int, str]]
 
 
 def bounded(tree: Tree, random: Random, largest: int) -> Tree:
-    """The formula with random bounds on its temporal operators."""
+    """Return the formula with random bounds on its temporal operators."""
     if tree[0] in ("event", "true", "false"):
         return tree
     operands = tuple(bounded(operand, random, largest) for operand in tree[1:])
@@ -40,7 +40,7 @@ def bounded(tree: Tree, random: Random, largest: int) -> Tree:
 
 
 def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
-    """The truth of a formula at event ``i``, by the definition of each operator."""
+    """Return the truth of a formula at event ``i``, by the definition of each operator."""
     operator, *rest = tree
     low, high = (0, None)
     if operator in TEMPORAL and rest and isinstance(rest[-1][0], int):
@@ -83,12 +83,12 @@ def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  
 
 
 def verdicts(run: Run, trace: Timed, events: tuple[str, ...] = ABC) -> list[bool]:
-    """Whether the formula holds, at each event."""
+    """Return whether the formula holds, for each event."""
     return [run.step(events.index(event), time) == ("validation",) for time, event in trace]
 
 
 def timed_trace(random: Random, length: int, gap: int) -> Timed:
-    """Events at random times, several at one instant now and then."""
+    """Return events at random times, some of them at the same time."""
     time, trace = random.randint(0, 5), []
     for _ in range(length):
         time += random.choice([0, 1, random.randint(0, gap)])
@@ -97,7 +97,7 @@ def timed_trace(random: Random, length: int, gap: int) -> Timed:
 
 
 def test_long_traces_by_definition() -> None:
-    """On traces of hundreds of events, one operator with every kind of bounds agrees with its definition."""
+    """On traces of hundreds of events, each operator with each kind of bounds agrees with its definition."""
     random = seeded(10)
     for low, high in ((0, 30), (10, None), (10, 40), (20, 20), (7, 9), (0, None), (0, 0)):
         for tree in (
@@ -110,7 +110,7 @@ def test_long_traces_by_definition() -> None:
 
 
 def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
-    """The formula in the language of the other monitor."""
+    """Return the formula in the language of the other monitor."""
     operator, *rest = tree
     bounds = ""
     if rest and isinstance(rest[-1][0], int):
@@ -136,7 +136,7 @@ def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
 
 
 def expressible(tree: Tree) -> bool:
-    """Whether the other monitor knows all operators (and it takes `[0:0]` for no bounds)."""
+    """Whether the other monitor has all operators. (It reads `[0:0]` as no bounds.)"""
     if isinstance(tree[-1], tuple) and tree[-1] == (0, 0):
         return False
     if tree[0] in ("true", "false", "xor", "iff") or (tree[0] == "previously" and len(tree) > 2):
@@ -145,7 +145,7 @@ def expressible(tree: Tree) -> bool:
 
 
 def test_against_another_monitor() -> None:
-    """With one event per unit of time, verdicts agree with those of an independent discrete-time monitor."""
+    """With one event in each unit of time, verdicts agree with those of an independent discrete-time monitor."""
     random = seeded(11)
     compared = 0
     while compared < 80:
@@ -177,7 +177,7 @@ def test_a_formula_without_bounds_becomes_a_table() -> None:
     ],
 )
 def test_a_formula_with_one_bound_becomes_tables_and_a_clock(text: str) -> None:
-    """One that begins at once, or has no end: a module can step it; and it tells what the windows tell."""
+    """If the bound begins at once or has no end, a module can step the formula, with the verdicts of the windows."""
     one, other = compiled("mtl", text), compiled("mtl", f"({text}) or once[1ns,1ns] false")
     assert isinstance(one, ClockedProperty)
     assert isinstance(other, PastProperty)
@@ -206,7 +206,7 @@ def test_a_copy_of_a_run_is_independent() -> None:
 
 
 def test_memory_of_values_that_are_not_needed_is_bounded() -> None:
-    """However many events happen at which the formula holds anyway, no window grows."""
+    """If the formula holds anyway, no window grows, however many events happen."""
     run = compiled("mtl", "a => once[1s,2s] b or previously[1s,2s] b").start(0)
     assert isinstance(run, PastRun)
     for second in range(0, 3_000, 3):
@@ -215,7 +215,7 @@ def test_memory_of_values_that_are_not_needed_is_bounded() -> None:
 
 
 def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:
-    """However many events, `since[l,u]` keeps about l/(u-l) intervals."""
+    """For any number of events, `since[l,u]` stores about l/(u-l) intervals."""
     window = SinceWindow(1000, 1100)
     longest = 0
     for now in range(0, 200_000, 3):

@@ -1,4 +1,4 @@
-"""``pattern``: against a declarative meaning, with certainty decided by looking at what may follow."""
+"""``pattern``: compared with a declarative meaning, where looking at all continuations decides certainty."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ Timed = tuple[tuple[int, str], ...]
 
 @dataclass(frozen=True)
 class Meaning:
-    """A pattern, read as a statement about what has happened until now."""
+    """A pattern, read as a statement about the trace so far."""
 
     kind: str
     opens: str | None
@@ -22,7 +22,7 @@ class Meaning:
     within: int | None
 
     def text(self) -> str:
-        """The pattern in the syntax of the logic."""
+        """Return the pattern in the syntax of the logic."""
         scope = {
             (False, False): "globally",
             (True, False): f"after {self.opens}",
@@ -37,7 +37,7 @@ class Meaning:
         return f"{scope}: {body}" + ("" if self.within is None else f" within {self.within} ns")
 
     def scopes(self, trace: Timed) -> Iterator[tuple[int, Timed, bool]]:
-        """For each scope: when it opened, the events inside it, and whether it is closed."""
+        """Yield for each scope when it opened, the events inside it, and whether it is closed."""
         opened: int | None = 0 if self.opens is None else None
         inside: list[tuple[int, str]] = []
         for time, event in trace:
@@ -55,7 +55,7 @@ class Meaning:
             yield opened, tuple(inside), False
 
     def unmet(self, trace: Timed, now: int) -> tuple[bool, frozenset[tuple[int, int]]]:
-        """Whether the pattern is violated by now, and what is still due (as scope and place in it)."""
+        """Return whether the pattern is violated already, and the duties that remain (as scope and position in it)."""
         results = [self._in_scope(*scope, now) for scope in self.scopes(trace)]
         due = {(number, place) for number, (_, places) in enumerate(results) for place in places}
         return any(violated for violated, _ in results), frozenset(due)
@@ -84,7 +84,7 @@ class Meaning:
         return any(j > i and near(t, u) for i, t in firsts for j, u in seconds), set()
 
     def verdict(self, trace: Timed, now: int, events: tuple[str, ...], ahead: int) -> tuple[str, ...]:
-        """Return the certain verdict. Validation: nothing can be violated or due. Violation: a duty cannot be met."""
+        """Return the certain verdict. Validation: no violation or duty is possible. Violation: a duty cannot be met."""
         gaps = (0,) if self.within is None else (0, self.within + 1)
         _, due_now = self.unmet(trace, now)
         can_meet = can_miss = False
@@ -104,7 +104,7 @@ class Meaning:
 
 
 def meanings(events: tuple[str, ...], bounds: tuple[int | None, ...]) -> list[Meaning]:
-    """Every pattern over some events, those in which one event has several parts included."""
+    """Return every pattern over some events, including those where one event has several parts."""
     scopes = [
         (None, None),
         *((e, None) for e in events),
@@ -139,7 +139,7 @@ def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[s
 
 
 def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
-    """Return the verdict that is certain only because nothing more happens at this instant."""
+    """Return the verdict that is certain only because no further event happens at this time."""
     if meaning.unmet(seen, instant + 1)[0]:
         return ("violation",)
     windows = [opened + (meaning.within or 0) for opened, _, closed in meaning.scopes(seen) if not closed]
@@ -149,7 +149,7 @@ def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
 
 
 def test_a_published_remedy_counts_as_the_answer() -> None:
-    """With the remedies put into the trace as answers, the pattern without them says the same of all short traces."""
+    """With the remedies inserted as answers, the pattern without remedies has the same verdicts on all short traces."""
     for scope, closes in (("globally", ""), ("after c", ""), ("until c", "c"), ("after c until b", "b")):
         for body in ("some a", "b causes a", "some b", "a causes b"):
             if body[-1] == closes:
@@ -168,19 +168,19 @@ def test_a_published_remedy_counts_as_the_answer() -> None:
 
 
 def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str) -> list[tuple[int, str]]:
-    """The trace with an answer at each remedy, behind what happened at that time."""
+    """Return the trace with an answer at each remedy, after the events of that time."""
     return sorted([*trace, *((time, answer) for time in remedies)], key=lambda one: one[0])
 
 
 def check_remedies(
     plain: CompiledProperty, trace: list[tuple[int, str]], remedies: list[int], answer: str
 ) -> None:
-    """Each comes when, without it, the deadline would have violated the pattern."""
+    """Fail unless each remedy comes when the deadline would otherwise have violated the pattern."""
     for place, time in enumerate(remedies):
         before = [one for one in with_answers(trace, remedies[:place], answer) if one[0] <= time]
         assert play(plain.start(0), "abc", before, time + 1)[-1] == (time, ("violation",)), (trace, remedies)
 
 
 def first(record: list[tuple[int, tuple[str, ...]]]) -> tuple[int, tuple[str, ...]] | None:
-    """The first verdict, which is for good."""
+    """Return the first verdict, which is final."""
     return next((one for one in record if one[1]), None)

@@ -1,4 +1,4 @@
-"""``ptcaret``: against the definition, which looks back through the whole trace for every question."""
+"""``ptcaret``: compared with the definition, which searches the whole trace for every question."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -22,7 +22,7 @@ TEMPORAL = [name for name in SIGNS if name not in ("not", "implies", "iff")]
 
 
 def show(tree: Tree) -> str:
-    """The formula, with all parentheses."""
+    """Return the formula with all parentheses."""
     operator, *operands = tree
     if operator == "event":
         return str(operands[0])
@@ -32,7 +32,7 @@ def show(tree: Tree) -> str:
 
 
 def before(trace: Sequence[str], place: int) -> int:
-    """The event before this one in the abstract past: over calls that have returned; -1 if there is none."""
+    """Return the previous event in the abstract past, which skips returned calls; -1 if there is none."""
     depth, at = 0, place - 1
     if at >= 0 and trace[at] == "end":
         while at >= 0:
@@ -44,7 +44,7 @@ def before(trace: Sequence[str], place: int) -> int:
 
 
 def holds(tree: Tree, trace: Sequence[str], place: int) -> bool:
-    """Whether a formula holds at a place of a trace."""
+    """Whether a formula holds at a position of a trace."""
     operator, *operands = tree
     if operator in ("event", "true", "false"):
         return bool(operator == "true" or (operator == "event" and trace[place] == operands[0]))
@@ -76,7 +76,7 @@ def verdicts(tree: Tree, trace: Sequence[str]) -> list[tuple[str, ...]]:
 
 
 def test_a_copy_of_a_run_is_independent() -> None:
-    """Steps of one copy, calls and returns included, do not change the other."""
+    """Steps of one copy, including calls and returns, do not change the other."""
     random = seeded(13)
     for _ in range(200):
         tree = draw(random, 3, TEMPORAL, UNARY, EVENTS)
@@ -132,7 +132,7 @@ BEHIND = {"": [], "@violation { } @c { }": ["violation", "c"], "// why\n@c /* {}
 @pytest.mark.parametrize("text", IN_A_FILE)
 @pytest.mark.parametrize("behind", BEHIND)
 def test_a_formula_needs_no_escapes_in_a_file(text: str, behind: str) -> None:
-    """Its `@` begins no handler, and a handler's belongs to no formula."""
+    """The formula's `@` begins no handler, and a handler's `@` is not part of a formula."""
     (found,) = parse(f"s() {{ ptcaret: {text}\n{behind} }}", "x.rv").specifications[0].properties
     assert found.formula.removesuffix("// why").rstrip() == text
     assert [handler.category for handler in found.handlers] == BEHIND[behind]

@@ -1,4 +1,4 @@
-"""``ptltl``: against the definition of its operators."""
+"""``ptltl``: compared with the definition of its operators."""
 
 import pytest
 
@@ -26,7 +26,7 @@ PRINTER = Printer(
 
 
 def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
-    """The truth of a formula at position ``i``, by the definition of each operator."""
+    """Return the truth of a formula at position ``i``, by the definition of each operator."""
     operator, *operands = tree
 
     def at(operand: int, position: int) -> bool:
@@ -67,7 +67,7 @@ def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911,
 
 @pytest.mark.parametrize("folded", [past_monitors.MAX_FOLDED, 0])
 def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A formula too large for a table is computed, with the same verdicts."""
+    """A formula too large for a table is computed at each event, with the same verdicts."""
     monkeypatch.setattr(past_monitors, "MAX_FOLDED", folded)
     random = seeded(8)
     for _ in range(examples(40)):
@@ -92,6 +92,6 @@ def test_since_groups_leftwards_and_binds_tighter_than_and() -> None:
 
 
 def test_a_wide_formula_is_accepted() -> None:
-    """Ten thousand operands are accepted."""
+    """A formula with ten thousand operands is accepted."""
     text = " xor ".join(["<*> a", *["b"] * 10_000])
     assert told(compiled("ptltl", text), "ab") == [("validation",), ("validation",)]

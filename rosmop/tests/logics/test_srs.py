@@ -1,4 +1,4 @@
-"""``srs``: rewriting against a rewriter that searches the whole string for every step."""
+"""``srs``: rewriting is compared with a rewriter that searches the whole string in every step."""
 
 from random import Random
 
@@ -13,7 +13,7 @@ Rule = tuple[list[str], list[str], bool, bool]
 
 
 def draw(random: Random) -> list[Rule]:
-    """Random rules that write no more than they take."""
+    """Draw random rules that never lengthen the string."""
     symbols = [*ABC[: random.randint(1, 3)], *(["X"] if random.random() < 0.5 else [])]
     rules = []
     for _ in range(random.randint(1, 4)):
@@ -26,7 +26,7 @@ def draw(random: Random) -> list[Rule]:
 
 
 def show(rules: list[Rule]) -> str:
-    """The rules in the syntax of the logic; one that writes X, so that it may be looked for."""
+    """Return the rules in the syntax of the logic; one of them writes X, which the test searches for."""
     text = "a a a a a a a a a a a a a -> X . "
     for left, right, begins, ends in rules:
         written = f"#{right[1]}" if right[:1] == ["#"] else " ".join(right) or "#epsilon"
@@ -57,7 +57,7 @@ def rewritten(rules: list[Rule], string: list[str]) -> tuple[list[str], tuple[st
 
 
 def test_endless_rewriting_is_a_fault_and_changes_nothing() -> None:
-    """A rule that grows, and one that goes round; the run goes on with the next event."""
+    """A rule that grows and a cyclic rule are faults; the run continues with the next event."""
     for rules in ("a -> a a .", "a -> X . X -> a ."):
         run = compiled("srs", f"{rules} b b -> #fail .").start(0)
         assert run.step(1, 0) == ()
@@ -67,7 +67,7 @@ def test_endless_rewriting_is_a_fault_and_changes_nothing() -> None:
 
 
 def test_comparing_long_rules_is_charged() -> None:
-    """A rule may be as long as the string; what would take seconds at each event is a fault, the rule alone is not."""
+    """A rule as long as the string is allowed alone; comparisons that would take seconds at each event are a fault."""
     long, half = "a " * 20_000, "a " * 10_000
     for formula, fault in (
         (f"{long} b -> #fail .", False),
@@ -84,7 +84,7 @@ def test_comparing_long_rules_is_charged() -> None:
 
 
 def test_a_string_that_grows_for_ever_is_a_fault() -> None:
-    """One symbol for each event, until there are too many."""
+    """Each event adds one symbol until there are too many."""
     run = compiled("srs", "a b -> #fail .").start(0)
     assert isinstance(run, RewritingRun)
     run.string = [0] * MAX_STRING

@@ -1,4 +1,4 @@
-"""``tfsm``: machines with time bounds against a simulation that looks at every instant."""
+"""``tfsm``: machines with time bounds are compared with a simulation of every nanosecond."""
 
 from random import Random
 
@@ -10,7 +10,7 @@ AB = ("a", "b")
 
 
 class Ticking:
-    """A random timed machine, simulated nanosecond by nanosecond: events first, then what ran out at this instant."""
+    """A random timed machine, simulated by nanosecond: events come first, then the timeouts of that time."""
 
     def __init__(self, random: Random) -> None:
         self.states = [f"s{number}" for number in range(random.randint(1, 3))]
@@ -26,7 +26,7 @@ class Ticking:
         self.timeouts.setdefault(self.states[0], (2, self.states[-1]))
 
     def text(self) -> str:
-        """The machine in the syntax of the logic."""
+        """Return the machine in the syntax of the logic."""
         parts = []
         for state in self.states:
             clauses = [f"{event} -> {target}" for event, target in self.moves[state].items()]
@@ -36,7 +36,7 @@ class Ticking:
         return "\n".join(parts)
 
     def play(self, trace: list[tuple[int, str]], start: int, end: int) -> list[tuple[int, tuple[str, ...]]]:
-        """Return the categories at each instant from ``start`` to before ``end``."""
+        """Return the categories at each time from ``start`` to before ``end``."""
         state, entered = self.states[0], start
         record: list[tuple[int, tuple[str, ...]]] = []
         for instant in range(start, end):
@@ -53,14 +53,14 @@ class Ticking:
 
 
 def test_a_run_refuses_to_step_past_its_deadline() -> None:
-    """A caller that forgot to expire the run gets an error instead of a wrong verdict."""
+    """A caller that forgets to expire the run gets an error instead of a wrong verdict."""
     run = compiled("tfsm", "s0 [ timeout 1s -> s0, a -> s0 ]", AB).start(0)
     with pytest.raises(ValueError, match="expire the run first"):
         run.step(0, 2 * 10**9)
 
 
 def test_time_does_not_run_backwards() -> None:
-    """An event with an earlier time counts as of the latest time seen."""
+    """An event with an earlier time gets the latest time seen."""
     run = compiled("tfsm", "s0 [ timeout 1s -> s0, a -> s0 ]", AB).start(0)
     run.step(0, 500_000_000)
     run.step(0, 400_000_000)

@@ -1,4 +1,4 @@
-"""The verdicts of random properties of each logic are those of its definition (`rosmop/tests/verdicts.py`)."""
+"""Random properties of each logic have the verdicts of its definition (`rosmop/tests/verdicts.py`)."""
 
 import pytest
 
@@ -15,7 +15,7 @@ SHORT = {"fsm": 120, "ere": 120, "cfg": 39, "ltl": 39, "pattern": 5}
 
 @pytest.mark.parametrize("logic", PROPERTIES)
 def test_verdicts_of_random_properties_are_those_of_the_definition(logic: str) -> None:
-    """On short traces and longer random ones, after each event and at each deadline."""
+    """This holds on short traces and longer random ones, after each event and at each deadline."""
     judged = [*differing(logic, 2 * PROPERTIES[logic], seed=11, each=2, short=SHORT.get(logic, 20))]
     assert [difference for _, difference in judged if difference] == []
 
@@ -23,7 +23,7 @@ def test_verdicts_of_random_properties_are_those_of_the_definition(logic: str) -
 def test_formulas_too_large_to_simplify_at_each_event_have_the_same_verdicts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Small ones are simplified, so that they need less time; here, none is."""
+    """Small formulas are simplified to save time; in this test no formula is."""
     monkeypatch.setattr(past_monitors, "MAX_FOLDED", 0)
     for logic in ("mtl", "ptltl"):
         judged = differing(logic, 2 * PROPERTIES[logic], seed=12, each=2, short=5)

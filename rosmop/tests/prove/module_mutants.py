@@ -1,4 +1,4 @@
-"""Modules that are wrong in one place: whatever a writer of modules may get wrong in an instruction."""
+"""Modules with one fault: every mistake that a generator of modules may make in an instruction."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -73,7 +73,7 @@ def _constant(one: WasmInstruction) -> Iterator[WasmInstruction]:
 
 
 def _check(one: WasmInstruction) -> Iterator[WasmInstruction]:
-    """A bound that is not looked at, or after which the message goes on."""
+    """Yield faults of a bound check: it is ignored, or the message continues after it."""
     if one.name == "if" and one.body:
         if not one.otherwise:
             yield WasmInstruction("drop")
@@ -99,7 +99,7 @@ def _trees(
 
 
 def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
-    """Each variable that is read, once the next one of its type instead."""
+    """Yield, for each variable that is read, the fault of reading the next one of its type."""
     kinds = [*code.parameters, *code.made]
 
     def change(one: WasmInstruction) -> Iterator[WasmInstruction]:
@@ -113,7 +113,7 @@ def operands(code: Code) -> Iterator[tuple[WasmInstruction, ...]]:
 
 
 def mutants(code: Code) -> Iterator[tuple[str, Code]]:
-    """The kind of each fault, and the function that has it."""
+    """Yield the kind of each fault, and the function that has it."""
     for kind, change in FAULTS.items():
         for body in _trees(code.body, change):
             yield kind, replace(code, body=body)
@@ -122,7 +122,7 @@ def mutants(code: Code) -> Iterator[tuple[str, Code]]:
 
 
 def event(body: str, parameters: str, pattern: str, before: str = "") -> str:
-    """A specification with one event on `/plain`."""
+    """Return a specification with one event on `/plain`."""
     return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"
 
 
@@ -143,7 +143,7 @@ FAULTY = {
 
 
 def compiled(text: str, known: Definitions | None = None) -> Compiled:
-    """One specification."""
+    """Compile one specification."""
     known = definitions() if known is None else known
     return MonitorSet.of(compiled_from({"a.rv": text}, known)).compiled
 

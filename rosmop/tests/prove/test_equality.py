@@ -1,4 +1,4 @@
-"""The code of an event is proved equal to its meaning; every wrong module is found."""
+"""The code of an event is proved equal to its meaning, and every wrong module is found."""
 
 import itertools
 import time
@@ -37,7 +37,7 @@ SHIPPED = {
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_specifications(name: str) -> None:
-    """All events that have a module without loops are proved; the others have the reason."""
+    """All events that have a module without loops are proved; each other event has a reason."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     assert (
@@ -46,7 +46,7 @@ def test_shipped_specifications(name: str) -> None:
 
 
 def test_no_shipped_specification_is_left_out() -> None:
-    """A new one is also proved."""
+    """A newly shipped specification must also be proved."""
     assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
 
 
@@ -92,7 +92,7 @@ PROVED = {
 
 @pytest.mark.parametrize("name", PROVED)
 def test_the_language_without_loops_is_proved(name: str) -> None:
-    """The proof covers all messages and states, which are more than any test can try."""
+    """The proof covers all messages and states, more than any test can try."""
     assert answers(PROVED[name]) == {"s.e": EQUAL}
 
 
@@ -125,7 +125,7 @@ def test_without_time_nothing_is_proved() -> None:
     [("fields, variables, a drop", 9, 4), ("output, and what the module leaves", 23, 2)],
 )
 def test_wrong_modules_are_found(name: str, every: int, times: int) -> None:
-    """Some of those that `tests/proofs/test_events.py` makes: each is decided, and most differ."""
+    """A sample of the mutants of `tests/proofs/test_events.py`: each is decided, and most differ."""
     told = Counter(answer for _, answer in faulty(FAULTY[name], every=every))
     assert {*told} == {EQUAL, "not equal"}
     assert told["not equal"] > times * told[EQUAL]

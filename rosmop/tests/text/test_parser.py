@@ -1,4 +1,4 @@
-"""The parser takes ROSMOP's syntax as it occurs, and says of anything else where and why it cannot be."""
+"""The parser accepts ROSMOP's syntax as it is used; for any other text it reports the position and the reason."""
 
 # ruff: noqa: E501  the rows of tables
 
@@ -11,19 +11,19 @@ from rosmop.text.parser import MAX_CHARACTERS, parse
 
 
 def parsed(text: str) -> tree.Specification:
-    """The only specification of a text."""
+    """Return the only specification of a text."""
     [found] = parse(text, "x.rv").specifications
     return found
 
 
 def event(body: str = "", head: str = "event e() /t std_msgs/Empty '{}'") -> tree.EventDefinition:
-    """The event of a specification with one."""
+    """Return the event of a specification with one event."""
     [found] = parsed(f"s() {{ {head} {{ {body} }} }}").events
     return found
 
 
 def refusal(text: str) -> tuple[int, int, str]:
-    """Line, column and text of the first error."""
+    """Return line, column and text of the first error."""
     with pytest.raises(SpecificationError) as caught:
         parse(text, "x.rv")
     finding = caught.value.findings[0]
@@ -49,20 +49,20 @@ HEADS = [
 
 @pytest.mark.parametrize(("head", "name", "modifiers"), HEADS)
 def test_the_head_of_a_specification(head: str, name: str, modifiers: tuple[str, ...]) -> None:
-    """Modifiers, parentheses or none, a C++ preamble and comments in front."""
+    """Covers modifiers, optional parentheses, and a C++ preamble and comments before the specification."""
     found = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
     assert found.name == name
     assert tuple(modifier.parts[0] for modifier in found.modifiers) == modifiers
 
 
 def test_several_specifications_in_a_file() -> None:
-    """Any number, in order, with stray semicolons."""
+    """A file may have any number of specifications, in order, with stray semicolons."""
     text = "a() { event e() /t std_msgs/Empty '{}' { }; };\nb { event e() /t std_msgs/Empty '{}' { } }"
     assert [found.name for found in parse(text, "x.rv").specifications] == ["a", "b"]
 
 
 def test_functions_and_declarations_may_stand_anywhere() -> None:
-    """As in the samples of ROSRV: declarations, init, events and functions mixed."""
+    """Declarations, init, events and functions may be mixed, as in the samples of ROSRV."""
     found = parsed("""s() {
         int a = 10; double b, c = 2.5; std::string const t = "x"; char d[20]; std::vector<std::vector<double>> v;
         init() { a = 1; }
@@ -100,7 +100,7 @@ TRIGGERS = [
 
 @pytest.mark.parametrize(("head", "expected"), TRIGGERS)
 def test_triggers_of_events(head: str, expected: tuple[str, str, str | None]) -> None:
-    """Topics and services with both spellings of types, and typographic quotes."""
+    """Covers topics and services, both spellings of types, and typographic quotes."""
     trigger = event(head=head).trigger
     assert isinstance(trigger, tree.MessageTrigger)
     assert (trigger.topic, trigger.type, trigger.part) == expected
@@ -120,14 +120,14 @@ DURATIONS = [
 
 @pytest.mark.parametrize(("text", "nanoseconds"), DURATIONS)
 def test_durations(text: str, nanoseconds: int) -> None:
-    """With or without a space; a bare number is seconds."""
+    """A space before the unit is optional; a bare number is in seconds."""
     trigger = event(head=f"event e() every {text}").trigger
     assert isinstance(trigger, tree.TimerTrigger)
     assert trigger.period_ns == nanoseconds
 
 
 def test_a_comma_may_end_a_pattern() -> None:
-    """`'{data:v,}'`, nested ones too, as ROSMOP takes it."""
+    """`'{data:v,}'` is accepted as in ROSMOP, also inside nested patterns."""
     paths = []
     for comma in (",", ""):
         pattern = f"'{{a:x, b:{{c:y{comma}}}{comma}}}'"
@@ -138,7 +138,7 @@ def test_a_comma_may_end_a_pattern() -> None:
 
 
 def test_patterns_are_paths() -> None:
-    """Nested patterns and dotted paths come to the same, with indexes and constants."""
+    """Nested patterns and dotted paths are equivalent, also with indexes and constants."""
     head = "event e(int a, int b) /t p/T '{x.y[2]:a, z:{w:{v:b}, c:-1.5}, s: \"on\", k: p::T::K, t: true}'"
     trigger = event(head=head).trigger
     assert isinstance(trigger, tree.MessageTrigger)
@@ -154,13 +154,13 @@ def test_patterns_are_paths() -> None:
 
 
 def test_the_older_brackets_of_actions() -> None:
-    """`<< … >>` around an action, as in the oldest samples."""
+    """`<< … >>` may surround an action, as in the oldest samples."""
     found = parsed("s() { event e() /t std_msgs/Empty '{}' << int a = 1 << 2; >> }").events[0]
     assert len(found.action.statements) == 1
 
 
 def test_properties() -> None:
-    """Logic, formula as written, its position, and the handlers."""
+    """A property has its logic, the formula as written, its position, and the handlers."""
     found = parsed("""s() {
     event e() /t std_msgs/Empty '{}' { }
     ERE :  (e e)* // not @this
@@ -180,7 +180,7 @@ def test_properties() -> None:
 
 @pytest.mark.parametrize("name", ["auto", "new", "break", "try", "default", "NULL"])
 def test_a_category_may_be_a_word_of_cpp(name: str) -> None:
-    """States have names of their own; what C++ does with the word does not matter there."""
+    """States have separate names, so a C++ keyword may be a state."""
     found = parsed(
         f"s() {{ event e() /t std_msgs/Empty '{{}}' {{ }} fsm: {name} [ e -> {name} ] @{name} {{ }} }}"
     )
@@ -215,7 +215,7 @@ STATEMENTS = [
 
 @pytest.mark.parametrize("statement", STATEMENTS)
 def test_a_statement_is_read(statement: str) -> None:
-    """Statements of C++ as they occur in specifications."""
+    """The statements are those of C++ that specifications use."""
     assert event(statement).action.statements
 
 
@@ -242,7 +242,7 @@ def test_a_file_has_a_limit() -> None:
 
 
 def test_trees_at_different_places_are_equal() -> None:
-    """So that a specification that was moved in its file is still the same."""
+    """A specification that was only moved in its file counts as the same."""
     text = "s() { int a = 1; event e(int x) /t p/T '{a.b[1]:x, c:2}' when (x) { a++; } ere: e @match { } }"
     assert parsed(text) == parsed("\n\n  " + text.replace(" when", "\n   when"))
     assert parsed(text) != parsed(text.replace("a = 1", "a = 2"))

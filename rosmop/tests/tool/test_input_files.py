@@ -36,7 +36,7 @@ FILES: list[tuple[str, Callable[[Path], object], str]] = [
 def test_other_files_are_usage_errors(
     command: str, make: Callable[[Path], object], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command neither blocks nor fills the memory; it exits with 2 and the reason."""
+    """The command neither blocks nor fills the memory; it exits with status 2 and the reason."""
     monkeypatch.chdir(tmp_path)
     Path("m.rv").write_text(SPECIFICATION)
     make(Path("given"))

@@ -33,7 +33,7 @@ def required(requirements: Iterable[str]) -> set[str]:
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a virtual environment with the wheel and its dependencies only."""
+    """Make a virtual environment with only the wheel and its dependencies."""
     folder = tmp_path_factory.mktemp("installed")
     built = run(sys.executable, "-P", "-m", "hatchling", "build", "--target", "wheel", "--directory", folder)
     assert built.returncode == 0, built.stderr
@@ -56,7 +56,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_wheel_is_complete(environment: Path) -> None:
-    """Every module but the tests, and the wire format; no appliance, no WebAssembly compiler."""
+    """The wheel has every module except the tests, and the wire format, but no appliance or WebAssembly compiler."""
     packages = next(environment.glob("lib/python*/site-packages"))
     ours = {path.relative_to(FOLDER) for path in FOLDER.rglob("*.py") if "tests" not in path.parts}
     assert {path.relative_to(packages / "rosmop") for path in (packages / "rosmop").rglob("*.py")} == ours
@@ -69,14 +69,14 @@ def test_the_wheel_is_complete(environment: Path) -> None:
 
 
 def test_shipped_specifications_are_valid(environment: Path) -> None:
-    """Check accepts every specification in `monitors/`."""
+    """`check` accepts every specification in `monitors/`."""
     done = run(environment / "bin/rosmop", "check", *MONITORS)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"{len(MONITORS)} specifications OK\n")
 
 
 def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
-    """An invalid specification has exit status 1, a missing file 2."""
+    """An invalid specification gives exit status 1, a missing file 2."""
     (tmp_path / "a.rv").write_text("a() {\n  event e() /t std_msgs/None '{}' { }\n}\n")
     wrong = run(environment / "bin/rosmop", "check", "a.rv", folder=tmp_path)
     assert (wrong.returncode, wrong.stdout.partition(" error")[0]) == (1, "a.rv:2:16:")
@@ -88,14 +88,14 @@ def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
 
 
 def test_the_readme_links_to_files() -> None:
-    """Its links work in a checkout."""
+    """The links of the README work in a checkout."""
     links = re.findall(r"\]\(([^)]+)\)", (FOLDER / "README.md").read_text())
     assert links
     assert [link for link in links if not (FOLDER / link).is_file()] == []
 
 
 def test_the_readme_shows_real_output(environment: Path, tmp_path: Path) -> None:
-    """Its files and commands, in order; then the written bag and the learnt specification are valid input."""
+    """The README's files and commands are used in order; the written bag and learnt specification are valid input."""
     blocks = dict(re.findall(r"```(\w+)\n(.*?)```", (FOLDER / "README.md").read_text(), re.DOTALL))
     (tmp_path / "limit.rv").write_text(blocks["cpp"])
     (tmp_path / "record.py").write_text(blocks["python"])

@@ -1,4 +1,4 @@
-"""Types of the language: C++'s usual arithmetic conversions, and what converts into what."""
+"""Types of the language: C++'s usual arithmetic conversions, and which types convert into which."""
 
 import pytest
 
@@ -20,12 +20,12 @@ COMMON = [
 
 @pytest.mark.parametrize(("left", "right", "result"), COMMON)
 def test_the_common_type_of_two_numbers(left: Type, right: Type, result: Type) -> None:
-    """It is C++'s, whichever stands first."""
+    """The common type is that of C++, in either order."""
     assert value_types.common(left, right) == value_types.common(right, left) == result
 
 
 def test_integers_of_one_width_and_sign_are_one_type() -> None:
-    """`int` and `int32_t` are the same type under two names, `char` and `uint8_t` are not."""
+    """`int` and `int32_t` are two names of the same type; `char` and `uint8_t` are different types."""
     assert value_types.IntegerType(32, True, "int32_t") == value_types.INT
     assert value_types.CHAR != value_types.UINT8
     assert len({value_types.IntegerType(8, True, "x"), value_types.CHAR, value_types.INT8}) == 1
@@ -50,7 +50,7 @@ CONVERTIBLE = [
 
 @pytest.mark.parametrize(("source", "target", "possible"), CONVERTIBLE)
 def test_types_that_can_be_assigned(source: Type, target: Type, possible: bool) -> None:
-    """Numbers to numbers, strings to strings, vectors of the same elements, the same message type."""
+    """Numbers convert to numbers and strings to strings; vectors need the same elements, messages the same type."""
     assert value_types.convertible(source, target) is possible
 
 
@@ -65,5 +65,5 @@ def test_types_that_can_be_assigned(source: Type, target: Type, possible: bool) 
     ],
 )
 def test_a_type_is_written_as_in_cpp(kind: Type, text: str) -> None:
-    """Messages to the author speak C++."""
+    """Error messages use the names of C++."""
     assert str(kind) == text

@@ -6,13 +6,13 @@ from rosmop.types.messages import nearest
 
 
 def test_the_nearest_name() -> None:
-    """The error for a misspelt name has the similar name, or else the short list of names."""
+    """The error for a misspelt name suggests a similar name, or else lists the names if they are few."""
     assert nearest("positon", ["name", "position"]) == "; did you mean `position`?"
     assert nearest("xyz", ["name", "position"]) == "; known: name, position"
 
 
 def test_thousands_of_names_and_mistakes_cost_little() -> None:
-    """A file full of names and of mistakes keeps its compiler busy for no longer than many short ones."""
+    """A file full of names and mistakes takes no longer than many short files."""
     known = [f"function{number}" for number in range(100_000)]
     began = time.process_time()
     for number in range(5):

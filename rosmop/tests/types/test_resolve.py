@@ -1,4 +1,4 @@
-"""Type names of the text: every spelling of C++'s types, and the refusal of all else."""
+"""Type names in the text: every C++ spelling of a type is accepted, and everything else is rejected."""
 
 import pytest
 
