@@ -1,11 +1,12 @@
 """The robot's delays under attack: `python -m benchmarks.attacks [--only loop,flood] [--busy 4] [--seconds 10]`.
 
 The appliance runs as users run it, on a host of a lab of network namespaces. The robot sends an unmonitored topic at
-100 Hz, makes 20 calls a second on new connections and 20 on a kept one. Guests and hosts that no rule names attack, one
-attack after the other and in combinations. Each row shows the delays in milliseconds, lost messages, unanswered calls,
-and relays that were restarted. `quiet` is the same without an attack; `--busy N` adds N processes that only compute.
+100 Hz, and makes 20 calls a second on new connections and 20 on a kept connection. Guests, and hosts that no rule
+names, attack: one attack after the other, then in combinations. Each row shows the delays in milliseconds, lost
+messages, unanswered calls and restarted relays. The row `quiet` is measured without an attack; `--busy N` adds N
+processes that only compute.
 
-The probes run at real-time priority, so that their own scheduling adds nothing to the delays; that needs root.
+The probes run at real-time priority, so that their own scheduling adds nothing to the delays; this needs root.
 """
 
 import argparse
@@ -81,11 +82,11 @@ MD5 = {
 }
 CONTEXT = multiprocessing.get_context("fork")
 PROBES = ("topic", "new calls", "kept calls")
-PATIENCE = 20.0  # seconds until a call counts as unanswered
+PATIENCE = 20.0  # seconds after which a call counts as unanswered
 _TRIES = 20
 
 
-# TCPROS and the node API, as much of them as a load needs
+# The parts of TCPROS and of the node API that a load needs
 
 
 def header(**fields: str) -> bytes:
@@ -287,7 +288,7 @@ def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.
 
 
 def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connection, begin: Event) -> None:
-    """Send 100 messages a second from the robot to its operator, for a round of `seconds` whenever `begin` is set."""
+    """Send 100 messages a second from the robot to its operator, for `seconds` after each time that `begin` is set."""
     realtime()
     with robot.entered():
         nodes = Nodes()
@@ -330,7 +331,7 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
                         rest = rest[12:]
                         if (
                             began is not None
-                        ):  # else a message of the earlier round, which counts as lost there
+                        ):  # otherwise it is a message of the earlier round, which counted it as lost
                             delays.append(came - began)
             except OSError:
                 missing, sent, rest, lost = missing + len(sent), {}, b"", True
@@ -342,9 +343,9 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
 
 
 def probe_calls(seconds: float, robot: Host, keep: bool, answers: Connection, begin: Event) -> None:
-    """Make 20 calls a second from the robot; `keep`: on one connection, else each on a new one.
+    """Make 20 calls a second from the robot, on one connection if `keep` is set, otherwise each on a new one.
 
-    Each round has the same number of calls, so that rows can be compared; it ends after three times its length.
+    Each round has the same number of calls, so that rows can be compared; it is cut off at three times its length.
     """
     realtime()
     body = xmlrpc.client.dumps(("/looker", "/rosdistro"), "getParam").encode()
@@ -387,11 +388,11 @@ def realtime() -> None:
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
 
 
-# Attacks: each is called in the crowd's namespace with its addresses, calls `go()` when it has begun, and never returns
+# Attacks: each one runs in the crowd's namespace with its addresses, calls `go()` when it has begun, and never returns
 
 
 class Pipes:
-    """Many connections on which a message is sent repeatedly, as fast as they take it or at a total rate."""
+    """Many connections that send a message repeatedly, as fast as the receiver reads or at a total rate."""
 
     def __init__(self, socks: Sequence[socket.socket]) -> None:
         self._rest: dict[socket.socket, memoryview] = {}
@@ -401,7 +402,7 @@ class Pipes:
         self.sent = 0
 
     def send(self, data: bytes) -> None:
-        """Send the data on each connection, or first the rest of the data before."""
+        """Send the data on each connection, after the rest of the previous data."""
         for sock in list(self.socks):
             view = self._rest.pop(sock, None) or memoryview(data)
             try:
@@ -416,7 +417,7 @@ class Pipes:
             self.sent += count
 
     def at(self, rate: float, data: bytes) -> None:
-        """Send `rate` times a second, for ever."""
+        """Send `rate` times a second, forever."""
         for turn in itertools.count():
             if turn == 0:
                 start = time.monotonic()
@@ -425,7 +426,7 @@ class Pipes:
 
 
 def published(nodes: Nodes, addresses: Sequence[str], topic: str, *, listen: bool = False) -> Pipes:
-    """Register a publisher at each address, and with `listen` a subscriber; return the connections."""
+    """Register a publisher at each address and, with `listen`, a subscriber; return the connections."""
     for number, address in enumerate(addresses):
         nodes.publish(address, f"/guest/n{number}_{topic.rpartition('/')[2]}", topic, TYPES[topic])
     if listen:
@@ -480,14 +481,14 @@ def six_joints(addresses: Sequence[str], go: Callable[[], None]) -> None:
 
 
 def slices(addresses: Sequence[str], go: Callable[[], None]) -> None:
-    """Make 20,000 slices, then send messages of zero bytes that concern all of them."""
+    """Make 20,000 slices, and then send empty messages that concern all slices."""
     nodes = Nodes()
     make = published(nodes, addresses, "/guest/make")
     touch = published(nodes, addresses, "/guest/touch")
     for sock in make.socks:
         sock.setblocking(True)
     for number in range(20_000):
-        with contextlib.suppress(ConnectionError):  # cut for what other attacks do from this host
+        with contextlib.suppress(ConnectionError):  # cut because of other attacks from this host
             make.socks[number % len(make.socks)].sendall(frame(struct.pack("<I", number)))
     go()
     touch.at(50 / len(addresses), frame(b""))
@@ -641,7 +642,7 @@ class Rig:
 
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
-        """Start all of it; stop it at the end."""
+        """Start everything, and stop it at the end."""
         with self.appliance, contextlib.ExitStack() as stack:
             self._probes = []
             with self.robot.entered():

@@ -88,8 +88,9 @@ def _length(answer: bytes) -> int:
 
 
 def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, float, float]:
-    """Return the median and 99th percentile in microseconds, calls a second, and CPU of control per call in
-    microseconds.
+    """Return the median and 99th percentile, calls a second, and CPU of control per call.
+
+    Times are in microseconds.
     """
     taken: list[list[float]] = [[] for _ in range(clients)]
     threads = [threading.Thread(target=calls, args=(one.port, seconds, mine)) for mine in taken]
@@ -105,7 +106,7 @@ def measure(one: Running, clients: int, seconds: float) -> tuple[float, float, f
 
 @contextlib.contextmanager
 def appliances(folder: Path, sink: Sink) -> Iterator[list[Running]]:
-    """Start the appliances to compare."""
+    """Start the appliances that are compared."""
     forwarding = {"syslog": {"to": f"tcp://127.0.0.1:{sink.port}"}}
     wanted: dict[str, dict[str, object]] = {
         "batched": {"durability": "batched"},

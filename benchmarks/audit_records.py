@@ -1,8 +1,8 @@
-"""How fast the audit log takes, proves and finds records: python -m benchmarks.audit_records [RECORDS]
+"""The speed of writing, proving and finding audit records: python -m benchmarks.audit_records [RECORDS]
 
-Measured: the time `record()` costs its caller; records a second in both kinds of durability, with an idle
-event loop and next to a thread that is always busy; how long a loop is held up; forwarding; searches over RECORDS (by
-default a million) records; verification. Everything on one directory (TMPDIR) and its disk.
+Measured: the time that `record()` costs its caller; records a second in both kinds of durability, with an idle event
+loop and beside a thread that is always busy; how long a loop is blocked; forwarding; searches over RECORDS (by default
+a million) records; verification. All files are in one directory (TMPDIR) on one disk.
 """
 
 import asyncio
@@ -58,7 +58,7 @@ def record(log: AuditLog, number: int) -> AuditRecord:
 
 
 def open_log(directory: Path, name: str, durability: str) -> AuditLog:
-    """Open a log that folds nothing, because writing is measured."""
+    """Open a log without folding, because writing is measured."""
     return AuditLog(
         directory / name / "audit.db",
         durability="strict" if durability == "strict" else "batched",
@@ -98,7 +98,7 @@ async def _clients(log: AuditLog, clients: int, each: int) -> float:
 
 
 def measure_strict(directory: Path) -> None:
-    """Measure clients that each wait for their record before they send the next."""
+    """Measure clients that each wait for their record before they send the next one."""
     for clients in (1, 10, 100, 1000):
         log = open_log(directory, f"strict{clients}", "strict")
         rate = asyncio.run(_clients(log, clients, max(20, 10_000 // clients)))
@@ -107,7 +107,7 @@ def measure_strict(directory: Path) -> None:
 
 
 async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float]:
-    """Record `rate` a second from a loop; return the latency of the loop's other work (median, 99.9 %), in ms."""
+    """Write `rate` records a second from a loop; return the delay of its other work (median, 99.9 %) in ms."""
     late: list[float] = []
 
     async def other_work() -> None:
@@ -132,7 +132,7 @@ async def _paced(log: AuditLog, rate: int, seconds: float) -> tuple[float, float
 
 
 def measure_loop(directory: Path) -> None:
-    """Measure the delay of an event loop that makes 10,000 records a second, and whether the writer keeps up."""
+    """Measure the delay of an event loop that makes 10,000 records a second, and whether the writer keeps pace."""
     log = open_log(directory, "paced", "batched")
     median, worst = asyncio.run(_paced(log, 10_000, 5.0))
     row("10,000 records/s from an event loop: its other work waits, median", f"{median:.3f} ms")
@@ -167,7 +167,7 @@ def measure_busy(directory: Path) -> None:
 
 
 def measure_forwarding(directory: Path, count: int) -> None:
-    """Measure reading committed records, making messages of them, and sending them to a receiver that takes all."""
+    """Measure reading committed records, formatting them as messages, and sending them to a willing receiver."""
     log = open_log(directory, "forward", "batched")
     for number in range(count):
         log.record(record(log, number))

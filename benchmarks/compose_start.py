@@ -1,9 +1,9 @@
-"""How long `docker compose up` takes until nodes may connect, `docker compose stop` takes, and how large the image is.
+"""The time until nodes may connect after `docker compose up`, the time of `stop`, and the size of the image.
 
     python -m benchmarks.compose_start [RUNS]
 
-As root; with a Docker engine of its own, as the tests in tests/system/containers have it. The first start makes the
-volume, the keys and the log; the others find them. Times are wall clock: run it on a machine that does nothing else.
+Needs root, and uses its own Docker engine, as the tests in tests/system/containers do. The first start makes the
+volume, the keys and the log; later starts find them. Times are wall clock, so run it on an otherwise idle machine.
 """
 
 import statistics

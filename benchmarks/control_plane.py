@@ -48,7 +48,7 @@ READS: dict[str, tuple[Any, ...]] = {
     "getTopicTypes": (),
 }
 OPERATIONS = (*READS, "register/unregister", "setParam/getParam", "20 getParam as one", "20 setParam as one")
-NODES, TOPICS = 20, 5  # registered during the measurement: nodes, and topics of each
+NODES, TOPICS = 20, 5  # registered during the measurement: nodes, and topics of each node
 LOADS = ((1, True), (1, False), (16, True), (16, False))
 
 
@@ -80,7 +80,7 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
 
 
 def furnish(port: int) -> None:
-    """Register nodes, topics and parameters, as a small robot has them."""
+    """Register nodes, topics and parameters like those of a small robot."""
     with xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}/") as master:
         for node in range(NODES):
             for topic in range(TOPICS):
@@ -97,7 +97,7 @@ def furnish(port: int) -> None:
 
 
 class Client:
-    """One connection at a time, one request at a time; `delays` are seconds per call, `answer` is the last body."""
+    """One connection with one request at a time; `delays` are seconds per call, `answer` is the last body."""
 
     def __init__(self, port: int, wanted: list[bytes], keep: bool, host: str = "127.0.0.1") -> None:
         self.delays: list[float] = []
@@ -108,7 +108,7 @@ class Client:
         self.sock: socket.socket | None = None
 
     def send(self) -> socket.socket:
-        """Send the next request, on a new connection where there is none."""
+        """Send the next request, on a new connection if there is none."""
         self._began = time.perf_counter()
         if self.sock is None:
             self.sock = socket.create_connection(("127.0.0.1", self._port), source_address=(self._host, 0))
@@ -119,7 +119,7 @@ class Client:
         return self.sock
 
     def receive(self) -> bool:
-        """Read the available data; return whether the answer is complete. Raises ConnectionError for a refusal."""
+        """Read the available data; return whether the answer is complete. Raises `ConnectionError` for a refusal."""
         assert self.sock is not None
         piece = self.sock.recv(1 << 20)
         self._buffer += piece
@@ -143,7 +143,7 @@ class Client:
 
 def load(port: int, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float]:
     """Return calls per second and the median delay of a call in microseconds."""
-    # Each client is a separate host: a long load of one host exceeds its quota of the audit log, and has to wait.
+    # Each client is a separate host: a long load of one host would exceed its quota of the audit log and be delayed.
     group = [
         Client(port, requests(operation, one, keep), keep, f"127.0.0.{one + 1}") for one in range(clients)
     ]
@@ -175,14 +175,14 @@ def load(port: int, operation: str, clients: int, keep: bool, seconds: float) ->
 
 
 def free_port() -> int:
-    """Return a port that is free now."""
+    """Return a port that is currently free."""
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
         return int(sock.getsockname()[1])
 
 
 def await_port(port: int) -> None:
-    """Wait until a program listens, at most 30 seconds."""
+    """Wait until a program listens on the port, at most 30 seconds."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):

@@ -30,14 +30,14 @@ PARAMETERS, NODES, TOPICS = (
     4000,
     100,
     10,
-)  # topics that each node publishes, and as many that it subscribes to
+)  # topics that each node publishes, and the number that it subscribes to
 TYPE = "std_msgs/String"
 ACKNOWLEDGED = xmlrpc.client.dumps(([1, "", 0],), methodresponse=True).encode()
 PATIENCE = 120.0  # seconds without any progress
 
 
 def parameters(port: int) -> float:
-    """Return the seconds until a roslaunch's multicall is answered."""
+    """Return the seconds until roslaunch's multicall is answered."""
     names = [f"/start/part_{one // 50}/value_{one % 50}" for one in range(PARAMETERS)]
     calls: list[tuple[str, list[str | int]]] = [("deleteParam", ["/roslaunch", "/start"])]
     calls += [("setParam", ["/roslaunch", name, place]) for place, name in enumerate(names)]
@@ -57,7 +57,7 @@ def parameters(port: int) -> float:
 
 
 class Node:
-    """One node: its calls to the master, one after the other, and its port, where it receives lists of publishers."""
+    """One node: its calls to the master, one after the other, and its port, which receives lists of publishers."""
 
     def __init__(self, master: int, number: int) -> None:
         self.listening = socket.create_server(("127.0.0.1", 0), backlog=64)
@@ -71,7 +71,7 @@ class Node:
             *(request("registerSubscriber", me, topic, TYPE, own, keep=True) for topic in others),
         ]
         self._wanted = others
-        self.known: set[str] = set()  # topics whose publisher it has heard of
+        self.known: set[str] = set()  # topics for which it knows a publisher
         self.client = Client(master, self.calls, keep=True)
 
     def answered(self, answer: bytes) -> None:
@@ -88,7 +88,7 @@ class Node:
 
     @property
     def done(self) -> bool:
-        """Whether all its calls are answered, and it knows a publisher of each topic."""
+        """Whether all calls of the node are answered, and it knows a publisher of each topic."""
         return len(self.client.delays) >= len(self.calls) and len(self.known) == TOPICS
 
 

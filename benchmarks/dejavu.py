@@ -42,7 +42,7 @@ def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence
 
 
 def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], str]) -> tuple[str, ...]:
-    """Return a specification for each property (its parameters and its formula)."""
+    """Return one specification for each property, given by parameters and formula."""
     return tuple(
         specification(f"s{number}", events, over, formula)
         for number, (over, formula) in enumerate(properties)
@@ -73,7 +73,7 @@ FILE = of({"open": ("f", "m"), "close": ("f",)}, (("f",), "close => (*)(!close S
 LOCKS = of(
     {"acq": ("t", "l"), "rel": ("t", "l"), "sleep": ("t",)},
     (("t", "l"), "(sleep => !(!rel S acq)) and (rel => (*)(!rel S acq))"),
-    # any acquirer: equivalent until the first failure, because before it only the lock's owner releases it
+    # any acquirer: equivalent until the first failure, because until then only the lock's owner releases it
     (("l",), "acq => !(*)(!rel S acq)"),
 )
 COMMANDS = of({"dis": ("c", "n"), "suc": ("c", "n"), "err": ("n",)}, (("c", "n"), "suc => (!err S dis)"))

@@ -1,4 +1,4 @@
-"""The delay that one host's large parameters cause for the others: `python -m benchmarks.large_values [--seconds 4]`.
+"""The delay that one host's large parameters cause for other hosts: `python -m benchmarks.large_values [--seconds 4]`.
 
 A robot makes one small call after the other while a guest (another address of this machine) sets large parameters,
 behind a plain `rosmaster` and behind the appliance. The table shows the delay of the robot's calls.
@@ -31,13 +31,13 @@ VALUES: dict[str, Callable[[], Any]] = {
 
 
 class Caller:
-    """One kept connection from an address."""
+    """A kept connection from an address."""
 
     def __init__(self, port: int, address: str) -> None:
         self._connection = http.client.HTTPConnection("127.0.0.1", port, 120, source_address=(address, 0))
 
     def send(self, body: bytes) -> None:
-        """Make a call that was encoded before."""
+        """Send a call that is already encoded."""
         self._connection.request("POST", "/", body, {"Content-Type": "text/xml"})
         answer = self._connection.getresponse()
         answer.read()
@@ -46,8 +46,9 @@ class Caller:
 
 
 def delays(port: int, seconds: float, large: bytes | None) -> tuple[list[float], int]:
-    """Return the robot's delays in milliseconds while the guest sends `large` repeatedly, and the number of these
-    calls.
+    """Return the robot's delays in milliseconds while the guest repeatedly sends `large`.
+
+    The second result is the number of the guest's calls.
     """
     stop, sent = threading.Event(), [0]
 

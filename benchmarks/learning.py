@@ -43,7 +43,7 @@ Row = tuple[str, int, bytes]
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive as the learner takes a recording."""
+    """A drive in the form in which the learner reads a recording."""
 
     name: str
     rows: tuple[Row, ...]
@@ -88,7 +88,7 @@ def mission(chance: random.Random) -> list[Part]:
 def drive(number: int, seed: int) -> Drive:
     """Return a drive, received with jitter and measured with noise."""
     chance = random.Random(f"{seed} {number}")
-    offset = number * 1000  # seconds: each begins at another time
+    offset = number * 1000  # seconds: the offset differs from drive to drive
     rows: list[Row] = []
     last: dict[str, int] = {}
     for message in Simulation().run(mission(chance)).messages:
@@ -276,8 +276,9 @@ KINDS: Mapping[str, Callable[[Seeding], list[Row]]] = {
 
 
 def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[Drive, int, list[Row], str]:
-    """Return a drive, its fault's time, its messages with the fault, and the fault's description. Retry if it changes
-    nothing.
+    """Return a drive, its fault's time, its messages with the fault, and the fault's description.
+
+    A fault that changes nothing is replaced by another one.
     """
     while True:
         drive_ = chance.choice(drives)
@@ -285,7 +286,7 @@ def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[D
         seeding = Seeding(drive_, time, chance)
         try:
             rows = KINDS[kind](seeding)
-        except (IndexError, ValueError):  # the topic has nothing after this time
+        except (IndexError, ValueError):  # the topic has no message after this time
             continue
         if rows != list(drive_.rows):
             return drive_, time, sorted(rows, key=lambda row: row[1]), f"{kind}: {seeding.what}"

@@ -69,7 +69,7 @@ def trace(kind: str, length: int) -> list[int]:
 
 
 def per_step(run: Run, events: Sequence[int]) -> float:
-    """Return nanoseconds per step; events come a millisecond apart."""
+    """Return nanoseconds per step; events are one millisecond apart."""
     step = run.step
     times = range(0, len(events) * MS, MS)
     gc.collect()
@@ -102,7 +102,7 @@ def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | No
 
 
 def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Callable[[int], bool], ...]:
-    """Return a step of reelay and one of rtamt; each returns whether the formula holds at an event."""
+    """Return a step of reelay and a step of rtamt; each returns whether the formula holds at an event."""
     other: Any = reelay.discrete_timed_monitor(pattern=for_reelay, semantics="boolean", condense=False)
     third = rtamt.StlDiscreteTimeSpecification()
     for name in (*EVENTS, "out"):
@@ -118,7 +118,7 @@ def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Call
 
 
 def beside(events: Sequence[int]) -> None:
-    """Print what a step costs here, in reelay and in rtamt; raises `SystemExit` where a verdict differs."""
+    """Print the cost of a step here, in reelay and in rtamt. Raises `SystemExit` if a verdict differs."""
     print(f"{'here':>8} {'reelay':>8} {'rtamt':>8}  ns/step, {len(events)} events")
     for formula, for_reelay, for_rtamt in BESIDE:
         compiled = compile_property("mtl", formula, EVENTS, Position("benchmark", 1, 1))

@@ -1,11 +1,11 @@
-"""The cost of the monitors for one message: `python benchmarks/monitor_messages.py`.
+"""The cost of monitors for one message: `python benchmarks/monitor_messages.py`.
 
-A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps one
-state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message; the last
-ten numbers that are kept; a message that is published with each message; the reference in the module, many at once and
-alone; a state machine with a timeout; a handler and a line of output with each message; a string that is kept; and
-loading, with the module and without. Times are processor time, the median of the rounds, in microseconds for a
-message.
+The rows are: a message on a topic without a monitor; the reference specification of the design (reads two fields,
+writes one, steps one state machine); the same with ten monitors on other topics; a growing string; a copy of the whole
+message; a vector with the last ten numbers; a message published with each message; the reference in the module, in
+batches and singly; a state machine with a timeout; a handler and a line of output with each message; a kept string;
+loading, with and without the module. Times are processor time in microseconds for each message, as the median of the
+rounds.
 """
 
 import statistics
@@ -99,7 +99,7 @@ def with_module(text: str) -> MonitorSet:
 
 
 def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cmd") -> float:
-    """Return the time of a message in a batch of `messages`, after a first round has made the buffers."""
+    """Return the time of a message in a batch of `messages`, after a first round that allocates the buffers."""
     loaded = with_module(text)
     loaded.process(topic, bytearray(body), 1)
     lane, area = loaded.lane(topic), loaded.area

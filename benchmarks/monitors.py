@@ -68,9 +68,7 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 
 class CopyingRelay:
-    """The relay in C, a new process for each run; with `epoll` it waits for data as a relay with many connections
-    does.
-    """
+    """The relay in C, a new process for each run; with `epoll` it waits for data like a relay with many connections."""
 
     def __init__(self, *, epoll: bool = False) -> None:
         self.name = "C with epoll" if epoll else "C relay"
@@ -83,7 +81,7 @@ class CopyingRelay:
         self._process: subprocess.Popen[str] | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Start one in front of this publisher."""
+        """Start a relay in front of this publisher."""
         self.close()
         command = [str(COPYING), str(publisher), *self._options]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -92,7 +90,7 @@ class CopyingRelay:
         return int(self._process.stdout.readline()), "-"
 
     def close(self) -> None:
-        """End it."""
+        """End the relay."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -133,9 +131,9 @@ def of_kind(name: str) -> Relay:
 
 
 def topics_at_once(number: int, seconds: float) -> tuple[float, float, float]:
-    """That many topics at 1,000 messages of 200 bytes a second, a monitor on each.
+    """Run this number of topics at 1,000 messages of 200 bytes a second, with a monitor on each.
 
-    The median and the largest of the topics' p50 (microseconds), and the share of a core that the relay takes.
+    Return the median and the largest of the topics' p50 (microseconds), and the part of a core that the relay uses.
     """
     relay = Relay("topics")
     names = [f"/load{one}" for one in range(number)]
@@ -234,7 +232,7 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
 
 
 def begin(systems: list[System], *, peers: bool, kinds: bool) -> None:
-    """Start the systems that are compared in turns."""
+    """Start the systems that are compared, which take turns."""
     systems += [Direct(), CopyingRelay(), CopyingRelay(epoll=True), Relay("relay alone")]
     if kinds:
         systems += map(of_kind, KINDS)

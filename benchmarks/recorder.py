@@ -43,7 +43,7 @@ from tests.support.waiting import eventually
 LOADS = {"fifty topics, 20 MB/s": (50, 8192, 50), "five topics, 0.1 MB/s": (5, 1024, 20)}
 _SOURCE = Path(__file__).parent / "nodes" / "recorder_load.cpp"
 _PROGRAM = ROOT / "build" / "benchmarks" / "recorder_load"
-_HEAD = struct.Struct("<4xQ")  # of a std_msgs/String: its length, the number
+_HEAD = struct.Struct("<4xQ")  # in a std_msgs/String: its length, the number
 _WARM_SECONDS, _AFTER_SECONDS = 3.0, 5.0
 _CONFIGURATION = """
 recorder: {{enabled: {enabled}, memory: 512MiB, before: {seconds}, disk: 8GiB, triggers: []}}
@@ -52,7 +52,7 @@ audit: {{reserve_bytes: 1MiB}}
 
 
 class Bag(NamedTuple):
-    """The part of the load that a bag has."""
+    """The load's messages in a bag."""
 
     messages: int
     lost: int
@@ -62,7 +62,7 @@ class Bag(NamedTuple):
 
 @dataclass
 class Result:
-    """One run; `cpu` is percent of a core by the name of the process."""
+    """The result of one run; `cpu` is percent of a core by process name."""
 
     p50: float
     bag: Bag | None = None
@@ -70,7 +70,7 @@ class Result:
 
 
 class Load:
-    """The two nodes at a master, warm. The listener writes the messages that it received into a file in `folder`."""
+    """The two nodes at a master, already connected. The listener writes its received messages to a file in `folder`."""
 
     def __init__(self, session: RosSession, folder: Path, topics: int, size: int, hertz: int) -> None:
         self._heard = folder / "heard"
@@ -120,9 +120,9 @@ def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) ->
 
 
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
-    """Count the messages of the load in a bag, and those missing between the first and the last of a topic.
+    """Count the load's messages in a bag, and those missing between the first and the last of a topic.
 
-    With `heard`, every message in it that the bag does not have is missing.
+    With `heard`, every message in `heard` that the bag lacks counts as missing.
     """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
@@ -146,7 +146,7 @@ def snapshot_program() -> Path | None:
 def at_plain_master(
     folder: Path, load: tuple[int, int, int], seconds: float, recorder: str, snapshot: Path | None
 ) -> Result:
-    """Run the load without a recorder (""), with `rosbag`, or with `snapshot`, which is that program."""
+    """Run the load without a recorder (""), with `rosbag`, or with `snapshot`, the node of rosbag_snapshot."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
         running = Load(session, folder, *load)
         if not recorder:
@@ -176,8 +176,9 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """Run the load without and with the recorder, which records the seconds before the request and some after; with
-    kills.
+    """Run the load without or with the recorder; with `kills`, kill its processes meanwhile.
+
+    The recorder records the seconds before the request, and some after it.
     """
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))

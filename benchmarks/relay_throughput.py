@@ -73,7 +73,7 @@ def cpu_seconds(pid: int | None) -> float:
 
 
 def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) -> Result:
-    """Run the load once through a system; `md5sum` replaces the checksum of the message's definition."""
+    """Run the load once through a system; `md5sum` replaces the md5sum of the message type."""
     with subprocess.Popen(
         [str(compiled()), str(size), str(seconds), mode, *md5sum],
         stdin=subprocess.PIPE,
@@ -106,11 +106,11 @@ class System(Protocol):
         """Return port and topic for the subscriber, given the publisher's port."""
 
     def close(self) -> None:
-        """End it."""
+        """End the system."""
 
 
 class Direct:
-    """Nothing in the middle."""
+    """A system without a relay."""
 
     name = "direct"
     pid: int | None = None
@@ -120,11 +120,11 @@ class Direct:
         return publisher, "-"
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing: there is no process to end."""
 
 
 class Relay:
-    """This project's relay process, with a control that only knows one topic a run."""
+    """This project's relay process, with a control that knows only one topic in each run."""
 
     def __init__(self, name: str = "relay", *, recorded: bool = False) -> None:
         self.name = name
@@ -146,7 +146,7 @@ class Relay:
             raise SystemExit(f"the relay does not take the specifications: {answer.findings}")
 
     def target(self, publisher: int) -> tuple[int, str]:
-        """Make a new incarnation, whose publisher is this run's."""
+        """Make a new incarnation with this run's publisher; return port and topic."""
         return self.place(publisher, "/load")
 
     def place(self, publisher: int, topic: str) -> tuple[int, str]:
@@ -173,10 +173,10 @@ class Relay:
 
 
 class RosRelay:
-    """A ROS node that relays, at a rosmaster, a fresh one each run; the publisher's node API is served here."""
+    """A ROS node that relays, at a rosmaster, started again for each run; the publisher's node API is served here."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
-        """`command` is given the two topics."""
+        """`command` is called with the two topics."""
         self.name = name
         self._command = command
         port = free_port()
@@ -229,7 +229,7 @@ class RosRelay:
             self._relay.wait(10)
 
     def close(self) -> None:
-        """End everything that was started."""
+        """End everything that this object started."""
         self.stop_relay()
         self._api.shutdown()
         self._api.server_close()

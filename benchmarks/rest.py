@@ -55,7 +55,7 @@ def free_port() -> int:
 
 
 class Client:
-    """One kept-alive connection that has one request under way."""
+    """A kept connection with one request at a time."""
 
     def __init__(self, port: int, data: bytes) -> None:
         self.sock = socket.create_connection(("127.0.0.1", port))
@@ -69,7 +69,7 @@ class Client:
         self.sock.sendall(self.data)
 
     def receive(self) -> bool:
-        """Whether the answer is whole."""
+        """Read the available data; return whether the answer is complete."""
         piece = self.sock.recv(1 << 20)
         if not piece:
             raise RuntimeError(f"the server closed the connection: {self.got[:300]!r}")
@@ -176,7 +176,7 @@ def quantile(values: list[float], share: float) -> float:
 
 
 def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """Return requests a second, beside the bare route."""
+    """Return requests a second, compared with the bare route."""
     rows = []
     for clients in CLIENTS:
         for path in PATHS:
@@ -198,7 +198,7 @@ def rates(appliance: Appliance, bare: int, seconds: float, rounds: int) -> list[
 
 
 def effects(appliance: Appliance, seconds: float, rounds: int) -> list[dict[str, Any]]:
-    """Return the delay of a call of RVMaster, in quiet and with REST at full load."""
+    """Return the delay of a call of RVMaster without load, and with REST at full load."""
     rows = []
     for path in ("/healthz", "/v1/status", "/v1/graph", "/v1/audit?limit=50"):
         quiet, loaded = [], []

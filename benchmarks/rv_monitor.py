@@ -80,7 +80,7 @@ class Formula(NamedTuple):
 
 
 def _shown(tree: Any) -> str:
-    """A formula of either logic."""
+    """Return the text of a formula of either logic."""
     kind, *operands = tree
     if kind == "event":
         return str(operands[0])
@@ -112,7 +112,7 @@ def automata(checkout: Path, javacc: Path, formulas: Sequence[Formula]) -> list[
         for logic in ("ere", "ltl"):
             plugin, parser = checkout / "plugins_logicrepository" / logic / "src" / "main", logic.upper()
             shutil.copytree(plugin / "java", sources, dirs_exist_ok=True)
-            (sources / _PLUGINS / logic / f"{parser}Plugin.java").unlink()  # it reads and writes XML
+            (sources / _PLUGINS / logic / f"{parser}Plugin.java").unlink()  # these files read and write XML
             grammar = plugin / "javacc" / _PLUGINS / logic / "parser" / f"{parser}Parser.jj"
             folder = sources / _PLUGINS / logic / "parser"
             _run(["java", "-cp", str(javacc), "javacc", f"-OUTPUT_DIRECTORY={folder}", str(grammar)])

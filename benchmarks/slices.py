@@ -1,9 +1,9 @@
 """The cost of slices: `python -m benchmarks.slices`.
 
-The same property without parameters and with one, at 10,000 live slices that are visited in turn; the memory of
-100,000 slices; an event that concerns all of them, and one that brings a verdict of each; how fast new ids are
-accepted, and rejected beyond the bound; the same `fsm` with a condition, and with an action that changes what slices
-share. Microseconds of processor time, the least of the rounds.
+Measured: the same property without and with a parameter, at 10,000 live slices that are visited in turn; the memory of
+100,000 slices; an event that concerns all slices, and one that gives a verdict in each; how fast new ids are accepted,
+and rejected beyond the limit; the same `fsm` with a condition, and with an action that changes variables shared by
+slices. Times are microseconds of processor time, the minimum of the rounds.
 """
 
 import struct
@@ -44,7 +44,7 @@ WITHIN = SPECIFICATION % (
 
 
 def ids(count: int) -> list[bytes]:
-    """Return messages with ids as actionlib makes them."""
+    """Return messages with ids in the form of actionlib's."""
     made = (b"/planner-%d-%d.%09d" % (number, 1_700_000_000 + number, number) for number in range(count))
     return [struct.pack("<I", len(one)) + one for one in made]
 
@@ -67,7 +67,7 @@ def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS)
 
 
 def visited(text: str, messages: Sequence[bytes]) -> float:
-    """Return the processor time of a message, when those of all slices come in turn."""
+    """Return the processor time of a message when the slices get messages in turn."""
     loaded = monitors(text)
 
     def visit() -> None:
@@ -84,7 +84,7 @@ def resident() -> float:
 
 
 def main() -> None:
-    """Print what is measured."""
+    """Print all measurements."""
     few, many = ids(LIVE), ids(MANY + LIVE)
     for name, formula in PROPERTIES.items():
         plain = visited(SPECIFICATION % ("", formula), few)

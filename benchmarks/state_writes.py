@@ -44,7 +44,7 @@ def main() -> None:
 
 
 def ahead(folder: Path, tree: bytes, rate: int, seconds: float) -> list[float]:
-    """Register as the program does."""
+    """Register as the program does: ahead of the database."""
     store = StateStore(folder, failed=print)
     try:
         return _registering(

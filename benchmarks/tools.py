@@ -1,9 +1,9 @@
-"""Stock tools that ask for everything, beside a plain master: `python -m benchmarks.tools [--rounds 3]`.
+"""Stock tools that query everything, compared with a plain master: `python -m benchmarks.tools [--rounds 3]`.
 
-`rosbag record -a` records a robot with a hundred topics: seconds between the first topic's first message in the bag and
-the last one's, and from the start of the tool. `rosgraph`'s library, which rqt_graph draws from, asks for the whole
-graph. Both masters run at once and take turns, so that whatever else the machine does falls on both; the ratio is that
-of the medians.
+`rosbag record -a` records a robot with a hundred topics. Two times are measured: from the first topic's first message
+in the bag to the last topic's, and from the start of the tool. `rosgraph`'s library, which rqt_graph draws from,
+queries the whole graph. Both masters run at once and take turns, so that other load on the machine affects both; ratios
+are of medians.
 """
 
 import argparse
@@ -55,8 +55,9 @@ class Robot:
             node.wait_for(event="ready")
 
     def record(self, bag: Path) -> tuple[float, float, float]:
-        """Record a bag; return the seconds from its first topic's message to the last one's, from the start, and
-        missing topics.
+        """Record a bag; return two times in seconds, and the number of missing topics.
+
+        The times end at the last topic's first message; they begin at the first topic's, and at the start.
         """
         began = time.time()
         self.session.run(
@@ -67,7 +68,7 @@ class Robot:
         return max(at) - min(at), max(at) - began, _NODES * _TOPICS - len(at)
 
     def graph(self) -> float:
-        """Return the seconds for the whole graph."""
+        """Return the seconds to get the whole graph."""
         return float(self.session.run(PYTHON, "-c", _GRAPH, timeout=90).stdout)
 
 

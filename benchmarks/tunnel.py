@@ -59,7 +59,7 @@ class Measure:
 
 
 class Bench:
-    """The site, with the trusted host behind its tunnel and, under its own address, in clear text."""
+    """The site, with the trusted host behind its tunnel and, at its own address, in clear text."""
 
     def __init__(self, site: TunnelSite, joined: JoinedHost, seconds: float) -> None:
         self.site, self.joined, self.seconds = site, joined, seconds
@@ -143,7 +143,7 @@ def measure(bench: Bench, rounds: int) -> Table:
 def here(seconds: float, rounds: int) -> None:
     """Measure on this machine."""
     console = Console(width=110)
-    # The host in clear text is trusted here, for this comparison, by its address.
+    # For this comparison, the host in clear text is trusted by its address.
     policy = POLICY.replace("trusted = host:ocu-1,", f"trusted = host:ocu-1, {OCU},")
     with (
         tempfile.TemporaryDirectory(prefix="rosrv-bench-") as folder,

@@ -1,9 +1,10 @@
-"""The cost of reading and writing ROS's wire formats, against Python's own XML-RPC.
+"""The cost of reading and writing ROS's wire formats, compared with Python's own XML-RPC.
 
     python benchmarks/wire.py
 
-RVMaster reads two documents and writes two for every call of the Master API: a microsecond here is up to four
-per call. Each line is the best of five rounds, in microseconds; the machine's other work only adds.
+RVMaster reads two documents and writes two for every call of the Master API, so a microsecond here is up to four
+microseconds per call. Each line is the best of five rounds in microseconds, because other load on the machine only adds
+time.
 """
 
 import timeit

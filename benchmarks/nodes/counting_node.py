@@ -1,8 +1,8 @@
-"""The thesis's node: publishes ten times a second, counts what it sent and received (runs under Debian's Python).
+"""The thesis's node: publish ten times a second, and count sent and received messages (run by Debian's Python).
 
-`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]`: publishes from its start on, as the thesis's node did,
-even without a subscriber; ends a second after the last message. Prints `{"event": "counted", "sent": …, "received": …,
-"lost": …}`: lost are the messages missing between the first and the last that were received.
+`counting_node.py SECONDS [publish:=TOPIC] [subscribe:=TOPIC]` publishes from its start on, even without a subscriber,
+as the thesis's node did. It ends a second after the last message and prints `{"event": "counted", "sent": …,
+"received": …, "lost": …}`: lost messages are those missing between the first and the last received message.
 """
 
 import json
@@ -17,7 +17,7 @@ LINGER = 1.0
 
 
 def main():
-    """Publish, listen, count."""
+    """Publish, receive and count."""
     words = dict(word.split(":=", 1) for word in sys.argv[1:] if ":=" in word and word[0] != "_")
     seconds = float(sys.argv[1])
     rospy.init_node("counting_node", argv=[word for word in sys.argv if word.startswith("__")])

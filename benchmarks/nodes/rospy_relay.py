@@ -1,4 +1,4 @@
-"""A typed relay in rospy, as monitors in Python have it: `rospy_relay.py IN OUT` (runs under Debian's Python)."""
+"""A typed relay in rospy, like a monitor written in Python: `rospy_relay.py IN OUT` (run by Debian's Python)."""
 
 import sys
 from pathlib import Path
@@ -10,7 +10,7 @@ TYPE = "relay_load/Sample"
 
 
 def main():
-    """Take each message apart, do a monitor's work on it, and publish it."""
+    """Decode each message, do a monitor's work on it, and publish it."""
     given, taken = rospy.myargv(sys.argv)[1:]
     text = (Path(__file__).parent / "msg" / f"{TYPE}.msg").read_text()
     sample = genpy.dynamic.generate_dynamic(TYPE, text)[TYPE]

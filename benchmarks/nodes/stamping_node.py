@@ -1,4 +1,4 @@
-"""Publish messages with their time, or report when they arrived (runs under Debian's Python, with rospy).
+"""Publish messages with timestamps, or report their arrival (run by Debian's Python, with rospy).
 
 `stamping_node.py publish TOPIC BYTES HZ SECONDS` (HZ 0: as fast as the connection takes them) ends after SECONDS;
 `stamping_node.py subscribe TOPIC` prints for each line on its input a line `{"event": "counted", "received": N,
@@ -31,7 +31,7 @@ def publish(topic, size, hertz, seconds):
 
 
 def subscribe(topic):
-    """Count until the input ends."""
+    """Count messages until the input ends."""
     seen = []
     rospy.Subscriber(topic, String, lambda message: seen.append((time.monotonic_ns(), message.data[:20])))
     print(json.dumps({"event": "ready"}), flush=True)
@@ -48,7 +48,7 @@ def subscribe(topic):
 
 
 def main():
-    """Do as the arguments say."""
+    """Publish or subscribe, as the arguments say."""
     words = rospy.myargv()[1:]
     rospy.init_node(f"stamping_{words[0]}", anonymous=True)
     if words[0] == "publish":
