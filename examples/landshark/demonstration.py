@@ -1,9 +1,9 @@
 """`rosrv demo`: the appliance at work, in about a minute.
 
-A lab of four hosts on this machine: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
-attacker. The operator drives and fires. The attacker tries what ROS 1 allows everyone. For each attempt, the demo reads
-the deciding rule from the audit log. Finally the operator makes mistakes that no policy can forbid, and monitors
-prevent them. Scripts can rely on the exit status: 0 if the robot obeyed only its operator.
+A lab on this machine has four hosts: the appliance, a simulated LandShark of real ROS nodes, its operator, and an
+attacker. The operator drives and fires. The attacker tries everything that ROS 1 allows any host. For each attempt, the
+demo reads the deciding rule from the audit log. Finally the operator makes mistakes that no policy can forbid, and
+monitors prevent them. Scripts can rely on the exit status: 0 if the robot obeyed only its operator.
 """
 
 import shutil
@@ -39,7 +39,7 @@ from examples.landshark.stage import (
 )
 
 PERMITTED = "watch the battery"  # the policy allows this to the attacker's host
-BYPASS = "go past the master"  # does not use the appliance at all
+BYPASS = "go past the master"  # bypasses the appliance
 ATTACKS = (
     "look around",
     "take over the operator",
@@ -67,7 +67,7 @@ Record = dict[str, Any]
 
 
 class Show:
-    """The demonstration, act by act; `results` is the basis of the summary."""
+    """The demonstration, act by act; `results` are the results for the summary."""
 
     def __init__(self, stage: Stage, door: Doorway, console: Console) -> None:
         self.stage, self.door, self.console = stage, door, console
@@ -174,7 +174,7 @@ class Show:
         self.results.append(Result(f"attack: {attack.name}", not attack.succeeded, attack.answer))
 
     def record_of(self, attack: Attack) -> Record | None:
-        """Return the denial of an attack: a new record of its resource, or the record whose reason its answer repeats.
+        """Return the denial of an attack: a new record of its resource, or the record whose reason the answer repeats.
 
         The log counts a repeated denial instead of recording it again.
         """
@@ -231,7 +231,7 @@ class Show:
 
 
 def rule_of(record: Record) -> str:
-    """Return the deciding rule with its place in the policy file, else the reason."""
+    """Return the deciding rule with its position in the policy file; without a rule, the reason."""
     rule = record.get("rule")
     if not rule:
         return str(record.get("reason", ""))

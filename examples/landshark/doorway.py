@@ -1,4 +1,4 @@
-"""Forward a loopback port of this machine to a host of a lab, which has no network link to this machine.
+"""Forward a loopback port of this machine to a host of a lab that has no network link to this machine.
 
 It leads to the demonstration's console. Bytes are copied unchanged in both directions. Clients are not authenticated,
 because the port is on loopback and the console requires a token.
@@ -21,7 +21,7 @@ _PIECE = 65536
 
 
 class Doorway:
-    """A listening port on 127.0.0.1 of this machine; a context manager. `target` is an address on `host`."""
+    """A listening port on 127.0.0.1 of this machine, as a context manager. `target` is an address on `host`."""
 
     def __init__(self, host: Host, target: tuple[str, int]) -> None:
         self._host, self._target = host, target

@@ -45,7 +45,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class Part:
-    """The operator's commands for some seconds; the gun is aimed at their start, and fired in the middle."""
+    """The operator's commands for some seconds; the gun is aimed at the beginning and fired in the middle."""
 
     seconds: float
     forward: float = 0.0
@@ -146,7 +146,7 @@ class Simulation:
         return self.drive
 
     def _send(self, topic: str, **fields: object) -> bytes | None:
-        """Publish a message; return the bytes that subscribers get, or None if it was dropped."""
+        """Publish a message; return the bytes that subscribers get, or None if the message was dropped."""
         data = self._messages.encode(
             TYPES[topic],
             header__stamp__sec=self._now // 10**9,
@@ -189,7 +189,7 @@ class Simulation:
         self.drive.tilts.append(self._turret.tilt)
 
     def _tell(self, ticks: int) -> None:
-        """Publish odometry and joints at every step, the laser at 10 Hz, the GPS at 5 Hz, the battery at 1 Hz."""
+        """Publish odometry and joints in every step, the laser at 10 Hz, the GPS at 5 Hz, and the battery at 1 Hz."""
         pose, velocity = self._pose, self._velocity
         self._send(
             "/landshark/odom",

@@ -1,4 +1,4 @@
-"""A lab: hosts on one Ethernet, each a network namespace, for tests and the demonstration.
+"""A lab for tests and the demonstration: hosts on one Ethernet, each in a network namespace.
 
 ```
 with Lab("rosrv-test") as lab:
@@ -6,9 +6,9 @@ with Lab("rosrv-test") as lab:
     process = robot.popen(["rosmaster", "--core"])
 ```
 
-The bridge between the hosts is in a namespace of its own, so nothing appears in the machine's own namespace, and two
-labs may use the same addresses at the same time. Leaving the block ends every process in the lab's namespaces and
-deletes them. If the lab's process died before that, the next lab with the same prefix does it.
+The bridge between the hosts is in a separate namespace, so nothing appears in the machine's own namespace, and two labs
+may use the same addresses at once. Leaving the block ends every process in the lab's namespaces and deletes the
+namespaces. If the lab's process died before that, the next lab with the same prefix deletes them.
 """
 
 import contextlib
@@ -72,7 +72,7 @@ class Host:
 
 
 class Lab:
-    """Hosts on a common bridge; a context manager. The names of its namespaces begin with `prefix`."""
+    """Hosts on a common bridge, as a context manager. The names of the lab's namespaces begin with `prefix`."""
 
     _numbers = itertools.count(1)
 

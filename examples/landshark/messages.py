@@ -14,7 +14,7 @@ DEFINITIONS = {f"{TRIGGER}.msg": (MONITORS / "msg" / f"{TRIGGER}.msg").read_text
 
 
 class Messages:
-    """The encoder and decoder; `store` has the types."""
+    """Encodes and decodes messages; `store` has the types."""
 
     def __init__(self) -> None:
         self.store: Any = get_typestore(Stores.ROS1_NOETIC)

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from examples.landshark.results import Result
 from examples.landshark.stage import Event, Stage
 
-OBSTACLE = ("8", "0.5")  # the middle of it
+OBSTACLE = ("8", "0.5")  # the middle of the obstacle
 OUTSIDE = ("24", "0.5")  # metres; the zone ends at 20
 BACK = ("3", "0.5")
 ASIDE = ("6", "6")
@@ -23,7 +23,7 @@ Ways = dict[str, Sequence[Sequence[float]]]
 
 
 class Narrator(Protocol):
-    """The printer of the demonstration, which also keeps its results."""
+    """The demonstration's printer, which also stores the results."""
 
     results: list[Result]
 
@@ -87,7 +87,7 @@ class Mistakes:
         self._narrator.say(f"rosrv monitor enable {name}  ({self._stage.monitors / file})")
 
     def _fires(self, what: str, *, hit: bool) -> None:
-        """Pull the trigger; `hit`: whether a shot is expected."""
+        """Pull the trigger; `hit` says whether a shot is expected."""
         fired = self._stage.command("fire")
         shots = fired["shots"] - fired["before"]
         self._result(what, shots == (1 if hit else 0), "1 shot" if shots == 1 else f"{shots} shots")
@@ -96,7 +96,7 @@ class Mistakes:
         """Find and print the audit record of a monitor's action."""
         found = self._stage.audit("--event", event, "--limit", "100")
         mine = [one for one in found if one["detail"]["monitor"] == monitor]
-        why = mine[-1]["reason"] if mine else "missing"  # the first, which is not folded
+        why = mine[-1]["reason"] if mine else "missing"  # the first record, which is not folded
         self._narrator.say(f"audit record: {why}")
         self._narrator.results.append(Result(f"audit record: {what}", bool(mine), why))
 

@@ -1,7 +1,7 @@
 """Draw two drives from above as an SVG: the yard, the obstacle, the robot's path, and the shots with their results.
 
-Below them is the angle of the gun over time, with the same shots. The text has its own background, so that the picture
-can also be read on a dark page.
+Below them, the picture has the angle of the gun over time, with the same shots. The text has its own background, so
+that the picture can also be read on a dark page.
 """
 
 import html
@@ -16,7 +16,7 @@ ZONE = 20.0  # metres, as in safe_zone.rv
 LOWEST = -0.45  # radians, as in safe_triggering.rv
 SCALE = 16.0  # pixels a metre
 CENTRE = (355.0, 465.0)
-BOTTOM = 640.0  # where the yard is cut off
+BOTTOM = 640.0  # where the drawn part of the yard ends
 STRIP = (70.0, 705.0, 890.0, 110.0)  # left, top, width, height of the gun's angle
 WITHOUT, GUARDED = "#c2410c", "#1d4ed8"
 STYLE = """

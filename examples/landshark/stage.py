@@ -1,4 +1,4 @@
-"""Run the actors of the demonstration: a simulated LandShark, its operator, an attacker; each on a host of a lab.
+"""Run the actors of the demonstration: a simulated LandShark, its operator and an attacker, each on a host of a lab.
 
     with Lab("rosrv-demo") as lab, Stage(lab, SHIPPED) as stage:
         stage.start_appliance()
@@ -29,14 +29,14 @@ from appliance.base.shipped import IS_CHECKOUT
 from examples.landshark.doorway import Doorway
 from examples.landshark.lab import Host, Lab
 
-NODE_PYTHON = "/usr/bin/python3"  # Debian's, which rospy is installed for
+NODE_PYTHON = "/usr/bin/python3"  # Debian's Python, for which rospy is installed
 APPLIANCE, ROBOT, OPERATOR, ATTACKER = "10.77.0.2", "10.77.0.10", "10.77.0.20", "10.77.0.66"
 MASTER_URI = f"http://{APPLIANCE}:11311"
 CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
 START_SECONDS = 60.0  # the limit for the start of an appliance or a node
 ATTACK_SECONDS = 60.0
 _NO_COMPILER = 3  # exit status of scripts/build-roscpp
-COMMAND_SECONDS = 120.0  # a drive through the yard and what starts before it
+COMMAND_SECONDS = 120.0  # long enough for a drive through the yard, and the starts before it
 
 Event = dict[str, Any]
 
@@ -47,7 +47,7 @@ class DemoError(RuntimeError):
 
 @dataclass(frozen=True)
 class Attack:
-    """An attempt of the attacker, the answer, and whether it succeeded."""
+    """An attempt of the attacker, with the answer and the result."""
 
     name: str
     tried: str
@@ -72,7 +72,7 @@ class Actor:
             stderr=self._log,
             text=True,
             errors="backslashreplace",
-            start_new_session=True,  # Ctrl-C is for the demonstration, which ends its actors itself
+            start_new_session=True,  # Ctrl-C is only for the demonstration, which ends its actors itself
         )
         self._reader = threading.Thread(target=self._read, name=f"{name} output", daemon=True)
         self._reader.start()
@@ -83,7 +83,7 @@ class Actor:
         return self.process.poll() is None
 
     def expect(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """Return the next event of this name and skip all others before it."""
+        """Return the next event with this name; skip all events before it."""
         deadline = time.monotonic() + seconds
         while True:
             try:
@@ -96,7 +96,7 @@ class Actor:
                 return said
 
     def newest(self, event: str, seconds: float = START_SECONDS) -> Event:
-        """Return the next event of this name from now on."""
+        """Return the next event with this name that is reported after this call."""
         with contextlib.suppress(queue.Empty):
             while True:
                 if self.events.get_nowait() is None:
@@ -141,7 +141,7 @@ class Actor:
 
 
 class Stage:
-    """The hosts and all their programs; a context manager that ends them."""
+    """The hosts and all their programs, as a context manager that ends them."""
 
     def __init__(self, lab: Lab, shipped: Path) -> None:
         self.shipped = shipped
@@ -197,8 +197,8 @@ class Stage:
         ]
 
     def make_radar(self) -> bool:
-        """Compile the roscpp node; return False without a compiler."""
-        # In a checkout it is compiled once; an installed package is not written to.
+        """Compile the roscpp node; return False if there is no compiler."""
+        # A checkout compiles it once; an installed package is never written to.
         program = (self.shipped / "build" if IS_CHECKOUT else self.directory) / "landshark_radar"
         build = self.shipped / "scripts" / "build-roscpp"
         command = ["bash", str(build), str(self.nodes / "radar.cpp"), str(program)]

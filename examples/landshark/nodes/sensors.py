@@ -23,7 +23,7 @@ class Gps:
     topic, kind = "/landshark/gps", NavSatFix
 
     def measure(self, odometry):
-        """Return one fix."""
+        """Return one position."""
         message = NavSatFix()
         message.header.stamp, message.header.frame_id = odometry.header.stamp, "gps"
         message.status.status, message.status.service = NavSatStatus.STATUS_FIX, NavSatStatus.SERVICE_GPS
@@ -49,7 +49,7 @@ class Laser:
 
 
 class Battery:
-    """The charge that is left."""
+    """The remaining charge."""
 
     topic, kind = "/landshark/battery", BatteryState
 
