@@ -1,5 +1,6 @@
 """The kernel in docs/dev/architecture.md: the modules that ensure "no message and no call passes undecided"."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -10,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.py)` (\d+)", SECTION)}
-BUDGET = 15_290  # the goal is 10,000: lower this number with the kernel, and never raise it
+BUDGET = 11_040  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
@@ -84,7 +85,20 @@ OUTSIDE = frozenset(
 
 
 def _lines(path: str) -> int:
-    return len((ROOT / "appliance" / path).read_text().splitlines())
+    """Return the lines of code of a module: neither blank, nor a comment, nor in a docstring."""
+    text = (ROOT / "appliance" / path).read_text()
+    docs: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if (
+            isinstance(node, ast.Expr)
+            and isinstance(node.value, ast.Constant)
+            and isinstance(node.value.value, str)
+        ):
+            docs.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in docs
+        for number, line in enumerate(text.splitlines(), 1)
+    )
 
 
 def _number(text: str) -> int:
