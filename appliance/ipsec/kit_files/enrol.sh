@@ -32,7 +32,7 @@ kit="$folder/rosrv-@name@"
 if [ -s "$kit/swanctl/x509/rosrv.pem" ] && [ "$(fingerprint "$kit/swanctl/x509ca/rosrv-ca.pem")" = "$authority" ] \
     && [ "$(openssl x509 -in "$kit/swanctl/x509/rosrv.pem" -noout -pubkey)" = "$(public "$folder/rosrv.key")" ] \
     && [ -z "${1-}" ]; then
-    echo "join.sh: @name@ is enrolled already; with a new token it enrols again"
+    echo "join.sh: @name@ is already enrolled; with a new token it enrols again"
 else
     token=${1-${ROSRV_ENROL_TOKEN-}}
     if [ -z "$token" ]; then

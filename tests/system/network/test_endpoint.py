@@ -32,7 +32,9 @@ def test_without_a_default_route_the_only_address_is_taken(lab: Lab) -> None:
         == only_address(host, without=LO)
         == PublicAddress("10.78.0.4", ONLY)
     )
-    with pytest.raises(NetworkError, match=r"several addresses here \(10\.78\.0\.4, 10\.113\.11\.1\)"):
+    with pytest.raises(
+        NetworkError, match=r"this machine has several addresses \(10\.78\.0\.4, 10\.113\.11\.1\)"
+    ):
         only_address(host, without=())
 
 

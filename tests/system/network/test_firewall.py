@@ -358,7 +358,7 @@ def test_auto_selects_a_back_end_that_the_kernel_enforces(
         assert firewall.install(settings(port)) == "iptables"
         assert "nft: a test port on 127.0.0.1 was reached" in firewall.report().not_used[0]
         assert connect(protected, OTHER, ("127.0.0.1", port)) == ["refused"]
-    with pytest.raises(FirewallError, match=r"no firewall works .* nft: a port of our own"):
+    with pytest.raises(FirewallError, match=r"no firewall works .* nft: a test port"):
         Firewall(protected.namespace, "nft").install(settings(11312))
 
 

@@ -245,7 +245,7 @@ def test_a_machine_cannot_check_itself(robot: Host) -> None:
         (("--appliance", "10.0.0.1", "--open", "tcp/99999"), "--open 'tcp/99999' is not a service"),
         (("--appliance", "10.0.0.1", "--ports", "9-3"), "9-3 is not a range of ports"),
         (("--apply", "--remove"), "exclude one another"),
-        (("--check", "no-such-host.invalid"), "the host 'no-such-host.invalid' is not known"),
+        (("--check", "no-such-host.invalid"), "the host 'no-such-host.invalid' is unknown"),
     ],
 )
 def test_wrong_arguments_are_named(robot: Host, arguments: tuple[str, ...], words: str) -> None:
