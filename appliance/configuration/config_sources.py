@@ -43,7 +43,7 @@ _PATH_KEYS = (
 KeyPath = tuple[str | int, ...]
 _SHORT_NAMES: dict[str, KeyPath] = {
     "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
-    "ROSRV_RELAY": ("relaying",),  # like --relay; a table is the value of the section `relay`
+    "ROSRV_RELAY": ("relaying",),  # like --relay; a table sets the section `relay`
 }
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Section = typing.TypeVar("_Section", bound="DataclassInstance")

@@ -162,7 +162,7 @@ class Policies(Revisions[RevisionRow]):
         """Bring a given text into force, as `reload` does with the file.
 
         Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
-        file has a different text. Raises `PolicyRefusedError` and `RevisionChangedError`.
+        lines of the file may differ. Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):

@@ -43,11 +43,11 @@ from roswire.uris import node_uri
 _log = structlog.get_logger()
 _ADMIN = "admin"
 _SWITCH_SECONDS = 0.0002
-_GARBAGE = 10_000  # new objects between two garbage collections; many are waiting records, not garbage
+_GARBAGE = 10_000  # new objects between two garbage collections; many are records that wait to be written
 _SAVE_SECONDS = 1.0
 _TASKS_SECONDS = 0.4
-_CLOSE_SECONDS = 1.2  # the limit for the state, and for the log; the supervisor kills control after 3 s
-_WARNINGS = 100  # the most warnings of the policy in `Ready`
+_CLOSE_SECONDS = 1.2  # to close the store, and again to close the log; the supervisor kills control after 3 s
+_WARNINGS = 100  # at most so many warnings of the policy in `Ready`
 
 
 def main(lifeline_fd: int, config_path: Path) -> None:

@@ -46,7 +46,7 @@ class Right(NamedTuple):
 
 
 def request_of(call: str, host: Address, caller_id: str, resource: str) -> Request:
-    """Return the request that decides a call: about its topic or service, or otherwise about the command."""
+    """Return the policy request for a call: about its topic or service, or otherwise about the command."""
     category = policy_call(call).category
     return Request(host, caller_id, category, call if category is Category.COMMAND else resource)
 

@@ -61,7 +61,7 @@ class Bounds:
             )
 
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
-        """Return bounds with the operator's `whole` and `host`. If `host` is None, it is scaled with `whole`.
+        """Return bounds with the operator's `whole` and `host`. If `host` is None, its limit is scaled with `whole`.
 
         `unknown` and `kept` are scaled with `whole` and rounded down. A nonzero `unknown` stays at least one, so that a
         small pool can still answer an unknown host with the reason of a refusal.

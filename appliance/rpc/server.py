@@ -4,8 +4,8 @@
 
 1. The body is limited (`HttpLimits.body_bytes`). Each connection has at most one request in progress and one response
    in the write buffer. Further requests wait, and reading pauses.
-2. A host that no policy rule names is refused before its body is complete. Only the beginning of the body is read, for
-   the audit record of the refusal.
+2. A request from a host that no policy rule names is refused before its body is complete. Only the beginning of the
+   body is read, for the audit record of the refusal.
 3. Accepting, reading, and each step of a handler wait for the host's turn and are charged to it (`processor_time`).
 4. Connections, the bytes that they hold (`connection_table`) and requests being served (`fair_queue`) have quotas: for
    each host, for unknown hosts, and for hosts with a registration.

@@ -62,7 +62,7 @@ class AllocationPlan:
 
 
 class Allocation:
-    """The allocation in force over `relays` relays; `save(text)` stores it."""
+    """The allocation in force across this number of relays; `save(text)` stores it."""
 
     def __init__(self, relays: int, save: Callable[[str], None] = lambda _text: None) -> None:
         self.relays = relays
@@ -124,7 +124,7 @@ class Allocation:
     def _one_way(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: Collection[Resource]
     ) -> list[int]:
-        """Return each group's relay, with all moving groups on one relay, so that nothing leaves that relay."""
+        """Return each group's relay: all groups that move are on one relay, so that no group has to leave it."""
         moving = [
             self._cost(group, home, carried) != (0, 0) for group, home in zip(groups, homes, strict=True)
         ]

@@ -95,7 +95,7 @@ class CheckedSpecifications(messages.Contents, frozen=True):
     signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
-        """Parse a message of a topic from its first bytes; return None if the topic's type is not known."""
+        """Parse the first bytes of a message on a topic; return None if the topic's type is not known."""
         name = self.types.get(topic)
         definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
         return read_fields(definitions, name, data) if name is not None and definitions is not None else None

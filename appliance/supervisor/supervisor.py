@@ -183,7 +183,7 @@ class Supervisor:
         self._spawn(self.until_ready())
 
     async def until_answering(self, slot: ProcessSlot) -> None:
-        """Wait until the process of this slot answers over HTTP, also after restarts."""
+        """Wait until the process of this slot answers over HTTP, even if it is restarted meanwhile."""
         began = time.monotonic()
         while self._gets_on(began, [slot]) and not self.stopping.is_set():
             process = slot.process
@@ -195,7 +195,7 @@ class Supervisor:
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; check the log")
 
     async def until_ready(self) -> None:
-        """Wait until all processes are ready; log the pending ones, and give up without progress."""
+        """Wait until all processes are ready; log the pending ones, and give up when they make no progress."""
         began = time.monotonic()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
@@ -213,7 +213,7 @@ class Supervisor:
                 log.info("still starting", waits_for=words, seconds=waited)
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
-        """Whether a start may continue: it may for some minutes, and longer while processes progress."""
+        """Whether a start may continue: for some minutes always, then up to a limit while processes make progress."""
         waited = time.monotonic() - began
         if waited < _START_SECONDS:
             return True
@@ -302,7 +302,7 @@ class Supervisor:
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:
-        """End the appliance during its start, with the reason for the operator; later, only kill the process.
+        """End the appliance with this reason if it is still starting; otherwise only kill the process.
 
         The process starts again, and its next start may succeed. A dispensable process never ends the appliance.
         """
@@ -429,7 +429,7 @@ class Supervisor:
         process.send(answer)
 
     def _demand(self, role: str) -> None:
-        """Start a role on demand; if it is just ending, start it again afterwards."""
+        """Start a role on demand; if its process is shutting down, start it again once that has ended."""
         for slot in self.slots:
             if slot.role.name == role:
                 slot.wanted = slot.process is not None

@@ -13,8 +13,8 @@ position that an earlier statement named. Reading beyond the end is a fault.
 
 The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), write fields
 (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the property (`Reset`). Each back end has a
-row for each kind of expression and statement: an implementation, or `Left`. `Charge` and `Allocate` take from the
-budgets of instructions and bytes, and functions with long values do the same. Exceeding a budget is a fault.
+table with a row for each kind of expression and statement: an implementation, or `Left`. `Charge` and `Allocate` take
+from the budgets of instructions and bytes, and functions with long values do the same. Exceeding a budget is a fault.
 """
 
 from collections.abc import Iterator, Mapping
@@ -105,7 +105,7 @@ class Moment(FormNode, frozen=True):
 
 
 class MomentOf(FormNode, frozen=True):
-    """A time or duration from seconds and nanoseconds (`long`); a fault if the type cannot hold the result."""
+    """A time or duration from seconds and nanoseconds (both `long`); a fault if the type cannot hold the result."""
 
     type: Type
     seconds: "Expression"

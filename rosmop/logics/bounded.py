@@ -240,7 +240,7 @@ class _Rows(_Operator):
 
 
 class _OpenUntil(_Rows):
-    """The operator `until` over values that may be open. All time up to `passed` is over.
+    """The operator `until` over values that may be open. Bounds up to the time `passed` have expired.
 
     `pending` are the undecided rows. They are decided from sorted lists of marks: the events where the right operand
     holds (`holds`) or may hold (`hopes`), and where the left operand fails (`fails`) or may fail (`doubts`). A new
@@ -386,7 +386,7 @@ def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
 
 
 def _behind(mark: _Mark | None, low: int = 0) -> _Mark:
-    """Return the start of the rows for which a mark is too early."""
+    """Return the first position for which a mark is too early."""
     return (-FOREVER, 0) if mark is None else (mark[0] - low, mark[1] + 1)
 
 
@@ -513,7 +513,7 @@ class BoundedProperty(CompiledProperty):
         return BoundedRun(self, time_ns)
 
     def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
-        """Return new operators for a run, for the values that may come later; the outermost first."""
+        """Return new operators of a run for values that may be decided later, the outermost first."""
         found: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
             instruction = self.program.instructions[number]
@@ -525,7 +525,7 @@ class BoundedProperty(CompiledProperty):
         return found
 
     def _decided_late(self) -> set[str]:
-        """Return the verdicts that a passed bound may cause because an `until` or `next` fails.
+        """Return the verdicts that are possible when a bound expires, so that an `until` or `next` fails.
 
         The failure causes `violation` if the operator is positive in the formula, and `validation` if it is negated.
         """

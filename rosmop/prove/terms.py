@@ -35,7 +35,7 @@ MIXED = _Mixed()
 
 
 class DiffersError(Exception):
-    """The module does something that the form does not."""
+    """The WebAssembly module behaves differently from the form."""
 
 
 def integer(value: int, bits: int) -> Term:
@@ -106,7 +106,7 @@ def as_bits(truth: Term, bits: int = 32) -> Term:
 
 
 def number_at(message: Term, position: Term, size: int) -> Term:
-    """Return the little-endian number in `size` bytes from a position on."""
+    """Return the little-endian number in the `size` bytes that start at a position."""
     every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
     return every[0] if size == 1 else z3.Concat(*reversed(every))
 

@@ -8,8 +8,8 @@ are integers; every other value has the closest Python type. This is one file be
 
 Invariants:
 
-1. A name is a variable of the set (`g…`) or of one call. Only variables of the set, and the values they refer to,
-   outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of an element that is skipped,
+1. A name is a variable of the monitor set (`g…`) or of one call. Only variables of the set, and the values they refer
+   to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of an element that is skipped,
    and `n` the depth of a recursion.
 2. `_site` is the site of the running statement. A fault stops the function and all its callers.
 """
@@ -109,7 +109,7 @@ class Interpreter:
         self._site = -1
 
     def had_happened(self, error: Exception) -> bool:
-        """Return whether the event had happened before the error stopped it."""
+        """Return whether the event had happened before the error stopped the function."""
         return error is self.failed.error and self.failed.happened
 
     def let_go(self) -> None:
@@ -121,7 +121,7 @@ class Interpreter:
         return variables[name] if name in variables else self.variables[name]
 
     def function(self, name: str) -> Callable[..., Any]:
-        """Return a function that takes a message, or None without one; for its result see `nodes.Function`.
+        """Return a function that takes a message, or None if the event has none; for its result see `nodes.Function`.
 
         The function raises the error that stops it; `failed` has the details.
         """

@@ -37,7 +37,7 @@ class _GroupHead(msgspec.Struct, array_like=True):
 
 
 class _Head(msgspec.Struct, array_like=True):
-    """The writer of a memory: the machine's boot, its clock, and the time (ns)."""
+    """Who wrote a memory, when, and its groups: boot id, offset of the clock and time (ns), heads of the groups."""
 
     boot: str
     offset: int
@@ -182,7 +182,7 @@ class StateKeeper:
         return fits
 
     def _base(self, group: "MonitorGroup") -> bytes:
-        assert self._monitors is not None  # noqa: S101  the group is of its
+        assert self._monitors is not None  # noqa: S101  the group is one of its groups
         return self._monitors.state_of(group)
 
     def _lay_out(self) -> None:
