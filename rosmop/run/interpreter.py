@@ -9,8 +9,8 @@ are integers; every other value has the closest Python type. This is one file be
 Invariants:
 
 1. A name is a variable of the monitor set (`g…`) or of one call. Only variables of the set, and the values they refer
-   to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of an element that is skipped,
-   and `n` the depth of a recursion.
+   to, outlive a call. In a call, `m` is the message, `b` its original bytes, `p` the start of a skipped element, and
+   `n` the depth of a recursion.
 2. `_site` is the site of the running statement. A fault stops the function and all its callers.
 """
 
