@@ -4,8 +4,8 @@ Invariants:
 
 1. At most `_MOST_OPEN` requests are open; a further request is rejected here and costs control nothing.
 2. A request ends with its answer, with the end of the link, or after a time limit.
-3. A notice (`tell`) never waits. While control is away, the last `_MOST_KEPT` notices are kept for the next control;
-   lost notices are counted and logged.
+3. A notice (`tell`) never waits. While the control process is away, the last `_MOST_KEPT` notices are kept for the next
+   control process; lost notices are counted and logged.
 """
 
 import asyncio

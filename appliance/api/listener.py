@@ -1,4 +1,4 @@
-"""Accept connections of REST behind the same front as RVMaster's; uvicorn serves them.
+"""Accept connections of REST with `rpc/front`, which RVMaster also uses; uvicorn serves them.
 
 uvicorn's configuration, a public interface, makes each connection's protocol for HTTP and ASGI. This protocol gets the
 bytes that the front accepts. Invariants besides those of `rpc/front`:
