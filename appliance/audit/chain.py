@@ -3,7 +3,7 @@
 Invariants:
 1. The hash of a record covers the hash of its columns (`content_hash`) and the hash of the previous record. An export
    can therefore prove the chain without the records that it omits. Version 0.1.0 hashed the columns directly.
-2. The encoding is injective: a MessagePack array, in which every value has its type and length.
+2. The encoding is injective: a MessagePack array, in which every value is stored with its type and length.
 """
 
 import hashlib

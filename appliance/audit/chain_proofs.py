@@ -1,8 +1,8 @@
 """Export records with their proofs: their position in the chain, up to a signed checkpoint.
 
-Each exported record has the previous hash and its own hash. `then` has the content hashes of the following records that
-the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record (`checkpoint`).
-`appliance/evidence` verifies this with the public key alone.
+Each exported record contains the previous hash and its own hash. `then` lists the content hashes of the following
+records that the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record
+(`checkpoint`). `appliance/evidence` verifies this with the public key alone.
 """
 
 import sqlite3

@@ -3,7 +3,7 @@
 Root on the appliance has the signer's key and memory, and can rewrite the whole history with valid signatures. Copies
 on another machine are out of root's reach. Therefore:
 
-1. A copy has the complete signed text and the signature, so it can be verified anywhere.
+1. A copy contains the complete signed text and the signature, so it can be verified anywhere.
 2. A log agrees with a copy if its chain has the copy's hash at the copy's sequence.
 3. A copy with an invalid signature is a finding. Copies from other logs are listed. If all copies are from other logs,
    this log replaced another one, which is a finding.

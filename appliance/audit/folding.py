@@ -4,10 +4,11 @@ Denials, errors of peers, allowed reads, and records of a host above its budget 
 
 1. The first record of a kind is written in full; every repetition counts in exactly one summary. A record with a
    `count` counts that many times.
-2. Memory is limited: the kinds of denials are a pool (`AUDIT_KINDS`). All unknown hosts together have a small quota of
-   it, so they cannot displace hosts that the policy names. Above a host's quota, all its further denials are one kind.
-   Above the quota of unknown hosts, they all share one kind. The kinds of reads are another pool (`AUDIT_READ_KINDS`).
-   When that pool is full, decisions are written in full, because policies are learned from them.
+2. Memory is limited: the kinds of denials are counted in a pool (`AUDIT_KINDS`). All unknown hosts together have a
+   small quota of this pool, so they cannot displace hosts that the policy names. Above a host's quota, all its further
+   denials count as one kind. Above the quota of unknown hosts, they all share one kind. The kinds of reads are counted
+   in another pool (`AUDIT_READ_KINDS`). When this pool is full, decisions are written in full, because policies are
+   learned from them.
 3. A kind without repetition for `seconds` is forgotten; its next record is written in full.
 4. An allow ends the denial kinds of the same host, caller and request, and a denial ends the allow kinds. Their
    summaries are written first, then the new record in full.

@@ -1,7 +1,7 @@
 """Run the background work of a log: checkpoints and their signatures, the full-text index, retention.
 
-1. A failed step is repeated later (`degraded` has the reason), while records are still written. Only a failure to write
-   records counts as a failure of the log.
+1. A failed step is repeated later (`degraded` gives the reason), while records are still written. Only a failure to
+   write records counts as a failure of the log.
 2. Each step is short: one step of retention, one slice of the index, a limited number of signatures.
 3. Records about a step are passed to `hold`, or appended together with it.
 """

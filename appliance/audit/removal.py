@@ -1,7 +1,7 @@
 """Remove old records step by step. If the log has a signer, the signer must sign each step first.
 
 Every removal is recorded in the same transaction. Records of a signed log are removed only with the signer's signature
-over exactly these records. A refused removal is tried again later (`unremoved` has the reason).
+over exactly these records. A refused removal is tried again later (`unremoved` gives the reason).
 """
 
 import time
