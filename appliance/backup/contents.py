@@ -22,7 +22,7 @@ KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
 
 
 class BackupError(Exception):
-    """A backup cannot be made or restored; the message has the reason and the remedy."""
+    """A backup cannot be made or restored; the message gives the reason and the remedy."""
 
 
 def is_passing(name: str) -> bool:
