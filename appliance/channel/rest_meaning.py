@@ -27,7 +27,7 @@ _SECOND = 1_000_000_000
 
 
 class NoOrderError(ValueError):
-    """The HTTP request does not define an order; the message has the reason."""
+    """The HTTP request does not define an order; the message gives the reason."""
 
 
 class BadTagError(NoOrderError):

@@ -1,4 +1,4 @@
-"""The hosts that come through tunnels, machines in clear text, and what a change of them did."""
+"""Answers about hosts with tunnels, machines that connect unencrypted, and the results of changes."""
 
 from typing import Annotated, Literal
 
@@ -20,7 +20,7 @@ class PortsSeen(msgspec.Struct, frozen=True):
 
 
 class Host(msgspec.Struct, frozen=True):
-    """A host that comes through a tunnel; times are seconds since the epoch.
+    """A host that connects through a tunnel; times are seconds since the epoch.
 
     `awaited`: it has a token and has not enrolled yet. `not wanted`: hosts.yaml says that its tunnel stays closed.
     """
@@ -48,7 +48,7 @@ class Host(msgspec.Struct, frozen=True):
 
 
 class Machine(msgspec.Struct, frozen=True):
-    """A machine in clear text on which nodes run, by its address."""
+    """A machine that runs nodes and connects without a tunnel, identified by its address."""
 
     address: str
     nodes: int
@@ -73,10 +73,11 @@ class Hosts(msgspec.Struct, frozen=True):
 
 
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
-    """The contents of an enrolled host's kit, without its private key; `kept` was kept with its one-time token.
+    """The contents of an enrolled host's kit, without its private key.
 
-    `rest_url` is REST's through the tunnel, and `pin` that of the key of its server; empty where the host cannot renew
-    its certificate there: `rest_trouble` says why.
+    `rest_url` is the URL of REST in the tunnel, and `pin` the pin of its server's key. If either is empty, the host
+    cannot renew its certificate through REST. `rest_trouble` says why other machines cannot reach REST, else it is
+    empty. `kept` contains the data that were stored with the one-time token.
     """
 
     revision: int
@@ -96,7 +97,7 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
-    """A one-time token: shown this once."""
+    """A one-time token: shown only once."""
 
     revision: Annotated[int, doc("revision of the table of hosts, the number in the ETag")]
     name: str
@@ -128,7 +129,7 @@ class NewCertificate(msgspec.Struct, frozen=True):
 
 
 class Revoked(msgspec.Struct, frozen=True):
-    """A host was excluded permanently; `serial` is empty if it was only awaited."""
+    """A host was excluded permanently; `serial` is empty if the host had a token but never enrolled."""
 
     revision: int
     name: str
@@ -138,7 +139,7 @@ class Revoked(msgspec.Struct, frozen=True):
 
 
 class PortsReport(msgspec.Struct, frozen=True):
-    """The known port check of `name`, a host's name or an address."""
+    """The stored result of the port check of `name`, a host's name or an address."""
 
     revision: int
     name: str

@@ -1,4 +1,4 @@
-"""The measured values, in numbers; `appliance.telemetry.metrics` has their names."""
+"""The measured values, in numbers; `appliance.telemetry.metrics` defines their names."""
 
 import msgspec
 

@@ -1,4 +1,4 @@
-"""Recordings of the flight recorder: what was said before and after something happened, and where it is kept."""
+"""Answers about recordings of the flight recorder: the messages sent before and after an event."""
 
 from typing import Annotated, Any, Literal
 
@@ -37,7 +37,7 @@ class RecordedTopic(msgspec.Struct, frozen=True):
 
 
 class LeftOutTopic(msgspec.Struct, frozen=True):
-    """A topic of one publisher that carried messages in that time and is not in the recording (`recorder.never`)."""
+    """A topic that had messages during the recording and was left out (`recorder.never`); one for each publisher."""
 
     topic: str
     type: Annotated[str, doc("type that the publisher declared")]
@@ -46,7 +46,7 @@ class LeftOutTopic(msgspec.Struct, frozen=True):
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """One recording; it is also `recording.json` beside its bag."""
+    """One recording; also stored as `recording.json` beside its bag."""
 
     id: str
     began: NanoMoment
@@ -77,7 +77,7 @@ class RecordingBegun(msgspec.Struct, frozen=True):
 
 
 class Recordings(msgspec.Struct, frozen=True):
-    """All recordings that are kept, the oldest first, and what is recorded."""
+    """All stored recordings, the oldest first, and the topics that are recorded."""
 
     recordings: list[Recording]
     topics: Annotated[list[str], doc("names of topics that are recorded; `*` matches anything")] = []
@@ -102,16 +102,14 @@ class RecordedFlow(msgspec.Struct, frozen=True):
 
 
 class EventMarks(msgspec.Struct, frozen=True):
-    """The events of a kind: their number in each column of the time line, including those that are not listed."""
+    """The number of events of one kind in each column of the time line, including events that are not listed."""
 
     kind: EventKind
     counts: Annotated[list[int], doc("events in each column, in their order")]
 
 
 class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """An event from an audit record of that time; `notice` is an event that is not a trigger, such as a change by
-    people.
-    """
+    """An event from an audit record of the recorded time; `notice` is a notable event of no other kind."""
 
     time: NanoMoment
     kind: EventKind
@@ -142,7 +140,7 @@ class Timeline(msgspec.Struct, frozen=True):
 
 
 class RecordedMessage(msgspec.Struct, frozen=True):
-    """A message of a recording as its publisher sent it, before the monitors."""
+    """A recorded message as its publisher sent it, before monitors processed it."""
 
     time: Annotated[NanoMoment, doc("when the relay received it: nanoseconds since the epoch")]
     place: Annotated[str, doc("position in the recording, which `at` takes")]

@@ -331,7 +331,7 @@ class SpecificationsTaken(Message):
     """The relay has brought the specifications into force.
 
     `began` lists the monitors that started in their initial state. `held` lists the monitors that hold their topics.
-    `because` has the reason for each monitor that holds its topics because its state was lost.
+    `because` gives the reason for each monitor that holds its topics because its state was lost.
     """
 
     revision: int
