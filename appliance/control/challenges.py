@@ -18,7 +18,7 @@ _MOST_TAKEN = 4096
 
 
 class ChallengeRefusedError(Exception):
-    """The challenge of a proof is not accepted; the message has the reason."""
+    """The challenge of a proof is not accepted; the message gives the reason."""
 
 
 class Challenges:

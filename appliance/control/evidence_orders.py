@@ -11,7 +11,7 @@ SEAL_SECONDS = 10.0
 
 
 class NotSealedError(Exception):
-    """The log's newest records cannot be sealed now; the message has the reason."""
+    """The log's newest records cannot be sealed now; the message gives the reason."""
 
 
 class EvidenceOrders:

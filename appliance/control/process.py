@@ -47,7 +47,7 @@ _GARBAGE = 10_000  # new objects between two garbage collections; many are recor
 _SAVE_SECONDS = 1.0
 _TASKS_SECONDS = 0.4
 _CLOSE_SECONDS = 1.2  # to close the store, and again to close the log; the supervisor kills control after 3 s
-_WARNINGS = 100  # at most so many warnings of the policy in `Ready`
+_WARNINGS = 100  # the most warnings of the policy in `Ready`
 
 
 def main(lifeline_fd: int, config_path: Path) -> None:

@@ -5,7 +5,7 @@ These invariants ensure that a flooded or compromised api cannot block RVMaster:
 1. At most `_MOST_WAITING` requests wait; further requests are answered `busy` at once. Between two requests, the event
    loop serves nodes.
 2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
-3. The link ends if the api sends an invalid message or does not read its answers.
+3. The link to the api ends if the api sends an invalid message or does not read its answers.
 4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
 5. A request is withdrawn if its client is gone before the request takes effect (`appliance/base/withdrawal.py`).
 6. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a proof

@@ -1,13 +1,14 @@
-"""Authenticate REST requests in control by the client's credentials, never by a claim of the api.
+"""Authenticate REST requests in the control process by the client's credentials, never by a claim of the api process.
 
-Browsers and scripts connect to the api, so the api may be compromised. Invariants:
+Browsers and scripts connect to the api process, so it may be compromised. Invariants:
 
 1. Every request must contain its token, or the token's reading key. A compromised api can use only the tokens that it
    has received since it was compromised.
 2. A change comes with the client's HTTP request. Control derives an order from this HTTP request
    (`channel/rest_meaning.py`). The change must equal the derived order.
 3. A change by a reading key needs a proof: a signature of the HTTP request by the token's signing key, with a challenge
-   of this process that is valid once. A compromised api can drop such an order, but cannot change, repeat or forge it.
+   of the control process that is valid once. A compromised api can drop such an order, but cannot change, repeat or
+   forge it.
 4. A bare token authorises requests of anyone who has seen it. With the setting `api_require_proof`, a bare token does
    not authorise changes.
 5. A request that is denied here has no effect. The caller records the denial.
@@ -42,7 +43,7 @@ _ITSELF = "the host itself"
 
 
 class UnprovenError(Exception):
-    """The request is denied; the message has the reason. `who` is the name of the presented token, if there is one."""
+    """The request is denied; the message gives the reason. `who` is the name of the presented token, if any."""
 
     def __init__(self, text: str, who: str = "", severity: Severity = Severity.WARNING) -> None:
         super().__init__(text)

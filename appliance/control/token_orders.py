@@ -23,7 +23,7 @@ _MOST = 1000
 
 
 class TokenRefusedError(Exception):
-    """The token cannot be made or revoked; the message has the reason."""
+    """The token cannot be made or revoked; the message gives the reason."""
 
 
 class TokenOrders:
