@@ -3,9 +3,9 @@
 Invariants:
 1. The members in the manifest are generated twice: once for their hashes, and once to be written. If the two differ,
    the export ends with an error.
-2. The manifest has the hash of every member except itself and `proof.json`. The audit record of the export has the hash
-   of the manifest. A signed checkpoint seals that record before the first byte is sent. The bundle contains that record
-   as `proof.json`.
+2. The manifest contains the hash of every member except itself and `proof.json`. The audit record of the export
+   contains the hash of the manifest. A signed checkpoint seals that record before the first byte is sent. The bundle
+   contains that record as `proof.json`.
 3. Records are exported as they are stored, so `verify.py` computes their hashes without the appliance's code.
 4. A run of records is complete between its ends. Records whose times are out of order (the clock was set back, or
    retention wrote them again) become separate runs if they are far apart in the log.
@@ -61,7 +61,7 @@ _LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE eve
 
 
 class BundleError(Exception):
-    """A bundle cannot be made; the message has the reason, `trouble` its kind."""
+    """A bundle cannot be made; the message gives the reason, `trouble` its kind."""
 
     def __init__(self, text: str, trouble: Trouble) -> None:
         super().__init__(text)
