@@ -4,7 +4,8 @@ Invariants:
 
 1. The database is only read, so forwarding never delays the log or loses its records.
 2. Memory is bounded: at most `_BATCH` records and `_BATCH` checkpoints at a time.
-3. The position advances only when the receiver has the batch; failures are retried forever, with growing pauses.
+3. The position advances only when the receiver has received the batch; failures are retried forever, with growing
+   pauses.
 4. Records that retention removed before they were sent are counted and reported (`missed`).
 5. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
 """
