@@ -14,7 +14,7 @@ NO_TUNNELS = (
 class RestAddress:
     """The ports of REST.
 
-    `port` is for other machines; if it is None, `trouble` has the reason and the remedy. `inner_port` is for hosts in
+    `port` is for other machines; if it is None, `trouble` gives the reason and the remedy. `inner_port` is for hosts in
     tunnels, at the appliance's tunnel address; None if these hosts cannot reach REST.
     """
 
