@@ -28,7 +28,7 @@ _FAULTS = (
 
 
 class CharonError(Exception):
-    """Report that charon cannot be used; the message has the reason and the remedy."""
+    """Report that charon cannot be used; the message gives the reason and the remedy."""
 
 
 class ViciClient:

@@ -1,8 +1,9 @@
-"""Run charon: the only process that talks to it, with the appliance's own key for the tunnels.
+"""Run charon, the IPsec daemon of the tunnels. Only this process talks to charon.
 
-This process makes a key once and requests a certificate from control. Control sends the complete wanted state
-(`TunnelsStated`) after each change; charon starts with the first one. If charon dies, this process also ends, and the
-supervisor starts both again without any state of the earlier run.
+This process makes the appliance's key for the tunnels once, and requests a certificate from the control process. The
+control process sends the complete wanted state (`TunnelsStated`) after each change; charon is started when the first
+state arrives. If charon dies, this process also ends, and the supervisor starts both again without any state of the
+earlier run.
 
 1. The private key stays in this process's own directory (mode 0600) and in charon.
 2. charon has the privileges of this process: its own user, and the capabilities to change the network and to bind the
@@ -52,7 +53,7 @@ _log = structlog.get_logger()
 
 
 class TunnelProcess:
-    """The process: it serves its lifeline and the link to control until it is stopped or charon dies."""
+    """Handles messages of the supervisor (the lifeline) and of control until it is stopped or charon dies."""
 
     def __init__(self, lifeline: Channel, directory: Path, key: bytes) -> None:
         self._child = Child(lifeline, messages.TunnelLink, said=self._control_said, linked=self._linked)
@@ -225,7 +226,7 @@ class TunnelProcess:
 
 
 def main(lifeline_fd: int, directory: Path) -> None:
-    """Run this process: `lifeline_fd` is the lifeline's descriptor, `directory` its own."""
+    """Run this process: `lifeline_fd` is the lifeline's descriptor, `directory` the process's private directory."""
     lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
     try:
         key = _own_key(directory / KEY_FILE)

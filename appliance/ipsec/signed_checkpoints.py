@@ -1,10 +1,10 @@
 """Remember the audit checkpoints that the signer signed, so that it never signs a second history.
 
-1. For each log, `<log>.signed` has the hashes of its signed checkpoints by number, and `<log>.times` has the times of
-   signing by the age clock. Both files only grow.
+1. For each log, `<log>.signed` lists the hashes of its signed checkpoints by number, and `<log>.times` lists the times
+   of signing by the age clock. Both files only grow.
 2. A checkpoint is approved if its number and hash follow the last one. A repeated checkpoint is approved if it equals
    the one signed under its number (control lost the answer). An unknown log may begin with any number.
-3. A checkpoint has the sequence of the last removed record. The signer must have approved that removal
+3. A checkpoint contains the sequence number of the last removed record. The signer must have approved that removal
    (`<log>.removed`, see `removals.py`). The first checkpoint with this field in a log from an older version is trusted;
    every later checkpoint of the log needs the field.
 4. At most `MOST_LOGS` logs are remembered, so control cannot fill the signer's disk.

@@ -89,7 +89,7 @@ def _create_key(directory: Path) -> None:
 
 
 class Signer:
-    """The signer: it serves its lifeline and the link to control until it is stopped."""
+    """Handles messages of the supervisor (the lifeline) and of control until it is stopped."""
 
     def __init__(
         self,
