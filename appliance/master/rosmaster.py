@@ -1,4 +1,4 @@
-"""Call the hidden ROS master over kept connections, behind a *door* that is shut while the ROS master is rebuilt.
+"""Call the hidden ROS master over reused connections. A *door* holds calls back while the ROS master is rebuilt.
 
 While the ROS master is down or not yet restored, calls of nodes wait at the door for a limited time. So a registering
 node notices only a delay. The reconcile loop shuts and opens the door, and uses `call_now` to call in the meantime.
@@ -6,7 +6,7 @@ node notices only a delay. The reconcile loop shuts and opens the door, and uses
 Small calls (`small` in the table of calls: parameters and answers are a few names) are sent one after the other. A
 small call is sent at once if no other small call is under way. Small calls that arrive in the meantime wait for the
 answer. They are then sent together as one `system.multicall`, in order. The ROS master is one Python process and does
-only one thing at a time. So under load, multicalls save most of the cost in control and in the ROS master.
+only one thing at a time. So under load, multicalls save most of the cost in the control process and in the ROS master.
 
 The answers to a multicall are separated again. A fault of one part affects only this part, so callers see no
 difference. A call with a parameter's value may be large, slow or impossible to encode. It is sent alone, because its

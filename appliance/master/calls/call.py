@@ -1,6 +1,6 @@
 """Define a row of a table of calls, and an attempt to make such a call.
 
-`call_table.py` has the rows of the Master API, `node_calls.py` the rows of a proxy endpoint. A row names the method
+`call_table.py` defines the rows of the Master API, `node_calls.py` the rows of a proxy endpoint. A row names the method
 that carries out the call. mypy checks that the parameters of the method fit the row.
 
 Before a decision, each parameter is converted to its canonical value: a name is resolved as in the ROS master, a URI

@@ -1,6 +1,6 @@
 """Parse the beginning of a request's body, for the record of a denial. The rest is not read. No I/O.
 
-The beginning is untrusted and has a few KiB. If it contains a complete known call, the record has the same fields as a
+The beginning is untrusted and a few KiB long. If it contains a complete known call, the record has the same fields as a
 decision on that call: category, resource, claimed name, and key or node. Otherwise, the record has only the name of the
 method, if it can be found.
 """

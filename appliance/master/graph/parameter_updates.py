@@ -1,11 +1,12 @@
-"""Compute the updates for subscribers when a parameter is set or deleted, from the decided key and value.
+"""Compute the updates for subscribers when a parameter is set or deleted, from its key and value.
 
-This works like rosmaster's `compute_param_updates`, but uses only canonical keys. So subscribers get only the decided
-key and keys below it, whatever names a value contains:
+This works like rosmaster's `compute_param_updates`, but uses only canonical keys. The *changed key* is the canonical
+key that the policy allowed the caller to change. Subscribers get only this key and keys below it, whatever names a
+value contains:
 
-1. Subscribers to the decided key, or to a key above it, get the decided key and its value.
-2. Subscribers to a key below the decided key get their part of the new value, or `{}` if their key is no longer set.
-3. If the value is not a namespace, there are no updates for keys below the decided key.
+1. Subscribers to the changed key, or to a key above it, get the changed key and its value.
+2. Subscribers to a key below the changed key get their part of the new value, or `{}` if their key is no longer set.
+3. If the value is not a namespace, there are no updates for keys below the changed key.
 """
 
 from collections.abc import Iterable, Iterator

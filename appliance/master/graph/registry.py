@@ -1,4 +1,5 @@
-"""Keep the registry: nodes, their registrations, and the lists that subscribers have. No I/O, no clock.
+"""Keep the registry: nodes, their registrations, and the lists of publishers that subscribers have received. No I/O, no
+clock.
 
 An *incarnation* is one life of a node: a name and an API URI that were registered from one host. Two endpoints and the
 relay ports represent the node. Every change of the registry returns the changes to save (`Durable`); `enactor` saves

@@ -2,13 +2,13 @@
 
 The same loop handles all failures: the ROS master died, control died, a call was interrupted.
 
-- A new ROS master gets everything again, in the original order. Calls wait at the door until then.
+- A new ROS master gets everything again, in the original order. Calls wait at the door (`rosmaster.py`) until then.
 - A registration that is wanted but not seen is made again.
 - A registration that is seen but not wanted is adopted if two conditions hold: it has the key of a known incarnation,
   and the policy in force grants it. In this case, control died before it saved the registration. Otherwise, the
   registration is ended. A registration at the ROS master is not a right: the policy may have withdrawn it just before.
-- After a rebuild, and after a relay starts, every subscriber gets each of its lists once. After a restart of control,
-  every node gets the values of the parameters that it subscribed to.
+- After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a restart
+  of control, every node gets the values of the parameters that it subscribed to.
 """
 
 import asyncio
