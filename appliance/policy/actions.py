@@ -16,7 +16,7 @@ VERBS = {"use-node" if category is Category.NODE else category.value: category f
 
 
 class BadWordError(ValueError):
-    """A host or action is invalid; the message has the reason and the remedy."""
+    """A host or action is invalid; the message gives the reason and the remedy."""
 
 
 def parse_action(text: str) -> tuple[Category, str]:

@@ -25,7 +25,7 @@ _MOST_LINES = 8  # the most lines that one grant may change
 
 
 class UngrantableError(Exception):
-    """No line of a policy can grant the request; the message has the reason."""
+    """No line of a policy can grant the request; the message gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ Step = tuple[str, bool]
 
 
 class BadKeyError(ValueError):
-    """A text is not a valid key; the message has the reason and the correct form."""
+    """The string is not a valid key; the message gives the reason and the correct form."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Key:
 
 
 def _compatible(one: Step, other: Step) -> bool:
-    """Whether one level of a name can match both steps."""
+    """Whether these levels of two keys can match the same level of a name."""
     (text, star), (other_text, other_star) = one, other
     fits = star and other_text.startswith(text)
     return fits or (other_star and text.startswith(other_text)) or text == other_text
@@ -106,7 +106,7 @@ def parse_key(text: str, *, parameter: bool = False) -> Key:
 
 
 def command_key(name: str) -> Key:
-    """Return the key of a call in `[Commands]`."""
+    """Return the key of a rule in `[Commands]`: the name of a call, which is not a ROS name."""
     return Key(name, (), subtree=False)
 
 

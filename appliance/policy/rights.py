@@ -7,7 +7,7 @@ action that a person names (`publish /cmd_vel`). `decide` makes one decision on 
 A right is a question to one section of the policy. A call needs all of these rights:
 
 1. the action itself: access to a topic or service, or the call as a command;
-2. the command that carries out the action, if `COMMAND_FOR` has one;
+2. the command that carries out the action, if `COMMAND_FOR` lists one;
 3. for a call about a parameter: read or write access to the parameter, to everything below it, and to the parameter
    that it replaces;
 4. for a call that makes a node part of the graph: the node's name.
