@@ -9,7 +9,7 @@ Invariants, for a pool with `Bounds(whole, host, unknown, kept)`:
 2. All unknown hosts together hold at most `unknown`, however many addresses they have.
 3. All hosts without a registration together hold at most `whole - kept`. The remaining `kept` is reserved for
    registered hosts.
-4. A host without holdings takes no memory.
+4. The pool stores nothing about a host without holdings.
 
 The quota class of a host may change while the host has holdings. Each call for a host reads its present class and
 counts its holdings under that class. Other hosts are not checked.
