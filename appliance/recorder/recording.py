@@ -1,7 +1,7 @@
 """Write a recording from the memory of the relays to a bag, step by step.
 
-1. After each step, the file `progress` has the bag's length and all data needed to continue; the file is replaced
-   atomically. A new recorder cuts the bag at that length and continues: the memory still has the unwritten messages.
+1. After each step, the file `progress` stores the bag's length and all data needed to continue; the file is replaced
+   atomically. A new recorder cuts the bag at that length and continues: the memory still holds the unwritten messages.
 2. Missing messages are reported: as a count by topic if the numbers of messages have a gap, otherwise in words.
 3. A bag has at most `largest` bytes, not counting the audit records.
 4. The headers of its connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.

@@ -1,11 +1,12 @@
-"""Plan which recording an act begins or extends, and which host is charged. No I/O.
+"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends, and who is charged. No
+I/O.
 
 Times are nanoseconds since the epoch.
 
-Control plans when it makes the audit record of the act. So the record names the recording, or the reason why there is
-none. The recorder reads the log and carries out the plan. A recording is charged to the cause of its first trigger:
-`ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together, `OPERATORS` for orders, or
-`APPLIANCE` for an act without a host (such as a monitor's timer).
+The control process makes the plan together with the audit record of the act. So the record names the recording, or the
+reason why there is none. The recorder reads the log and carries out the plan. A recording is charged to the cause of
+its first trigger: `ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together,
+`OPERATORS` for orders, or `APPLIANCE` for an act without a host (such as a monitor's timer).
 
 Invariants:
 

@@ -1,4 +1,4 @@
-"""Keep recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished ones (`.ID.part/`).
+"""Store recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished recordings (`.ID.part/`).
 
 A removed recording stays as `.ID.gone/`, without its bag, until its removal is in the audit log. `.ID.rest/` is
 garbage.
@@ -11,12 +11,13 @@ Invariants:
    made. Each host other than the robot has at most a quarter of `disk`, and all of them together three quarters. Their
    recordings never replace recordings of the robot or of operators, for whom half of `disk` is always available. The
    first to be removed is the oldest recording of the kind of trigger that uses the most bytes. The number of
-   recordings, and the bytes of their descriptions (`_MOST_DESCRIBED`), are also limited, because control gets all
-   descriptions in one message.
+   recordings, and the bytes of their descriptions (`_MOST_DESCRIBED`), are also limited, because the control process
+   gets all descriptions in one message.
 3. The file `noted` in a folder marks a recording that is in the audit log. Other recordings are reported again.
 4. The file `lent` in a folder marks a temporary recording, which does not count in `disk`. At most `MOST_TEMPORARY` of
-   them exist, each for up to `TEMPORARY_SECONDS`. A further one replaces the oldest, unless the oldest is so new that
-   its reader may not have opened it yet (`_OPENING_SECONDS`). A new recorder removes all temporary recordings.
+   them exist, each for up to `TEMPORARY_SECONDS`. A further temporary recording replaces the oldest, unless the oldest
+   is so new that its reader may not have opened it yet (`_OPENING_SECONDS`). A new recorder removes all temporary
+   recordings.
 5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
    atomically before anything in it is removed.
 """

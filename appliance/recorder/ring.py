@@ -3,7 +3,7 @@
 The supervisor holds the memory, one relay writes it (`RingWriter`), and one recorder reads it (`RingReader`). The
 memory consists of blocks of one size. Each connection to a publisher is a *stream*: a chain of header blocks (the
 connection's TCPROS header, with the definition of the type) and a chain of data blocks. The blocks of each chain are
-numbered from 0. The data chain is a sequence of records, which may span blocks. A record has the number of frames,
+numbered from 0. The data chain is a sequence of records, which may span blocks. A record contains the number of frames,
 their size in bytes, the time, the number of the first frame, and the frames.
 
 Invariants:
