@@ -3,22 +3,22 @@
 The loop does not use asyncio, which costs a callback, a transport and a future for each read. Raw epoll with one bound
 method per descriptor halves the delay of a relayed message.
 
-Processor time is a quota. Each descriptor has a *payer*: a host that the policy names, all other registered hosts
-together, all unregistered hosts together, or new connections. The relay's own descriptors (control, lifeline) have no
-payer. A payer with more than `_DIRECT` descriptors has its own epoll inside the loop's epoll. Therefore the loop finds
-the ready descriptors of other payers in time, however many of this payer's are ready. Payers are served by deficit
+Hosts share processor time by quota. Each descriptor has a *payer*: a host that the policy names, all other registered
+hosts together, all unregistered hosts together, or new connections. The relay's own descriptors (control, lifeline)
+have no payer. The descriptors of a payer beyond the first `_DIRECT` are in a second epoll, inside the loop's epoll. So
+a payer with many ready descriptors cannot hide the ready descriptors of other payers. Payers are served by deficit
 round robin in its continuous form. The payer that has used the least processor time goes first, for at most `QUANTUM`.
 Idle time earns a credit of at most one quantum, and a new payer starts behind the others. A payer is *costly* if it
-used much more than a quantum in its last turn. All other ready payers, for one quantum together, come before the next
-costly payer, even if they have used more.
+used much more than a quantum in its last turn. Before a costly payer, the other ready payers share one quantum, even if
+they have used more.
 
 Invariants:
 - A handler is never called for a descriptor that was unwatched earlier in the same turn. `discard` closes a socket only
   at the end of the turn, so its number cannot refer to another socket in that turn. An event that waits for the payer's
   next turn is forgotten when its descriptor is unwatched or changed.
-- A turn calls the relay's own handlers first. After `QUANTUM`, a turn starts no further handler or timer, except one
-  costly payer's. So a turn lasts at most a quantum and the time of two handlers, one of them costly. A handler with
-  much to do stops when the quantum is `over`, and passes the rest to `later`.
+- A turn calls the relay's own handlers first. Once payers have used `QUANTUM` in a turn, the turn serves no further
+  payer, except one costly payer. A payer that has used `QUANTUM` in a turn starts no further handler; the same holds
+  for the timers together. A handler with much to do stops when the quantum is `over`, and passes the rest to `later`.
 - A handler that raises an exception has a defect: the process ends, and the supervisor starts another.
 """
 

@@ -8,7 +8,8 @@ Invariants:
 - Equal refusals within that time become one message with a count, and at most `refusals` different ones are sent. So a
   flood of unknown hosts can neither grow the relay nor fill the link.
 - Messages dropped by limits are counted separately for at most `_KEPT` limits; the others are counted together.
-- At most `_KEPT` connections that end without a link are kept for the next control; the others are only counted.
+- At most `_KEPT` connections that end without a link are kept for the next control process; the others are only
+  counted.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,14 +1,14 @@
 """One relayed topic of one publisher: its subscribers and the messages that they get, without sockets.
 
 A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header, and
-subscribers that are served. The upstream stays open while a subscriber, monitor or tap needs it, and a short time
-longer.
+subscribers that are served. The upstream stays open while a subscriber, a monitor or a tap (a consumer inside
+the appliance) needs it, and a short time longer.
 
-Subscribers stay connected when the upstream is lost. Their publication stays valid until control withdraws it; control
-does so when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that closed its
-connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are passed on
-whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with another
-type, md5sum, definition or latching flag, because they must read the new header.
+Subscribers stay connected when the upstream is lost. Their publication stays valid until the control process withdraws
+it, which happens when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that
+closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are
+passed on whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with
+another type, md5sum, definition or latching flag, because they must read the new header.
 
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that

@@ -1,13 +1,14 @@
-"""Report monitors' actions to control: the first event of each kind in a second in full, the others as counts.
+"""Report monitors' actions to the control process: the first event of each kind in a second in full, the others as
+counts.
 
 Invariants:
 - For each monitor, kind and distinction (the category of a verdict, the text of a log line), one event a second is
   reported in full. The others of that second become one event with a count, whose detail holds what they have in
   common. Counts are complete.
-- Each full report has the sender of the message (caller id and host), and the message's number in its publication.
+- Each full report gives the sender of the message (caller id and host), and the message's number in its publication.
 - The number of distinctions is bounded (`_DISTINCT`); beyond it, events are counted under the kind alone.
 - Counters are sent after the events that they count. Once a second, counters without a reported event are sent as well.
-- Without control, at most `_KEPT` events wait; only the number of further events is reported.
+- Without a link to the control process, at most `_KEPT` events wait; only the number of further events is reported.
 """
 
 from collections import deque

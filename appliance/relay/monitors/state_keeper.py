@@ -37,7 +37,7 @@ class _GroupHead(msgspec.Struct, array_like=True):
 
 
 class _Head(msgspec.Struct, array_like=True):
-    """Who wrote a memory, when, and its groups: boot id, offset of the clock and time (ns), heads of the groups."""
+    """The head of a memory: boot id, offset of the clock and time of writing (ns), heads of the groups."""
 
     boot: str
     offset: int

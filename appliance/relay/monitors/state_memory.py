@@ -1,12 +1,12 @@
 """Lay out a file of fixed size that keeps monitors' state when a relay dies; the supervisor opens the file.
 
-The file has a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half has a `head` (the
-writer's data), a table, and *sections*. A section has two places for the `base` state of a group of monitors, two for
-its `cells`, and one byte that marks the valid places. `lay_out` writes the invalid half and then the file's byte.
-`write_base` and `write_cells` write the invalid place and then the section's byte. Stores of one thread become visible
-in order, and a byte is stored as a whole. Therefore a process killed at any point leaves the state either before or
-after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has restarted
-since.
+The file contains a magic number, a byte with the valid half (1 or 2; 0: none), and two halves. A half contains a `head`
+(the writer's data), a table, and *sections*. A section contains two places for the `base` state of a group of monitors,
+two for its `cells`, and one byte that marks the valid places. `lay_out` writes the invalid half and then the file's
+byte. `write_base` and `write_cells` write the invalid place and then the section's byte. Stores of one thread become
+visible in order, and a byte is stored as a whole. Therefore a process killed at any point leaves the state either
+before or after a write. A power cut can lose this order, so the reader uses the head to check whether the machine has
+restarted since.
 """
 
 import mmap

@@ -1,12 +1,12 @@
-"""Find whole TCPROS frames in received bytes; every relayed message passes here.
+"""Find whole TCPROS frames in received bytes; every relayed message passes through this module.
 
 A frame is a 4-byte little-endian length, followed by that many bytes. `FrameReceiver` provides the receive buffer, and
 returns all whole frames after each read as one `Batch`, without copying them:
 
-- A batch has at most `MOST` frames of unequal length, because its users visit each of them. `FrameReceiver.following`
-  returns the rest of a read, at once or at the publisher's next turn.
+- A batch has at most `MOST` frames of unequal length, because callers loop over them. `FrameReceiver.following` returns
+  the next frames of the same read, at once or at the publisher's next turn.
 - Small frames are received into a scratch area that all receivers share. If monitors run, this area is in the memory of
-  their module. Only the incomplete frame at the end of a read is copied.
+  the monitors' WebAssembly module. Only the incomplete frame at the end of a read is copied.
 - A frame larger than `LARGE` gets its own area. An area of up to 8 MiB is reused for the next large frame, unless a
   queue has kept it. A larger area is anonymous memory, so a declared length that is never sent costs only address
   space. While memory is short, no area is reused.
@@ -47,10 +47,10 @@ _unpack_length = _LENGTH.unpack_from
 class Batch:
     """Consecutive whole frames in a buffer that is reused unless they are kept.
 
-    `last` is the offset of the last of the `messages` frames (None: not known yet). `stride` is the size of each frame
-    if all are known to be equally long, else 0. `first` is the number of the first frame in its publication. `judged`
-    is the time when monitors got the frames, by the monitors' clock (0: never). `left` is the number of messages at the
-    end that monitors had no time for.
+    `messages` is the number of frames, and `last` the offset of the last frame (None: not known yet). `stride` is the
+    size of each frame if all are known to be equally long, else 0. `first` is the number of the first frame in its
+    publication. `judged` is the time when monitors got the frames, by the monitors' clock (0: never). `left` is the
+    number of messages at the end that monitors had no time for.
     """
 
     __slots__ = ("_kept", "_owned", "first", "judged", "last", "left", "messages", "stride", "view")
@@ -74,13 +74,13 @@ class Batch:
         return self._kept is not None
 
     def keep(self) -> memoryview:
-        """Return the frames in memory that does not change; copy them at most once."""
+        """Return the frames in memory that will not be overwritten; copy them at most once."""
         if self._kept is None:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
 
     def rest(self, sent: int) -> memoryview:
-        """Return the bytes after the first `sent`, in memory that does not change; copy them if they are few."""
+        """Return the bytes after the first `sent`, in memory that will not be overwritten; copy few bytes."""
         if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
             return memoryview(bytes(self.view[sent:]))
         return self.keep()[sent:]

@@ -1,15 +1,15 @@
 """Divide the relay's memory among hosts.
 
 There are four pools: incomplete frames, requests and replies; queues for slow subscribers and clients; latched
-messages; connection headers. A frame counts for the host that sends it, a queue for the host that is slow. The pools
-are separate: queues cannot use the memory for frames.
+messages; connection headers. A frame is charged to the host that sends it, a queue to the slow host. The pools are
+separate: queues cannot use the memory for frames.
 
 Invariants, besides those of `Pool`:
 
 1. A host gets no more memory once it holds as much as is free. So a single host can have half of a pool. Each of *n*
    greedy hosts gets 1/(*n* + 1) of the pool, and the same amount stays free for the next host.
-2. Memory beyond a host's quota is freed when data of that host moves, or at the next check (once a second). A latched
-   message is dropped when a host that holds less memory needs to latch one.
+2. Memory beyond a host's quota is freed when the relay next handles data of that host, or at the next check (once a
+   second). A latched message is dropped when a host that holds less memory needs to latch one.
 """
 
 from collections.abc import Callable
@@ -31,11 +31,11 @@ class HostMemory:
 
     @property
     def used(self) -> int:
-        """Return the bytes of this host."""
+        """Return the number of bytes that this host holds."""
         return self._pool.held(self._host)
 
     def add(self, size: int) -> None:
-        """Count `size` more bytes for this host; a negative `size` counts fewer."""
+        """Charge `size` bytes to this host; give bytes back if `size` is negative."""
         if size > 0:
             self._pool.charge(self._host, size)
         elif size:
@@ -82,7 +82,7 @@ class RelayMemory:
 
     @classmethod
     def of(cls, limits: RelayLimits, quota_class: Callable[[str], QuotaClass]) -> "RelayMemory":
-        """Return the pools of one relay: `memory_bytes`, divided like the defaults of the table."""
+        """Return the pools of one relay; `memory_bytes` is divided in the proportions of `quotas/table.py`."""
         rows = (RELAY_FRAMES, RELAY_QUEUES, RELAY_LATCHED)
         together = sum(row.bounds.whole for row in rows)
 
