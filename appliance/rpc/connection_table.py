@@ -9,7 +9,8 @@ Invariants:
 3. The lowest class is evicted first. In a class, idle connections are evicted before unfinished connections, and these
    before served connections. In each stage, the longest wait is evicted first.
 4. `patience` is the minimum wait before an eviction. At RVMaster, an idle connection is evicted at once, because ROS
-   clients reconnect. An unfinished connection of the same class has one second. A served connection is never evicted.
+   clients reconnect. An unfinished connection of the same class is evicted after one second at the earliest. A served
+   connection is never evicted.
 5. If bytes are short, the largest unfinished connection of a host with more bytes or a lower class is evicted.
 """
 

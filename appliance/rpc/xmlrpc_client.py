@@ -1,4 +1,4 @@
-"""Make the appliance's XML-RPC calls. Connections to the ROS master are kept; each call to a node has its own.
+"""Make the appliance's XML-RPC calls. Calls to the ROS master reuse connections; each call to a node opens a new one.
 
 Each call has a time limit, and each response has a size limit. For a slow, silent or misbehaving peer, the caller gets
 a `CallFailedError`. Other callers are not affected.
@@ -19,7 +19,7 @@ from roswire.xmlrpc import FaultReceived, Value, XmlRpcLimits, build_call, parse
 
 
 class CallFailedError(Exception):
-    """A call has no usable answer; the message has the reason and the address."""
+    """A call has no usable answer; the message gives the reason and the address."""
 
 
 class RefusedError(CallFailedError):
@@ -98,8 +98,8 @@ class XmlRpcClient:
     async def _exchange(self, request: bytes, seconds: float) -> bytes:
         """Return the response.
 
-        Raises `UnreachedError` if the time limit passes before a connection, `TimeoutError` if it passes later, and
-        another `OSError` if the connection fails.
+        Raises `UnreachedError` if the time limit passes before a connection is made, `TimeoutError` if it passes later,
+        and another `OSError` if the connection fails.
         """
         loop = asyncio.get_running_loop()
         deadline = loop.time() + seconds
@@ -167,7 +167,7 @@ class _Connection(asyncio.Protocol):
         return self._answer
 
     def give_up(self) -> None:
-        """Fail the answer, because its time limit passed."""
+        """End the pending request with `TimeoutError`, and close the connection."""
         self._fail(TimeoutError())
 
     def close(self) -> None:
