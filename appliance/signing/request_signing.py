@@ -33,7 +33,7 @@ _PROOF_FORM = re.compile(r"([!-~]{1,200}) ([A-Za-z0-9_-]{86})")
 
 
 class BadProofError(ValueError):
-    """A proof is invalid, or a request cannot be signed; the message has the reason."""
+    """A proof is invalid, or a request cannot be signed; the message gives the reason."""
 
 
 class TokenKeys(NamedTuple):

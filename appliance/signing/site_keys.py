@@ -34,7 +34,7 @@ _HOW = "sign it (rosrv sign FILE --key KEY) and leave FILE.sig beside it, or sen
 
 
 class UnsignedError(Exception):
-    """A text has no valid signature of the site; the message has the reason and the remedy."""
+    """A text has no valid signature of the site; the message gives the reason and the remedy."""
 
 
 def checked_key(line: str) -> str:
