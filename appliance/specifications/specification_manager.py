@@ -4,8 +4,8 @@ This file is long because each of its short methods changes the same state, one 
 
 Invariants:
 
-1. The folder is the baseline, and is never written. Changes while the robot runs are revisions in the store
-   (`specification_revisions.py`). Revisions and switches (`switches.py`) survive a restart.
+1. The folder of specifications is the baseline, and the appliance never writes to it. Changes while the robot runs are
+   revisions in the store (`specification_revisions.py`). Revisions and switches (`switches.py`) survive a restart.
 2. The compiler process compiles new specifications before anything changes. If there are errors, nothing changes, and
    all errors are returned. The relays get the compiled form, and may refuse it.
 3. A monitor that is loaded and shares variables with monitors in shadow mode is also in shadow mode. A load or switch
