@@ -1,8 +1,8 @@
-"""Keep statements in a write-ahead file until the database has them, so that a killed process loses none.
+"""Keep statements in a write-ahead file until the database has stored them, so that a killed process loses none.
 
 A statement is appended before any answer that depends on it. The append is one small write to the page cache: it takes
-microseconds and does not wait for the disk. When the database has all statements, the file is emptied. After a crash,
-the statements in the file are executed again, in order; each of them is idempotent.
+microseconds and does not wait for the disk. When the database has stored all statements, the file is emptied. After a
+crash, the statements in the file are executed again, in order; each of them is idempotent.
 
 The alternative is to commit each statement (`python -m benchmarks.state_writes` compares both). With this file, a
 registration blocks the thread that answers nodes for 20 µs instead of 45 µs. That thread never waits for SQLite's one

@@ -40,9 +40,9 @@ R = TypeVar("R", bound=Row)
 class Revisions(ABC, Generic[R]):
     """The revisions of the policy or of the specifications; only one change is made at a time.
 
-    A change can have a time limit: unless confirmed, it is rolled back automatically, even if control or the appliance
-    restarts meanwhile. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried again after
-    `_AGAIN_SECONDS`, because no person may be present to do it.
+    A change can have a time limit: unless confirmed, it is rolled back automatically, even if the control process or
+    the appliance restarts meanwhile. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried
+    again after `_AGAIN_SECONDS`, because the operators may be absent.
     """
 
     refusal: ClassVar[type[Exception]]
@@ -60,7 +60,8 @@ class Revisions(ABC, Generic[R]):
     ) -> None:
         """`rows(limit)` returns revisions, newest first; `save` writes one.
 
-        The revision `nothing` is in force until the start. The store keeps the time limit under the name `setting`.
+        The revision `nothing` is in force until the last stored revision is loaded. The store keeps the time limit
+        under the name `setting`.
         """
         self.store = store
         self._rows = rows
@@ -91,8 +92,8 @@ class Revisions(ABC, Generic[R]):
     def _find_last(self, *, restarted: bool) -> bool:
         """Put the last stored revision in force; return whether it takes precedence over the files on disk.
 
-        It does after a crash of control (`restarted`). At the start of the appliance, only a revision made by an
-        operator (a rollback, REST) does.
+        It takes precedence after a crash of the control process (`restarted`). When the appliance starts, only a
+        revision made by an operator (a rollback, REST) takes precedence.
         """
         self.in_force = next(iter(self._rows(1)), self.in_force)
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
