@@ -183,7 +183,7 @@ class ProcessHandle:
     def _dead(self) -> None:
         self._loop.remove_reader(self._pidfd)
         if self._channel is not None:
-            # The process's last message may be unread; it has the reason of a failed start.
+            # The process's last message may be unread; it gives the reason of a failed start.
             channel, self._channel = self._channel, None
             with suppress(ChannelClosedError, msgspec.DecodeError):
                 for message, descriptors in channel.receive():

@@ -3,12 +3,12 @@
 1. The supervisor parses no data from a node or a browser. A child that sends a message outside `_FROM_ANY` and
    `_FROM_CONTROL` is killed and restarted.
 2. A dead process is restarted within a second. A process that does not answer for five seconds is killed.
-3. Once nodes may connect, only control's request ends the appliance; no other message and no death of a process does. A
-   process that cannot serve (a full disk) is restarted after at most a second, a dispensable process after at most a
-   minute.
+3. Once nodes may connect, only a request of the control process ends the appliance; no other message and no death of a
+   process does. A process that cannot serve (a full disk) is restarted after at most a second, a dispensable process
+   after at most a minute.
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
-5. The end takes less than five seconds, even if children hang, and leaves no process behind.
+5. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
 import asyncio

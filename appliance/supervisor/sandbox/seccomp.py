@@ -71,7 +71,7 @@ Comparison = tuple[int, int, int, int]  # argument, operator, value, second valu
 
 
 class SeccompError(Exception):
-    """Report that no filter is in force; the text has the reason."""
+    """Report that no filter is in force; the text gives the reason."""
 
 
 class _Comparison(ctypes.Structure):
