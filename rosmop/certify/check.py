@@ -51,7 +51,7 @@ class Certificate:
     """The result for one property.
 
     `proved`: every trace's verdict is that of the definition; `text` describes the check. `wrong`: some trace's verdict
-    differs; `text` has such a trace. Neither: the property was not certified; `text` has the reason.
+    differs; `text` gives such a trace. Neither: the property was not certified; `text` gives the reason.
     """
 
     proved: bool

@@ -3,7 +3,7 @@
 The walks of topics and the data, tables included, stay byte for byte the same. The script is stored after the frames:
 the notes of calls, the state to restore before each try, and the result of each function.
 
-This file has its own encoders and decoders, and shares none with the writer of modules (`fast/wasm.py`). So an error in
+The encoders and decoders in this file share no code with the writer of modules (`fast/wasm.py`). So an error in
 the writer's encoding of a number or section is not repeated here. The file shares only facts about the module
 (`WasmModule`) with the writer: the names of the walks, and the addresses of frames and effects. If the writer records a
 wrong address, the module traps or the comparison in `steps.py` fails, unless the writer uses the same wrong address

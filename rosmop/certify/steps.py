@@ -1,25 +1,26 @@
 """Run the steps of a compiled module in every state, and compare them with the certified automata.
 
-In a module, the walk of a topic (`fast/batch_codegen.py`) calls the functions of events, looks up states in tables, and
-runs handlers. The check runs the same bytes, tables included, but with stubs in place of the functions of events and
-handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so the check can let every event
-happen in every state of every property. The effect is compared with `expected_steps.py`: the certified automaton, and
-the order and effects of `run/execution.py`.
+For each topic, a module exports a *walk* (`fast/batch_codegen.py`): a function that calls the functions of events,
+looks up states in tables, and runs handlers. The check runs the same bytes, tables included, but with stubs in place of
+the functions of events and handlers (`scripted_module.py`). A stub notes its call and returns a scripted result, so the
+check can let every event happen in every state of every property. The effect is compared with `expected_steps.py`: the
+certified automaton, and the order and effects of `run/execution.py`.
 
 For each topic the check runs:
 
 - each event alone, in every state of every property; with a clock before, at and after its bound;
 - each handler with no result, a drop, `__RESET;`, both, and a message that is left to the engine;
 - each event that may drop, with a drop; two events on one message in every state, with a drop by the second if it may
-  drop, up to `MOST` steps for the whole set; and several messages in one read, all with the same results;
+  drop, up to `MOST` steps for all specifications of the module; and several messages in one read, all with the same
+  results;
 - a monitor that is switched off, and a drop and a verdict that are left to the engine.
 
 Not checked: the functions themselves (`prove` compares the functions of events with their form), the list of effects
 after a changed message, the stored explanations, and the translation of the module to machine code.
 
-The check depends on the writer for some data: the addresses of states, clocks, frames and counters (`WasmModule`,
-`Cells`). It also takes the numbers of events and properties from `form/specification_groups.py`, and the steps of
-clocked properties from `ClockedRun`. It encodes its stubs with its own code.
+The check depends on the code generator for some data: the addresses of states, clocks, frames and counters
+(`WasmModule`, `Cells`). It also takes the numbers of events and properties from `form/specification_groups.py`, and the
+steps of clocked properties from `ClockedRun`. It encodes the stubs without the code generator.
 """
 
 import struct
