@@ -1,4 +1,4 @@
-"""Compile the reads of bound fields from the bytes of a message, and the writes of assigned fields.
+"""Generate code that reads bound fields from the bytes of a message, and code that writes assigned fields.
 
 Numbers at known distances from each other are read together. A changed number is written in place. A new buffer is made
 only for a changed string, array or message of a different size.
@@ -50,7 +50,7 @@ def writes(scope: FunctionScope, written: list[PatternField]) -> tuple[nodes.Wri
 
 
 def _slots(scope: FunctionScope, field: PatternField) -> list[int | str]:
-    """Return the path of a field as list indices; parts of a time are names."""
+    """Return the path of a field as list indices; the parts of a time keep their names (`sec`, `nsec`)."""
     kind: Type = value_types.RecordType(scope.message_type or "")
     path: list[int | str] = []
     for step in field.binding.path:
