@@ -198,7 +198,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
-        """Choose as `std::min` and `std::max` do.
+        """Return code that selects the same argument as `std::min` or `std::max`.
 
         For `fmin` and `fmax`, also choose the second value if the first is NaN.
         """
@@ -228,7 +228,7 @@ class ArithmeticCodegen(FunctionBuilder):
         )
 
     def _of_parts(self, seconds: bytes, nanoseconds: bytes) -> bytes:
-        """Combine seconds and nanoseconds (64 bits). Leave the message if the sum would not be exact."""
+        """Combine seconds and nanoseconds (64 bits); leave the message to the interpreter if the sum may be inexact."""
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
@@ -238,7 +238,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + self._get(names[1], I64) + I64_ADD
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
-        """Leave the message if a time or duration is out of range."""
+        """Leave the message to the interpreter if a time or duration is out of range."""
         least, most = (
             (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         )
@@ -276,8 +276,8 @@ class ArithmeticCodegen(FunctionBuilder):
     def _in_seconds(self) -> bytes:
         """Convert a time to seconds as a double, rounded only once.
 
-        A time of more than 53 bits is divided by 5^9, with 40 bits after the point. The last of these bits is set if
-        there is a remainder. Then the result is divided by 2^9.
+        A time of more than 53 bits is divided by 10^9 in two steps. It is divided by 5^9 in fixed point, with 40
+        fractional bits; the last bit is set if there is a remainder. The result is divided by 2^9.
         """
         code, value = self._set("moment", I64), self._get("moment", I64)
         size = self._get("whole", I64)
@@ -297,7 +297,7 @@ class ArithmeticCodegen(FunctionBuilder):
         return code + result + F64_NEG + result + negative + SELECT
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
-        """Return code that splits a time, and code for the 64 bits of its seconds and nanoseconds as in a message."""
+        """Return code that splits a time, and code that packs both parts into 64 bits as in a message."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
         low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
         return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR
@@ -311,7 +311,7 @@ def to_floating(source: int, target: int, *, signed: bool) -> bytes:
 
 
 def _narrowed(target: value_types.IntegerType) -> bytes:
-    """Wrap a number in 32 bits to the type's fewer bits."""
+    """Return code that wraps a 32-bit number to the width of a narrower type; empty if the type is not narrower."""
     if target.bits >= 32:
         return b""
     if target.signed:

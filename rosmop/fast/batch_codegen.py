@@ -1,4 +1,5 @@
-"""Writes the module of a set as WebAssembly: a loop over the frames of one read that runs the events of every message.
+"""Write the WebAssembly module of a set of specifications: a loop over received frames runs the events of every
+message.
 
 For each topic the module exports `feed(at, end, now)`. It processes the frames from `at` to before `end` in the memory;
 a frame is a length (4 bytes, little-endian) and the message. The result has three parts: the address of the first frame

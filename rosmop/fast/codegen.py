@@ -1,20 +1,23 @@
-"""Writes functions of the form as WebAssembly: numbers, conditions, loops, message fields, drops.
+"""Translate functions of the intermediate form (`form/nodes.py`) to WebAssembly.
 
-Strings, vectors and messages within the current message are read in place if all of their parts have a fixed size
-(`codegen_access.py`). Strings can be kept (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and
-handlers, and the functions that they call. `batch_codegen.py` writes the loop over the frames of a read.
+The translation includes numbers, conditions, loops, message fields and drops. Strings, vectors and messages within the
+current message are read in place if all of their parts have a fixed size (`codegen_access.py`). Variables can hold
+strings (`strings_codegen.py`). `ModuleCodegen` writes the functions of events and handlers, and the functions that they
+call. `batch_codegen.py` writes the loop over the frames that were received together.
 
-- The function of an event or handler takes the address of the message and its size (i32, i32), and returns bits (i32):
-  `HAPPENED`, `DROPPED`, `CHANGED` (bytes differ), `ELSEWHERE`, `RESET`.
-- `ELSEWHERE` leaves the message to the interpreter, and its effects are undone. `ELSEWHERE` is returned at each fault,
-  and where the form has a node that is not compiled. Called functions trap instead. An event is not compiled at all if
-  every message would reach such a place; `NotCompiledError` has the reason. The rows `STATEMENTS` and `EXPRESSIONS`
-  list the nodes that are not compiled.
+- The function of an event or handler takes the address of the message and its size (i32, i32), and returns flags (i32):
+  `HAPPENED` (the event happened), `DROPPED` (the message is dropped), `CHANGED` (bytes of the message were changed),
+  `ELSEWHERE` (the interpreter must process the message), `RESET` (the handler restarts the property).
+- `ELSEWHERE` is returned at each fault and at each node that is not compiled. The effects of the message are undone,
+  and the interpreter processes the message. Functions that events and handlers call trap instead of returning
+  `ELSEWHERE`. An event is not compiled at all if every message would reach such a node; `NotCompiledError` gives the
+  reason. The tables `STATEMENTS` and `EXPRESSIONS` list the nodes that are not compiled.
 - A line of output is stored after the earlier lines, at the address in `SAID`; the current message is at `POSITION`
   (`deferred_output.py`).
-- Before a field is written, the old bytes are appended to the log that `UNDO` points into (address, size, bytes; 16
-  bytes each).
-- The charges of the form are taken from the budget of the specification, as in the interpreter.
+- Before a field is written, the old bytes are appended to a log; `UNDO` holds the end of this log. An entry takes 16
+  bytes: address (i32), size (i32) and the old bytes (i64).
+- The charges of the intermediate form (`nodes.Charge`, `nodes.Allocate`) are taken from the specification's budget, as
+  in the interpreter.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -116,9 +119,9 @@ EARLY = 16
 class WasmFunction:
     """A function of the module: types, code, the variables that it assigns, its writes to fields, and whether it drops.
 
-    `brief`: it has no loops. `passes`: some message reaches its end. `says`: it may print lines. `early`: it may write
-    to the first bytes of the message, where a header is. `references` has the addresses of the values of its references
-    after the return.
+    `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
+    `early`: it may write to the first bytes of the message, where a header is. `references` pairs each reference
+    parameter with the address where the function stores its value before it returns.
     """
 
     number: int
@@ -186,7 +189,7 @@ class ModuleCodegen(MemoryLayout):
         return cells.settle
 
     def _added(self, parameters: tuple[int, ...], code: bytes) -> WasmFunction:
-        """Add a function that is not in the form; its result has 32 bits."""
+        """Add a function that the intermediate form does not contain; its result has 32 bits."""
         written = WasmFunction(
             len(self.written), parameters, I32, code, frozenset(), 0,
             drops=False, brief=True, passes=True, says=False, early=False,
@@ -211,7 +214,7 @@ class _FunctionCodegen(StringCodegen):
         self._writer = writer
         self._function = function
         self._references: dict[str, int] = {}
-        """Addresses of the values of references after the return."""
+        """By reference parameter: the address where its value is stored before the return."""
         self._result = result
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # was checked
         self._types = tuple(parameters.values())
@@ -614,7 +617,7 @@ class _FunctionCodegen(StringCodegen):
         return self._called(node)[0]
 
     def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
-        """Return the code of a call, and the addresses of the values of its references.
+        """Return the code of a call, and the address of each reference parameter's value after the call.
 
         The code returns a string or vector as address (32 bits) and length.
         """

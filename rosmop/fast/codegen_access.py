@@ -82,7 +82,7 @@ class MessageAccess(ArithmeticCodegen):
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
-        """Store the number of elements, in 64 bits. Leave the message if it is too short for this number."""
+        """Store the number of elements (64 bits). Leave a message that is too short for them to the interpreter."""
         code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
         room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB

@@ -95,7 +95,7 @@ class FunctionBuilder(ABC):
     def _allocated(self, size: bytes) -> bytes:
         """Charge for the bytes (i64) of a new value.
 
-        Leave the message if the specification's memory must be measured.
+        Leave the message to the interpreter if the specification's memory must be measured.
         """
         many = size + constant(I64, UNMEASURED) + I64_GT_U
         spent = size + constant(I64, BYTES_PER_INSTRUCTION) + I64_DIV_U

@@ -17,7 +17,7 @@ LINES = 64 << 10
 class NotCompiledError(Exception):
     """A function, or a place in it, cannot be compiled.
 
-    The error has the reason and the site (-1: the whole function).
+    The error gives the reason and the site (-1: the whole function).
     """
 
     def __init__(self, reason: str) -> None:

@@ -88,7 +88,7 @@ class StringCodegen(MessageAccess):
         return super()._elements(node)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
-        """Pop address and length into local variables. Leave the message if the length exceeds `most`."""
+        """Pop address and length into local variables; a length above `most` leaves the message to the interpreter."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:

@@ -1,5 +1,5 @@
-"""Runs the module of a set: decides when the lane of a topic, or of a part of a service, may be used, and processes
-batches.
+"""Run the compiled module of a set of specifications: decide when the module may process a topic, or a
+part of a service (the *lane* of the topic or part), and process batches of messages.
 
 Invariants:
 
