@@ -1,10 +1,10 @@
-"""Monitors for mtl formulas about a bounded future (`past_monitors.py` has the other part of mtl).
+"""Monitors for mtl formulas about a bounded future (`past_monitors.py` implements the part about the past).
 
 The formula is evaluated at every event. Its value at an event is reported once it is certain: after an event, or when a
 bound passes. `x or y` is certain once either operand is true. `x until[l,h] y` is certain once `y` came in time and `x`
 held until then, once `x` failed, or once the time is over.
 
-Theory of operation. A `PastProgram` has the distinct subformulas. The subformulas that only look back are computed at
+Theory of operation. A `PastProgram` lists the distinct subformulas. The subformulas that only look back are computed at
 their event (`FoldedProgram`). For each other subformula, a *cell* is its value at one event while the value is open. A
 decided cell notifies its *users*. Cells exist only where needed: for `fire => eventually[0,1s] safe`, only the waiting
 `fire` events are kept.

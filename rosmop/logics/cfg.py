@@ -1,8 +1,8 @@
 """``cfg``: context-free grammars over the events, as MOP's CFG plugin reads them.
 
 ``S -> a S b | epsilon``; the first left side is the start symbol. Any grammar is accepted, even if it is ambiguous or
-derives the empty word. The category is ``match`` while the trace so far is in the language, and ``fail`` once no
-continuation can be in it.
+derives the empty word. The verdict's category is ``match`` while the trace so far is in the language, and ``fail`` once
+no continuation can be in it.
 
 If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
@@ -75,7 +75,7 @@ def compile_cfg(source: Source) -> CompiledProperty:
 
 
 def _table(recogniser: EarleyRecogniser, events: int) -> Automaton | None:
-    """Return the recogniser as an automaton if it can reach only few frames. Frames are compared by content."""
+    """Return the recogniser as an automaton if it can reach only a few frames. Frames are compared by content."""
     frames: dict[object, EarleySet] = {}
 
     def held(frame: EarleySet) -> object:

@@ -1,8 +1,8 @@
 """``ltl``: future linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with three verdicts.
 
-Each event is one position, where exactly its own atom holds. The category is ``violation`` once no continuation
-satisfies the formula, and ``validation`` once all continuations satisfy it. Both are permanent. (Bauer, Leucker,
-Schallhart: LTL3.)
+Each event is one position, where exactly its own atom holds. The verdict's category is ``violation`` once no
+continuation satisfies the formula, and ``validation`` once all continuations satisfy it. Both are permanent. (Bauer,
+Leucker, Schallhart: LTL3.)
 
 Theory of operation. The normal forms of the formula and of its negation each become a generalised Büchi automaton
 (``buchi``). States that accept no word are removed. Both automata are determinised side by side: an empty left side is

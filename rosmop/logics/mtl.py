@@ -7,8 +7,8 @@ About the future: ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b
 operators need an upper bound.
 
 The semantics is pointwise: a formula is evaluated only at events, and its operators see only events, at their times of
-reception. The category is ``validation`` if the formula holds at an event, and ``violation`` if it does not. The
-verdict comes once it is certain, at the latest when the bounds have passed.
+reception. The verdict's category is ``validation`` if the formula holds at an event, and ``violation`` if it does not.
+The verdict comes once it is certain, at the latest when the bounds have passed.
 """
 
 from rosmop.logics.bounded import BoundedProperty

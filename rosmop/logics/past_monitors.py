@@ -1,4 +1,5 @@
-"""Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the other part).
+"""Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` implements the part about the
+future).
 
 Theory of operation. A formula becomes a *program*: its distinct subformulas, each after its operands. The only temporal
 operators are ``previously`` and ``since`` (``once b`` is ``true since b``). A step computes all subformulas from the

@@ -17,9 +17,9 @@ Patterns concern only events inside one scope. Time bounds are closed:
 
 ``before`` and ``after`` are strict: no event answers, requires or forbids itself.
 
-The category is ``violation`` once the property is certainly violated, and ``validation`` once nothing can violate it
-any more. Both are permanent. A pattern that waits (``some``, ``causes``) may give no verdict for ever: silence violates
-the pattern only if there is a time bound, and never validates it.
+The verdict's category is ``violation`` once the property is certainly violated, and ``validation`` once nothing can
+violate it any more. Both are permanent. A pattern that waits (``some``, ``causes``) may give no verdict for ever:
+silence violates the pattern only if there is a time bound, and never validates it.
 
 ``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, the category is
 ``enforced`` and ``f`` publishes the due message, which counts as received.
