@@ -1,8 +1,8 @@
-"""Asks z3 whether the form of an event and its code in the module can differ.
+"""Ask z3 whether the compiled code of an event can differ from its intermediate form (`form/nodes.py`).
 
-The form of an event and its function in the module are compared for every message of up to `AREA` bytes and every
-state. They are equal if the function leaves the message to Python, which then processes it from the start, or if all of
-these hold:
+The form of an event and its function in the WebAssembly module are compared for every message of up to `AREA` bytes and
+every state. They are equal if the function leaves the message to Python, which then processes it from the start, or if
+all of these hold:
 
 - the form does not fault,
 - both agree on whether the event happened, dropped the message, and changed it,

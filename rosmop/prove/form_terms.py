@@ -1,5 +1,6 @@
-"""Translates the form of an event to terms of z3. It follows `run/interpreter.py` line by line, for all messages at
-once.
+"""Translate the intermediate form of an event (`form/nodes.py`) to terms of z3.
+
+This module follows `run/interpreter.py` line by line, for all messages at once.
 
 - Positions and counts have 64 bits here, but are unbounded in the interpreter. This is enough: a function without loops
   adds a few products of a count below 2**32 and a size, which never exceed 64 bits. Times also have 64 bits, and the

@@ -1,4 +1,4 @@
-"""Translates a function of a module to terms of z3, by the standard of WebAssembly.
+"""Translate a function of a WebAssembly module to terms of z3, by the standard of WebAssembly.
 
 Memory has these parts. Access to any other address counts as a difference:
 

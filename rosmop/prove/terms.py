@@ -24,7 +24,7 @@ FRAME = z3.BitVec("position", 32)
 
 
 class NotProvedError(Exception):
-    """Nothing is known about an event; the text has the reason."""
+    """Nothing is known about an event; the text gives the reason."""
 
 
 class _Mixed:
