@@ -1,17 +1,16 @@
-"""Explains verdicts: as few as possible of the past events that give the verdict alone, and the senders of their
-messages.
+"""Explain a verdict by few past events that suffice for it, and by the senders of their messages.
 
 Theory of operation:
 
 1. For a property with tables, `Exits` stores for each state the event that left it last. From the initial state these
    events lead to the present state, each later than the previous event: the trace without its loops. So nothing is cut,
-   however long the trace is, and events before `__RESET;` are left out. The module stores the same data in the same
-   memory.
+   however long the trace is, and events before `__RESET;` are left out. The compiled module stores the same data in the
+   same memory.
 2. For other properties, `Steps` keeps the last events and the run before them. (With a clock it is `ClockedSteps`,
-   which the module also stores.) If the events give the verdict to a new run, they explain it alone. Otherwise they
-   explain it only together with the run before them (`Explanation.since`). A run about the future cannot be copied. For
-   such runs more events are kept, and the run knows at which event the decided formula was evaluated. The events from
-   there on suffice, unless the formula also looks back; then there is no explanation.
+   which the compiled module also stores.) If the events give the verdict to a new run, they explain it alone. Otherwise
+   they explain it only together with the run before them (`Explanation.since`). A run about the future cannot be
+   copied. For such runs more events are kept, and the run knows at which event the decided formula was evaluated. The
+   events from there on suffice, unless the formula also looks back; then there is no explanation.
 3. For a parametric specification, the last `TRAIL` events are kept with their bindings. The events of the slice must
    explain its verdict alone; otherwise there is no explanation.
 4. Each explanation is tested: its events must give the verdict.

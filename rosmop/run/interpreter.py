@@ -1,10 +1,11 @@
-"""The interpreter, which defines the meaning of the form. Every faster implementation is compared with it.
+"""The interpreter, which defines the meaning of the intermediate form (`form/nodes.py`). Every faster implementation is
+compared with it.
 
 Each expression becomes a Python function that computes a value from the variables of a call. Each statement becomes a
-function that returns how it ends its block (None: it does not). There is one method for each kind of node
-(`STATEMENTS`, `EXPRESSIONS`). `runtime/` has the functions of the form, `runtime/values.py` the encoding of values in
-messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times and durations
-are integers; every other value has the closest Python type. This is one file because it is the definition.
+function that returns how it ends its block (None: the block goes on). There is one method for each kind of node
+(`STATEMENTS`, `EXPRESSIONS`). `runtime/` defines the functions that the form calls, and `runtime/values.py` encodes
+values in messages. A function is built on its first call. Strings are bytes, vectors and messages are lists, times and
+durations are integers; every other value has the closest Python type. This is one file because it is the definition.
 
 Invariants:
 

@@ -1,18 +1,18 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
-A *binding* gives a value to some or all of the parameters. The *slice* of a binding has the events whose bindings are
-part of it, from the first `creation event` on. Without creation events, the slice begins with the first event. Each
+A *binding* gives a value to some or all of the parameters. The *slice* of a binding contains the events whose bindings
+are part of it, from the first `creation event` on. Without creation events, the slice begins with the first event. Each
 slice whose events bind all parameters is monitored like a separate specification.
 
 Theory of operation:
 
 1. `targets` returns the slices of an event: every known binding that agrees with the event's binding, joined with it. A
    new slice starts with the state of the largest known binding within its own binding. That binding is unique, because
-   the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) are kept for this
-   purpose; their actions and handlers have no output.
-2. The engine loads each slice in turn into the monitor (`select`), steps the monitor as usual, and stores the state
-   again (`settle`). Tables, functions and handlers are the same as without parameters. If an event only changes the
-   states of automata, `step` and `quiet` do so directly.
+   the union of two known bindings that agree is also known. Slices that lack a parameter (`seeds`) only provide such
+   start states; their actions and handlers have no output.
+2. The engine (`execution.py`) loads each slice in turn into the monitor (`select`), steps the monitor as usual, and
+   stores the state again (`settle`). Tables, functions and handlers are the same as without parameters. If an event
+   only changes the states of automata, `step` and `quiet` do so directly.
 3. Each slice has its own clocks. `deadline` is the first deadline of all slices (in a heap), and `due` is the slice
    with that deadline. A slice has one valid entry in the heap (`Slice.due`), whose time may be too early, but never too
    late.

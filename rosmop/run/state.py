@@ -1,8 +1,8 @@
 """The state of monitors as data that outlives their process. It is written group by group, and read back under limits.
 
-A group has the specifications that share topics or variables, so a message changes the state of at most one group. The
-saved state is everything that affects later messages: variables, runs of properties, timers, and whether a monitor
-holds its topics. The events that explain a verdict, and the times of throttled output, are not saved.
+A group consists of the specifications that share topics or variables, so a message changes the state of at most one
+group. The saved state is everything that affects later messages: variables, runs of properties, timers, and whether a
+monitor holds its topics. The events that explain a verdict, and the times of throttled output, are not saved.
 
 If the variables of a group are numbers, its state is saved as the bytes in the module's memory, which `CellNames`
 describes. This keeps the common case cheap. Times are those of the caller's clock, which the next process continues.
