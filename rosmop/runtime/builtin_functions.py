@@ -1,4 +1,4 @@
-"""The functions that the form may call, by name.
+"""The functions that the intermediate form (`form/nodes.py`) may call, by name.
 
 If the first parameter is `context`, it gets the context of the running specification, to charge the call to it. If the
 last parameter is `site`, it gets the position to report for a fault.
