@@ -169,7 +169,7 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
     ],
 )
 def test_an_invalid_module_is_refused(code: str | bytes, reason: str) -> None:
-    """The error has the reason."""
+    """The error gives the reason."""
     with pytest.raises(WasmError, match=reason):
         run(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)))
 
