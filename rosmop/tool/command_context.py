@@ -1,4 +1,4 @@
-"""The command that a person runs: its name in messages, and its access to the files that the person names."""
+"""The context of a CLI command: the name used in its messages, and its access to the files that the user names."""
 
 import errno
 import io
@@ -46,7 +46,7 @@ class CommandContext:
         return data
 
     def read_text(self, path: Path) -> str:
-        """Return the text of a file with LF line ends; bytes outside UTF-8 become surrogates. Raises `OSError`."""
+        """Return the text of a file with LF line endings; invalid UTF-8 bytes become surrogates. Raises `OSError`."""
         with io.TextIOWrapper(io.BytesIO(self.read(path)), "utf-8", "surrogateescape") as text:
             return text.read()
 
