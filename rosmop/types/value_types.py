@@ -2,7 +2,7 @@
 
 A type is a value object, and its text is the C++ spelling. While actions run, values have these Python types: `bool`,
 `int` and `float` for numbers; bytes for strings and `char *` buffers; integer nanoseconds for times and durations;
-lists for vectors and messages. The list of a message has its fields in the order of the definition.
+lists for vectors and messages. The list of a message contains its fields in the order of the definition.
 """
 
 import msgspec
