@@ -105,7 +105,7 @@ class TokenAuthenticator:
             return True
         _require_patience(self._wrong, host)
         async with self._checking:
-            _require_patience(self._wrong, host)  # other requests of this host may have failed meanwhile
+            _require_patience(self._wrong, host)  # others of this host may have failed while it waited
             if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
                 return False
         if kept.id in self._tokens:

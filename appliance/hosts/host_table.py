@@ -198,7 +198,7 @@ class HostTable:
         self.changed()
 
     def take_next(self, name: str) -> HostRow | None:
-        """Replace a host's certificate by the stored next one; return None if there is none."""
+        """Replace a host's certificate with its stored successor; return None if no successor is stored."""
         row, certificate = self.rows[name], self.certificates.get(name)
         if certificate is None or certificate.next is None:
             return None

@@ -45,7 +45,7 @@ def _forget(family: int, port: int, own: set[str]) -> int:
             try:
                 tracker.entry("del", tuple_orig=entry)
             except NetlinkError as error:
-                if error.code != errno.ENOENT:  # not an entry that ended meanwhile
+                if error.code != errno.ENOENT:  # ENOENT: the entry ended before its removal
                     raise
             else:
                 deleted += 1

@@ -155,7 +155,7 @@ class GrantTable:
         return ("client", key, service, host, caller_id) in self._facts
 
     def client_of(self, key: str, service: str, host: str) -> str | None:
-        """Return a name under which this host may call this service; None if there is none."""
+        """Return a node name under which this host may call this service, or None."""
         return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
     def _name(self, message: Statement) -> None:

@@ -183,7 +183,7 @@ class Supervisor:
         self._spawn(self.until_ready())
 
     async def until_answering(self, slot: ProcessSlot) -> None:
-        """Wait until the process of this slot answers over HTTP, even if it is restarted meanwhile."""
+        """Wait until the process of this slot answers over HTTP; keep waiting if the process restarts."""
         began = time.monotonic()
         while self._gets_on(began, [slot]) and not self.stopping.is_set():
             process = slot.process

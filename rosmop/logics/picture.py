@@ -38,7 +38,7 @@ def dot_of(properties: Sequence[CompiledProperty]) -> str | None:
 
 
 def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
-    """Return the automata as an SVG picture, one below the other; None if there are none to draw."""
+    """Return the automata as an SVG picture, one below the other, or None if no property has one."""
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:

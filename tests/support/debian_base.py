@@ -72,7 +72,7 @@ def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUI
 
 
 def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
-    """Return the tar archive that `make_base` unpacks, and make it if there is none; also for `docker import`."""
+    """Return the tar archive that `make_base` unpacks and `docker import` reads; make it if it does not exist."""
     need_root()
     need_program("debootstrap", "debootstrap")
     settings = machine_settings(suite)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.control.rest` over a real link, with stand-ins for administration, tokens and trail."""
+"""Tests of `appliance.control.rest` over a real link; administration, tokens and audit trail are test doubles."""
 
 import asyncio
 import socket
