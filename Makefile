@@ -15,6 +15,9 @@ LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
 CONTAINERS := tests/system/containers
 FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
+# What takes longest runs with `make test-system` only: attacks, crashes and stock tools; searches through the language.
+LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integration/*/test_floods.py tests/integration/*/test_crashes.py tests/integration/*/test_robustness.py tests/integration/test_stock_tools.py tests/integration/*/test_stock_tools.py)
+LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py)
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
 .PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
@@ -45,22 +48,22 @@ build/collected:
 	$(PYTEST) tests/unit rosmop/tests tests/integration tests/proofs --collect-only --quiet > /dev/null || true
 	touch $@
 
-unit: build/collected
-	$(PYTEST) tests/unit rosmop/tests $(addprefix --ignore=,$(LONG_UNIT)) -n logical --quiet
+unit:
+	$(PYTEST) tests/unit rosmop/tests $(addprefix --ignore=,$(LONG_UNIT)) -n $$(nproc) --quiet
 
-test: setup ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
+test: setup ## check, long unit tests, and tests with real ROS nodes (root: they make network namespaces)
 	$(MAKE) --jobs=3 --output-sync=target static units nodes
 
 # Tests with real nodes wait half of their time: what computes has the processors then, and after them, for it is nice.
 units: build/collected
-	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit rosmop/tests -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit rosmop/tests $(addprefix --ignore=,$(LONGEST_UNITS)) -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 nodes: build/collected
-	$(PYTEST) tests/integration -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	$(PYTEST) tests/integration $(addprefix --ignore=,$(LONGEST_NODES)) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
-test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
+test-system: ## the whole product: attacks, demo, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
+	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(LONGEST_UNITS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
 	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers
 	$(MAKE) --no-print-directory system-namespaces
 
@@ -71,7 +74,7 @@ system-containers:
 	$(PYTEST) $(CONTAINERS) --quiet --durations=5
 
 system-namespaces:
-	$(PYTEST) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	$(PYTEST) $(LONGEST_NODES) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system

@@ -139,6 +139,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the files of tests/long.txt first."""
-    long = set(Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines())
-    items.sort(key=lambda item: item.nodeid.partition("::")[0] not in long)
+    """Run the files of tests/long.txt first, in the order of the list."""
+    names = Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines()
+    rank = {name: number for number, name in enumerate(names)}
+    items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(names)))
