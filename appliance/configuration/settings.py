@@ -61,6 +61,13 @@ SizeOfMebibytes = Annotated[int, _BYTES, Field(ge=1 << 20)]  # at least 1 MiB
 WithinAnHour = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
 
 
+def _comma_separated(value: object) -> object:
+    """Return a list of strings as one string with commas; return any other value unchanged."""
+    return (
+        ",".join(value) if isinstance(value, list) and all(isinstance(item, str) for item in value) else value
+    )
+
+
 class Unasked(str):
     """A default string. Its class distinguishes it from a string that the user configured."""
 
@@ -435,10 +442,10 @@ class Settings:
     monitors: Path | None = key(
         default=None, description="folder of specifications (.rv) of monitors; read again on reload"
     )
-    enable: str = key(
+    enable: Annotated[str, BeforeValidator(_comma_separated)] = key(
         default="all",
         description="initial state of monitors that no operator has switched, including new ones: all enabled, none,"
-        " NAME,…, or all in shadow mode (shadow)",
+        " NAME,… or a list of names, or all in shadow mode (shadow)",
     )
     forgotten_after: Seconds | None = key(
         default=86_400.0,

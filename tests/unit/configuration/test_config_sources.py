@@ -98,6 +98,15 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
     ] == []
 
 
+def test_monitors_to_enable_as_a_list(file: Path) -> None:
+    """`enable` accepts a list of names; an entry that is not a name is a mistake with its line."""
+    file.write_text("enable: [speedLimit, zone]\n")
+    assert resolve(file, {}, {}).enable == "speedLimit,zone"
+    file.write_text("enable:\n  - speedLimit\n  - {zone: 1}\n")
+    [mistake] = mistakes(file)
+    assert mistake.startswith(f"{file}:1: enable: must be ")
+
+
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
     """YAML would silently use the last value."""
     file.write_text("relays: 1\nlisten: 127.0.0.1:1\nrelays: 1\n")
