@@ -24,6 +24,12 @@ from distribution.man import write_pages
 HERE = ROOT / "distribution"
 LIBRARY = "usr/lib/rosrv"
 _TOOLS = {"dh_installsystemd": "debhelper", "dpkg-buildpackage": "dpkg-dev", "lintian": "lintian"}
+COMPLETIONS = {
+    "bash": "usr/share/bash-completion/completions/rosrv",
+    "zsh": "usr/share/zsh/vendor-completions/_rosrv",
+    "fish": "usr/share/fish/vendor_completions.d/rosrv.fish",
+}
+"""Where each shell looks for the completion of a command that a package installs."""
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
 import os
@@ -95,15 +101,15 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     date = formatdate(moment)
     write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
     _documentation(root / "usr/share/doc/rosrv")
-    completion = root / "usr/share/bash-completion/completions"
-    completion.mkdir(parents=True)
-    shown = subprocess.run(
-        [ROOT / ".venv/bin/rosrv"],
-        env=os.environ | {"_ROSRV_COMPLETE": "source_bash"},
-        capture_output=True,
-        check=True,
-    )
-    (completion / "rosrv").write_bytes(shown.stdout)
+    for shell, place in COMPLETIONS.items():
+        shown = subprocess.run(
+            [ROOT / ".venv/bin/rosrv"],
+            env=os.environ | {"_ROSRV_COMPLETE": f"source_{shell}"},
+            capture_output=True,
+            check=True,
+        )
+        (root / place).parent.mkdir(parents=True)
+        (root / place).write_bytes(shown.stdout)
 
 
 def _make_virtual(library: Path) -> None:
@@ -140,10 +146,10 @@ def _debian_folder(target: Path, moment: int) -> None:
         (target / f"rosrv.{name}").write_text(text.replace("@VERSIONS@", " ".join(INTERPRETERS)))
 
 
-def _missing_packages() -> list[str]:
+def _missing_packages(architectures: list[str]) -> list[str]:
     packages = [package for tool, package in _TOOLS.items() if shutil.which(tool) is None]
     foreign = ARCHITECTURES["arm64"].triplet
-    if shutil.which(f"{foreign}-gcc") is None:
+    if "arm64" in architectures and shutil.which(f"{foreign}-gcc") is None:
         packages += [f"gcc-{foreign.replace('_', '-')}", "libc6-dev-arm64-cross"]
     return packages
 
@@ -154,7 +160,7 @@ def main(arguments: list[str]) -> int:
     if unknown or not arguments:
         sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")
         return 2
-    if missing := _missing_packages():
+    if missing := _missing_packages(arguments):
         sys.stderr.write(f"package: tools are missing: sudo apt-get install {' '.join(missing)}\n")
         return 1
     if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
@@ -162,6 +168,10 @@ def main(arguments: list[str]) -> int:
         return 1
     moment = time_of_commit()
     for name in arguments:
+        sys.stdout.write(
+            f"package: building for {name}; dpkg's output is in build/package/{name}/build.log\n"
+        )
+        sys.stdout.flush()
         made = build(ARCHITECTURES[name], moment=moment)
         sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
     return 0

@@ -1,6 +1,7 @@
 """The shell completes names of the running appliance; without one it completes nothing, without an error."""
 
 import os
+import re
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -26,12 +27,13 @@ def appliance() -> Iterator[Appliance]:
             yield appliance
 
 
-def completed(words: str, state: str) -> list[str]:
-    """Return bash's completions of the last of these words."""
+def completed(words: str, state: str, shell: str = "bash") -> list[str]:
+    """Return the shell's completions of the last of these words."""
     place = len(words.split(" ")) - 1
     environment = {
-        **os.environ, "_ROSRV_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place),
-        "ROSRV_STATE": state,
+        **os.environ, "_ROSRV_COMPLETE": f"complete_{shell}", "ROSRV_STATE": state,
+        "COMP_WORDS": words, "COMP_CWORD": str(place),
+        "_TYPER_COMPLETE_ARGS": words, "_TYPER_COMPLETE_FISH_ACTION": "get-args",
     }  # fmt: skip
     done = subprocess.run([ROSRV], env=environment, capture_output=True, text=True, timeout=30, check=False)
     assert not done.stderr
@@ -45,6 +47,13 @@ def test_names_of_the_running_appliance(appliance: Appliance) -> None:
     assert completed("rosrv monitor disable x", state) == []
     assert "olga" in completed("rosrv token revoke ", state)
     assert completed("rosrv up --isolation n", state) == ["netns", "none"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_names_in_other_shells(appliance: Appliance, shell: str) -> None:
+    """zsh and fish complete the names of the running appliance as well."""
+    offered = " ".join(completed("rosrv monitor disable wo", str(appliance.state), shell))
+    assert re.findall(r"\bwords\b", offered) == ["words"]
 
 
 def test_nothing_where_no_appliance_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
