@@ -85,9 +85,9 @@ wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.w
 	$(BIN)/python -m hatchling build --target wheel
 	sed -n 's/^\([a-z0-9.-]*==[^ ]*\) .*/\1/p' requirements.lock > dist/rosrv_appliance-$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')-constraints.txt
 
-package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
+package: setup ## the Debian package of this machine's architecture, or of ARCH="amd64 arm64": dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package
-	$(BIN)/python -m distribution.deb amd64 arm64
+	$(BIN)/python -m distribution.deb $(or $(ARCH),$$(dpkg --print-architecture))
 
 image: setup ## the container image and the list of its parts: dist/rosrv-image_VERSION_ARCH.tar, .cdx.json
 	$(BIN)/python -m distribution.image $(ARGS)
@@ -97,7 +97,7 @@ site: setup ## all that a site without a network needs, in one archive: dist/ros
 
 release: ## everything anew, with provenance and checksums that KEY=FILE signs
 	rm -rf dist
-	$(MAKE) wheel package site
+	$(MAKE) wheel package site ARCH="amd64 arm64"
 	$(BIN)/python -m distribution.release "$(KEY)"
 
 bench: setup ## measure: every program in benchmarks/
