@@ -1,10 +1,12 @@
-"""Check the shipped alert rules with Prometheus's tool, and the scrape configuration with Prometheus itself."""
+"""Check the shipped alert rules, scrape configuration and dashboard queries with Prometheus's tool."""
 
+import json
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 
 FOLDER = Path(__file__).parents[2] / "examples" / "prometheus"
 
@@ -53,3 +55,19 @@ def test_the_cases_find_a_fault(tmp_path: Path, was: str, now: str) -> None:
     (tmp_path / "alerts.yaml").write_text(rules.replace(was, now))
     shutil.copy(FOLDER / "alerts.tests.yaml", tmp_path)
     assert promtool("test", "rules", "alerts.tests.yaml", folder=tmp_path).returncode != 0
+
+
+def test_the_queries_of_the_dashboard_are_valid(tmp_path: Path) -> None:
+    """Prometheus accepts the queries of Grafana's dashboard as rules, with Grafana's variables replaced."""
+    dashboard = json.loads((FOLDER.parent / "grafana/rosrv.json").read_text())
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", ())]
+    queries += [one["expr"] for one in dashboard["annotations"]["list"]]
+    rules = [
+        {"record": f"query:{number}", "expr": query.replace("$__rate_interval", "1m")}
+        for number, query in enumerate(queries)
+    ]
+    assert len(rules) > 20
+    file = tmp_path / "rules.yaml"
+    file.write_text(yaml.safe_dump({"groups": [{"name": "dashboard", "rules": rules}]}))
+    done = promtool("check", "rules", str(file))
+    assert done.returncode == 0, done.stdout + done.stderr
