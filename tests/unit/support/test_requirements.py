@@ -31,7 +31,7 @@ def test_an_unmet_requirement_fails_in_ci(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_make_test_needs_only_what_it_installs() -> None:
-    """On a fresh machine `make test` installs two lists of packages; a test that needs another belongs in tests/system."""
+    """`make test` installs two lists of packages; a test that needs another package belongs in tests/system."""
     lists = [(ROOT / name).read_text() for name in ("packages.txt", "packages-develop.txt")]
     installed = {line.partition("#")[0].strip() for text in lists for line in text.splitlines()}
     needed = {
