@@ -20,7 +20,7 @@ LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integratio
 LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py)
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
-.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
+.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-nodes system-namespaces test-package prove wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -65,6 +65,7 @@ test-system: ## the whole product: attacks, demo, tunnels, containers, a virtual
 	@scripts/setup --system
 	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(LONGEST_UNITS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
 	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers
+	$(MAKE) --no-print-directory system-nodes
 	$(MAKE) --no-print-directory system-namespaces
 
 system-machine:
@@ -74,7 +75,10 @@ system-containers:
 	$(PYTEST) $(CONTAINERS) --quiet --durations=5
 
 system-namespaces:
-	$(PYTEST) $(LONGEST_NODES) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	$(PYTEST) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+
+system-nodes: build/collected
+	$(PYTEST) $(LONGEST_NODES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system
