@@ -99,7 +99,7 @@ def test_messages_about_values_are_our_own(value: Any) -> None:
 
 
 def test_monitors_to_enable_as_a_list(file: Path) -> None:
-    """`enable` accepts a list of names; an entry that is not a name is a mistake with its line."""
+    """`enable` accepts a list of names; any other entry is a mistake at the line of `enable`."""
     file.write_text("enable: [speedLimit, zone]\n")
     assert resolve(file, {}, {}).enable == "speedLimit,zone"
     file.write_text("enable:\n  - speedLimit\n  - {zone: 1}\n")
