@@ -18,7 +18,7 @@ from typing import Any
 import reelay
 import rtamt
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FiniteProperty, Run
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from functools import partial
 
 from rosmop.check.sources import compiled_from
-from rosmop.fast.wasm_build import fast_path_of
+from rosmop.fast.build import fast_path_of
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 

@@ -7,7 +7,7 @@ that an unused api starts without it.
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from appliance.api.monitor_models import EventShown, PropertyShown
 from appliance.api.problems import Finding, ProblemError
@@ -15,7 +15,6 @@ from appliance.channel.answers.monitor_answers import Monitors
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.monitor import MonitorInstance
 
 _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
 
@@ -40,21 +39,59 @@ def refusal(error: str, findings: list[str]) -> ProblemError:
     )
 
 
+class Described(NamedTuple):
+    """A monitor's events and properties, the monitors whose variables it uses, and whether it is declared `hold`."""
+
+    events: list[EventShown]
+    properties: list[PropertyShown]
+    uses: list[str]
+    hold: bool
+
+
 class Compiler:
     """The compiler of the specifications in force; it keeps the last result, so repeated queries compile only once."""
 
     def __init__(self) -> None:
         self._last: tuple[int, MonitorSet] | None = None
 
-    def monitor(self, loaded: Monitors, name: str) -> MonitorInstance:
-        """Return a monitor of the loaded texts. Raises KeyError."""
+    def _set(self, loaded: Monitors) -> MonitorSet:
         if self._last is None or self._last[0] != loaded.revision:
             self._last = (loaded.revision, _compiled(loaded.files or {}, loaded.definitions or {}))
-        return self._last[1].monitor(name)
+        return self._last[1]
+
+    def described(self, loaded: Monitors, name: str) -> Described:
+        """Describe a monitor of the loaded texts. Raises KeyError."""
+        monitor = self._set(loaded).monitor(name)
+        events = [
+            EventShown(
+                name=event.name,
+                line=event.position.line,
+                topic=event.topic,
+                type=event.service_type or event.type,
+                part=event.part,
+                every=None if event.period_ns is None else event.period_ns / 1e9,
+            )
+            for event in monitor.code.events
+        ]
+        properties = [
+            PropertyShown(
+                logic=running.code.property.logic,
+                formula=running.code.property.formula.strip(),
+                categories=list(running.code.property.categories),
+                handled=list(running.code.order),
+                drawn=running.drawable,
+            )
+            for running in monitor.properties
+        ]
+        return Described(events, properties, sorted(monitor.code.uses), monitor.code.hold)
+
+    def picture(self, loaded: Monitors, name: str) -> str | None:
+        """Return the automata of a monitor's properties (SVG); None if no automaton is finite. Raises KeyError."""
+        return self._set(loaded).monitor(name).picture()
 
     def warnings(self, file: str) -> list[Finding]:
         """Return the warnings about a file of the last compilation."""
-        assert self._last is not None  # noqa: S101  callers compile by `monitor` first
+        assert self._last is not None  # noqa: S101  callers compile by `described` first
         return findings_of(
             [str(warning) for warning in self._last[1].warnings if warning.position.file == file]
         )
@@ -68,41 +105,3 @@ def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
 
     known = standard_definitions().extended(Definitions.from_files(definitions))
     return MonitorSet.of(compiled_from(files, known))
-
-
-def events_of(monitor: MonitorInstance) -> list[EventShown]:
-    """Return the events of a monitor."""
-    return [
-        EventShown(
-            name=event.name,
-            line=event.position.line,
-            topic=event.topic,
-            type=event.service_type or event.type,
-            part=event.part,
-            every=None if event.period_ns is None else event.period_ns / 1e9,
-        )
-        for event in monitor.code.events
-    ]
-
-
-def properties_of(monitor: MonitorInstance) -> list[PropertyShown]:
-    """Return the properties of a monitor."""
-    from rosmop.logics.picture import dot_of  # noqa: PLC0415  the compiler: see the head
-
-    return [
-        PropertyShown(
-            logic=code.property.logic,
-            formula=code.property.formula.strip(),
-            categories=list(code.property.categories),
-            handled=list(code.order),
-            drawn=dot_of([code.property]) is not None,
-        )
-        for code in monitor.code.properties
-    ]
-
-
-def picture_of(monitor: MonitorInstance) -> str | None:
-    """Return the automata of a monitor's properties (SVG); None if no automaton is finite."""
-    from rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
-
-    return svg_of([code.property for code in monitor.code.properties])

@@ -9,7 +9,7 @@ from msgspec.structs import asdict
 
 from appliance.api.access import Bearer
 from appliance.api.audit import LogReader
-from appliance.api.monitor_judgement import Compiler, events_of, findings_of, picture_of, properties_of
+from appliance.api.monitor_judgement import Compiler, Described, findings_of
 from appliance.api.monitor_models import Happened, History, Monitor, Replaced
 from appliance.api.operation_routes import Answer, OperationCall
 from appliance.api.problems import ProblemError
@@ -48,10 +48,15 @@ class _Looking:
             raise unknown_monitor(name, loaded)
         return loaded, row
 
-    async def compiled(self, loaded: Monitors, name: str) -> Any:
-        """Compile a monitor."""
+    async def described(self, loaded: Monitors, name: str) -> Described:
+        """Compile and describe a monitor."""
         async with self._services.judging:
-            return await asyncio.to_thread(self.compiler.monitor, loaded, name)
+            return await asyncio.to_thread(self.compiler.described, loaded, name)
+
+    async def picture(self, loaded: Monitors, name: str) -> str | None:
+        """Compile and draw a monitor."""
+        async with self._services.judging:
+            return await asyncio.to_thread(self.compiler.picture, loaded, name)
 
 
 def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
@@ -69,17 +74,17 @@ def routes(services: Services) -> Routes:
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
         """One monitor: state, counters, the text of its file, its events and properties."""
         loaded, state = await looking.state(bearer, name)
-        found = await looking.compiled(loaded, name)
+        found = await looking.described(loaded, name)
         shown = Monitor(
             **asdict(state),
             revision=loaded.revision,
             tag=loaded.tag,
             text=(loaded.files or {})[state.file],
-            alphabet=events_of(found),
-            properties=properties_of(found),
+            alphabet=found.events,
+            properties=found.properties,
             warnings=looking.compiler.warnings(state.file),
-            uses=sorted(found.code.uses),
-            hold=found.code.hold,
+            uses=found.uses,
+            hold=found.hold,
         )
         return tagged(shown)
 
@@ -87,7 +92,7 @@ def routes(services: Services) -> Routes:
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
         """Return the automata of its properties (SVG); 404 when it has none that is finite."""
         loaded, _state = await looking.state(bearer, name)
-        drawn = await asyncio.to_thread(picture_of, await looking.compiled(loaded, name))
+        drawn = await looking.picture(loaded, name)
         if drawn is None:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")

@@ -69,17 +69,10 @@ def header(definitions: Definitions) -> OwnHeaderStated:
 
 
 def _words(event: MonitorEvent) -> tuple[int, str]:
-    """Return the level and the text of a report. Level 0 means that the report is not for `/rosout`.
-
-    The text of a report with only a count contains the level or category.
-    """
+    """Return the level and the text of a report. Level 0 means that the report is not for `/rosout`."""
     text, level, category = event.text, event.detail.get("level"), event.detail.get("category")
-    if event.count and event.kind == "log":
-        level, _, text = text.partition(" ")
-    elif event.count:
-        category = text.rpartition(" ")[2]
     if event.count:
-        text = f"{event.count} more in the same second: {text}"
+        text = f"{event.count} more in the same second" + (f": {text}" if text else "")
     if event.kind == "log":
         return _LEVELS.get(str(level), INFO), text
     if event.kind == "fault":

@@ -53,7 +53,7 @@ class DataPlane:
             loop,
             self._reporter,
             budget=limits.budget / 1000,
-            publish=lambda published: self._publish(published.topic, published.data),
+            publish=self._publish,
             changed=self._monitors_changed,
             holder=self._holder,
             payer=self._table.payer,

@@ -223,7 +223,8 @@ def _join(touched: Mapping[str, Iterable[Resource]], checked: CheckedSpecificati
     for file, resources in touched.items():
         for resource in resources:
             join(owner.setdefault(resource, file), file)
-    for name, others in checked.uses.items():
+    for names in checked.sharing:
+        first, *others = (checked.monitors[name] for name in names)
         for other in others:
-            join(checked.monitors[name], checked.monitors[other])
+            join(first, other)
     return list({id(files): files for files in group.values()}.values())

@@ -11,13 +11,10 @@ from appliance.specifications.specification_files import (
     checked,
     require_bounded,
 )
-from rosmop.certify.properties import DEFECT, certificates_of
-from rosmop.certify.steps import StepDiffersError
 from rosmop.check.sources import compiled_from
-from rosmop.fast.serialization import decoded, encoded, encoded_part
-from rosmop.fast.wasm_build import part_of
+from rosmop.fast.build import ModuleDefectError, certified, parts_of
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
@@ -41,13 +38,11 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
         monitors = MonitorSet.of(compiled_from(files, definitions))
+        certificates, data = certified(monitors.compiled)
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
         raise SpecificationsRefusedError([f"msg/{error}"]) from error
-    certificates, wrong = certificates_of(monitors.monitors)
-    if wrong:
-        raise SpecificationsRefusedError([str(finding) for finding in wrong])
     topics, services = (
         {
             monitor.name: frozenset(
@@ -68,10 +63,10 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         tuple(str(warning) for warning in monitors.warnings),
         types,
         {name: definitions.full_text(name) for name in types.values()},
-        {monitor.name: monitor.code.uses for monitor in monitors.monitors},
+        tuple(map(frozenset, monitors.compiled.groups(monitors.names))),
         {name: monitors.published_by(name) for name in files},
         certificates,
-        _bounded(encoded(monitors.compiled)),
+        _bounded(data),
         _places(monitors),
     )
 
@@ -90,12 +85,10 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
     """Return the parts of a set (`Contents.compiled`) for these relays. Raises `SpecificationsRefusedError`."""
-    whole = decoded(compiled)
     try:
-        return [_bounded(encoded_part(part_of(whole, names.monitors, names.shadows))) for names in wanted]
-    except StepDiffersError as error:
-        text = f"the code of a step differs from its automaton: {error}; {DEFECT}"
-        raise SpecificationsRefusedError([text]) from error
+        return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
+    except ModuleDefectError as error:
+        raise SpecificationsRefusedError([str(error)]) from error
 
 
 def _bounded(data: bytes) -> bytes:

@@ -208,13 +208,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             raise UnknownMonitorError(self._unknown([name]))
         return self.checked.monitors[name]
 
-    @admin.answers(admin.MonitorRevisions)
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
         """Return all kept revisions, the newest first."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
-    @admin.answers(admin.MonitorRevisionWanted)
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
         """Return a revision with its texts. Raises `UnknownMonitorError`."""
         row = await self._find(request.revision)
@@ -229,7 +227,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     # --- changing ---
 
-    @admin.answers(admin.MonitorLoad, who=True)
     async def load(self, request: admin.MonitorLoad, who: str) -> Replacement:
         """Add these files, replacing files of the same names. Raises `SpecificationsRefusedError`.
 
@@ -245,7 +242,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             note, within = request.note or "loaded", request.confirm_within
             return await self._change(sources, who, who, note, within, shadow=shadow, forced=request.force)
 
-    @admin.answers(admin.MonitorTry, who=True)
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return the effects that a load would have. Raises the errors of `load`, and `DryRunUnderWayError`."""
         if who in self._attempting:
@@ -266,7 +262,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         files = following.difference(present)
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
-    @admin.answers(admin.MonitorReplace, who=True)
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replacement:
         """Replace the file of a monitor by a text. Raises `UnknownMonitorError`, and the errors of `load`."""
         file = self.file_of(request.name)
@@ -282,7 +277,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
         return await self.load(load, who)
 
-    @admin.answers(admin.MonitorReload, who=True)
     async def reload(self, request: admin.MonitorReload, who: str) -> Replacement:
         """Load the folder's files; other files stay in force, unless `prune` is set.
 
@@ -303,7 +297,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
             )
 
-    @admin.answers(admin.MonitorRemove, who=True)
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, given by their names or the names of their monitors.
 
@@ -328,7 +321,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
             return await self._change(sources, who, who, note, request.confirm_within)
 
-    @admin.answers(admin.MonitorRollback, who=True)
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """Bring a kept revision into force again (None: the previous revision; 0: no specifications).
 
@@ -339,7 +331,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
             return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
 
-    @admin.answers(admin.MonitorConfirm, who=True)
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
         async with self._changing(request.expected):
@@ -356,7 +347,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 await self.store.settled()
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
-    @admin.answers(admin.MonitorSwitch, who=True)
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
         """Enable or disable monitors, for `for_seconds` or until further notice; return the monitors that changed.
 
@@ -375,7 +365,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 raise SpecificationsRefusedError([text])
             return self._switched(await self._switch(request.names, request.enabled, who, seconds))
 
-    @admin.answers(admin.MonitorShadow, who=True)
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Put monitors into shadow mode, or from shadow mode into force; return the monitors that changed.
 
@@ -394,7 +383,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             names = await self._switch(request.names, SHADOW if request.shadow else True, who)
             return self._switched(names, self.rollout.began(names))
 
-    @admin.answers(admin.MonitorTrial, who=True)
     async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
         """Do the same as `shadow`; earlier versions used this name."""
         return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
@@ -463,7 +451,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             more=None if until is None else {"until": _moment(until)},
         )
 
-    @admin.answers(admin.MonitorResume, who=True)
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
         """Release the topics that these monitors hold; return the monitors that held their topics.
 

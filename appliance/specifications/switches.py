@@ -10,7 +10,6 @@ from collections.abc import Mapping
 
 from appliance.specifications.rollout import SHADOW, Switch
 from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
-from rosmop.form.connected_groups import sharing
 
 
 class Switches:
@@ -43,7 +42,7 @@ class Switches:
         """Return the states of these monitors; shadow mode extends to monitors that share variables with one in it."""
         states = {name: self._own(name) for name in checked.monitors}
         if SHADOW in states.values():
-            for group in sharing(checked.uses):
+            for group in checked.sharing:
                 if any(states[name] == SHADOW for name in group):
                     states |= {name: SHADOW for name in group if states[name] is True}
         return states
@@ -63,7 +62,7 @@ class Switches:
 
 def require_whole(states: Mapping[str, Switch], checked: CheckedSpecifications) -> None:
     """Raise `SpecificationsRefusedError` if monitors in force share variables with monitors in shadow mode."""
-    for group in sharing(checked.uses):
+    for group in checked.sharing:
         shadowed = sorted(name for name in group if states[name] == SHADOW)
         others = sorted(name for name in group if states[name] is True)
         if shadowed and others:

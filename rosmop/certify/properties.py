@@ -6,10 +6,10 @@ This is the only module that passes results of the logics' compilers to the cert
 from collections.abc import Iterable
 
 from rosmop.certify.check import AutomatonTables, Certificate, certify
-from rosmop.form.positions import Diagnostic
+from rosmop.form.compiled import SpecificationCode
+from rosmop.form.findings import Diagnostic
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
 from rosmop.logics.tfsm import TimedStateMachine
-from rosmop.run.monitor import MonitorInstance
 
 DEFECT = "this is a defect of the monitor compiler, and nothing is loaded; report it with the specification"
 
@@ -24,14 +24,16 @@ def certificate_of(compiled: CompiledProperty) -> Certificate:
     return certify(compiled.logic, compiled.formula, compiled.events, tables)
 
 
-def certificates_of(monitors: Iterable[MonitorInstance]) -> tuple[dict[str, list[str]], list[Diagnostic]]:
-    """Return a line for each property of each monitor, and an error for each wrong automaton."""
+def certificates_of(
+    specifications: Iterable[SpecificationCode],
+) -> tuple[dict[str, list[str]], list[Diagnostic]]:
+    """Return a line for each property of each specification, and an error for each wrong automaton."""
     lines: dict[str, list[str]] = {}
     wrong: list[Diagnostic] = []
-    for monitor in monitors:
-        mine = lines.setdefault(monitor.name, [])
-        for running in monitor.properties:
-            compiled = running.code.property
+    for specification in specifications:
+        mine = lines.setdefault(specification.name, [])
+        for declared in specification.properties:
+            compiled = declared.property
             certificate = certificate_of(compiled)
             mine.append(f"{compiled.logic}: {certificate.text}")
             if certificate.wrong:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from rosmop.form.findings import Position
 from rosmop.form.nodes import Expression, acts
-from rosmop.form.positions import Position
 from rosmop.types.value_types import Type
 
 

@@ -15,7 +15,7 @@ from rosmop.check.assignables import (
 )
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.text.errors import SpecificationError
+from rosmop.form.findings import SpecificationError
 from rosmop.types import value_types
 
 

@@ -14,9 +14,8 @@ from rosmop.check.print_statements import OutputStream, formatted
 from rosmop.check.scope import ConstantReference, FunctionScope, HelperFunction
 from rosmop.check.standard_functions import LIBRARY, Arguments, find_function
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
 from rosmop.types.messages import nearest, shown

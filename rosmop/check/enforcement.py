@@ -5,11 +5,11 @@ from dataclasses import replace
 
 from rosmop.check.function_bodies import topics_of
 from rosmop.check.scope import SpecificationNames
+from rosmop.form.findings import SpecificationError
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.pattern import ENFORCED, TimedPattern
 from rosmop.logics.property_lint import TIME, VerdictGraph, graph_of, shortest_trace_to
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import nearest, shown
 
 _TAKES = {

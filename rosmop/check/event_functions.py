@@ -16,11 +16,10 @@ from rosmop.check.slicing import acts, binds, creates
 from rosmop.check.statements import check_topic, write
 from rosmop.form import nodes
 from rosmop.form.compiled import EventCode
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.form.sites import Site
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import UnknownNameError, nearest, shown
 from rosmop.types.resolve import resolve

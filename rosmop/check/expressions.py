@@ -20,12 +20,11 @@ from rosmop.check.margins import noted
 from rosmop.check.scope import FunctionScope
 from rosmop.check.standard_functions import CONSTANTS
 from rosmop.form import nodes
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.run.interpreter import constant_of
 from rosmop.runtime.action_context import FaultError
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve

@@ -9,8 +9,8 @@ from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction
 from rosmop.check.slicing import check_own
 from rosmop.check.statements import initial, known, write
 from rosmop.form import nodes
+from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve

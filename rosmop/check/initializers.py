@@ -3,8 +3,8 @@
 from rosmop.check.conversion import convert
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
+from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 

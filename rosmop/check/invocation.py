@@ -7,8 +7,7 @@ from rosmop.check.assignments import mark, marked, require_place, store
 from rosmop.check.conversion import convert, number
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
-from rosmop.text.errors import SpecificationError
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.types import value_types
 
 

@@ -5,10 +5,10 @@ length are computed for each message, once for all fields that need them.
 """
 
 from rosmop.form import nodes
+from rosmop.form.findings import SpecificationError
 from rosmop.form.nodes import Spot
 from rosmop.form.sites import Symbols
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes, UnknownNameError
 from rosmop.types.value_types import Type

@@ -8,10 +8,9 @@ from rosmop.check.order import settled
 from rosmop.check.scope import FunctionScope, LoopScope
 from rosmop.check.vector_members import element_value
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.runtime.numbers import wrap
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.resolve import resolve
 from rosmop.types.value_types import Type

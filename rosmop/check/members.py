@@ -9,9 +9,8 @@ from rosmop.check.conversion import check_convertible, constant_value, convert
 from rosmop.check.invocation import MemberCall, Method
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.runtime.numbers import f32
-from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
 from rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown

@@ -11,10 +11,10 @@ from rosmop.check.conversion import convert
 from rosmop.check.locate import FieldLocator, MessageCursor
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
+from rosmop.form.findings import SpecificationError
 from rosmop.form.nodes import Spot
 from rosmop.runtime.values import struct_code, struct_size
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 

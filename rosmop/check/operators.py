@@ -5,8 +5,7 @@ from rosmop.check.assignables import Value
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
-from rosmop.text.errors import SpecificationError
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 

@@ -10,9 +10,8 @@ from rosmop.check.assignables import Value
 from rosmop.check.conversion import convert, number
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 
 _CONVERSION = re.compile(rb"%([-+ #0]*)(\*|[0-9]*)(?:\.(\*|[0-9]*))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)

@@ -9,11 +9,10 @@ from typing import Literal
 from rosmop.check.assignables import Value, Variable
 from rosmop.form import nodes
 from rosmop.form.compiled import Comparison, Publication
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.form.sites import Site, SiteVariable, Symbols
 from rosmop.runtime.values import ValueCodec
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes, nearest, shown

@@ -10,12 +10,11 @@ from rosmop.check.assignables import Variable
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.form import nodes
 from rosmop.form.compiled import EventCode, PropertyCode, Slicing
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.past_monitors import PastProperty
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
 from roswire.definitions import Definitions
 

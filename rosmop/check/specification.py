@@ -23,12 +23,11 @@ from rosmop.check.slicing import check_parameters, declare_parameters, slicing_o
 from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
 from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import MessageTypes, nearest, shown
 from roswire.definitions import Definitions
 

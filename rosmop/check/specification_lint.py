@@ -6,7 +6,7 @@ from typing import Protocol
 
 from rosmop.check.call_expressions import stream_of
 from rosmop.form.compiled import EventCode, PropertyCode
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic
 from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.interface import Categories, ClockedProperty, CompiledProperty, FiniteProperty
 from rosmop.logics.property_lint import analyse

@@ -10,9 +10,8 @@ from rosmop.check.conversion import convert, number, require_number
 from rosmop.check.print_statements import formatted
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.runtime import numbers, strings
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 
 

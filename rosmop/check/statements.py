@@ -14,10 +14,9 @@ from rosmop.check.expressions import assignment
 from rosmop.check.initializers import converted, elements
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.runtime import numbers
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import record, resolve

@@ -8,8 +8,7 @@ from rosmop.check.assignables import ElementLvalue, Value
 from rosmop.check.conversion import constant_value, convert, number
 from rosmop.check.invocation import MemberCall, Method, empty, length
 from rosmop.form import nodes
-from rosmop.form.positions import Position
-from rosmop.text.errors import SpecificationError
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.types import value_types
 
 

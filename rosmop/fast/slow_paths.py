@@ -7,7 +7,7 @@ from rosmop.fast.batch_codegen import written_of
 from rosmop.fast.memory_layout import NotCompiledError
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 

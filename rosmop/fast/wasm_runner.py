@@ -44,8 +44,8 @@ from rosmop.run.explain import ClockedSteps, Exits
 from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NextDue
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, MonitorInstance, RunningProperty
-from rosmop.run.outcomes import Outcome, Verdict
-from rosmop.runtime.action_context import FUEL_PER_SECOND, Context, LogLine
+from rosmop.run.outcomes import FUEL_PER_SECOND, Outcome, Verdict
+from rosmop.runtime.action_context import Context, LogLine
 from rosmop.runtime.values import struct_code
 from rosmop.runtime.wire import Buffer
 from rosmop.types import value_types

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from rosmop.form import nodes
 from rosmop.form.connected_groups import channel_of, sharing
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position
 from rosmop.form.sites import Site, Symbols
 from rosmop.logics.interface import CompiledProperty
 from rosmop.types import value_types

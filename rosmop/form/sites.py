@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 

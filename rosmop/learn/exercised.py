@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.learn.recordings import RecordingSource
 from rosmop.logics.catalogue import LOGICS
 from rosmop.logics.fsm import FAIL, TIMEOUT, StateText, read_state_machine

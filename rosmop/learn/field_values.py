@@ -1,7 +1,7 @@
 """Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times are scalars, arrays of numbers are numpy arrays, and arrays of strings are lists. Only the
-length of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing.
+Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. Only the length
+of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing.
 The `seq` of headers is left out, because every publisher increments it automatically.
 """
 
@@ -9,19 +9,17 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
-
 from roswire.message_layout import ArrayPart, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
 
 MOST_ELEMENTS = 20_000
-"""Longer arrays are left out: a monitor that reads each of their elements would be too slow."""
+"""Longer arrays are represented by their length: a monitor that reads each of their elements would be too slow."""
 
 _LENGTH = struct.Struct("<I")
 _BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
 _NO_NUMBERS = frozenset({"time", "duration"})
 
-Value = Any  # float, int, bool, str, (seconds, nanoseconds), or an array of one of the first four
+Value = Any  # float, int, bool, str, (seconds, nanoseconds), a tuple of numbers, a list of strings
 _Part = Callable[[bytes, int, dict[str, Value]], int]
 
 
@@ -89,7 +87,7 @@ def _reader(part: FixedPart | StringPart | ArrayPart) -> _Part:
 def _fixed(part: FixedPart) -> _Part:
     scalars = [leaf for leaf in part.leaves if leaf.count is None and _wanted(leaf.path)]
     arrays = [
-        (leaf.path, leaf.offset, leaf.count, np.dtype("<" + PRIMITIVES[leaf.type][0]))
+        (leaf.path, leaf.offset, struct.Struct(f"<{leaf.count}{PRIMITIVES[leaf.type][0]}"))
         for leaf in part.leaves
         if leaf.count is not None and leaf.count <= MOST_ELEMENTS and _elements_read(leaf)
     ]
@@ -104,17 +102,15 @@ def _fixed(part: FixedPart) -> _Part:
         found = iter(unpack(data, position))
         for leaf, is_time in zip(scalars, times, strict=True):
             values[leaf.path] = (next(found), next(found)) if is_time else next(found)
-        for path, offset, count, kind in arrays:
-            values[path] = np.frombuffer(data, kind, count, position + offset)
+        for path, offset, layout in arrays:
+            values[path] = layout.unpack_from(data, position + offset)
         return position + part.size
 
     return read
 
 
 def _array(part: ArrayPart) -> _Part:
-    kind = (
-        np.dtype("<" + PRIMITIVES[part.type][0]) if _elements_read(part) and part.type != "string" else None
-    )
+    kind = PRIMITIVES[part.type][0] if _elements_read(part) and part.type != "string" else None
     nested = [_reader(inner) for inner in part.layout.parts] if part.layout is not None else []
 
     def read(data: bytes, position: int, values: dict[str, Value]) -> int:
@@ -129,10 +125,8 @@ def _array(part: ArrayPart) -> _Part:
                 texts.append(text)
             values[part.path] = texts
             return position
-        if kind is not None:
-            values[part.path] = np.frombuffer(data, kind, count, position) if count else np.empty(0, kind)
-        else:
-            values[part.path] = count
+        read_elements = kind is not None and count <= MOST_ELEMENTS
+        values[part.path] = struct.unpack_from(f"<{count}{kind}", data, position) if read_elements else count
         if part.element_size is not None:
             return _within(data, position + count * part.element_size)
         for _ in range(count):

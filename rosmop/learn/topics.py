@@ -1,11 +1,10 @@
 """Statistics of one topic: the intervals of its messages, and a series for each field."""
 
+import math
 import statistics
 from typing import Any
 
-import numpy as np
-
-from rosmop.learn.field_values import MOST_ELEMENTS, Fields
+from rosmop.learn.field_values import Fields
 from rosmop.learn.series import HighestValues, Series, ValueSeries
 
 MOST_SINGLE = 6
@@ -90,16 +89,16 @@ class TopicContent:
             kind = self.types[path]
             if kind in {"string", "bool"}:
                 self._add_set(path, value, window)
-            elif isinstance(value, tuple):
+            elif kind in {"time", "duration"}:
                 if path == "header.stamp":
                     self._add_stamp(value[0] + value[1] / 10**9, seconds, window)
-            elif kind == "length":
+            elif kind == "length" or (kind.endswith("[]") and isinstance(value, int)):
                 self._add_length(path, value, window)
             elif kind == "string[]":
                 self._add_length(path, len(value), window)
                 if len(value) <= MOST_SINGLE:
                     self._add_set(path, tuple(value), window)
-            elif isinstance(value, np.ndarray):
+            elif isinstance(value, tuple):
                 self._add_array(path, value, seconds, window)
             else:
                 if path not in self.numbers:
@@ -141,20 +140,18 @@ class TopicContent:
             self.lengths[path] = ValueSeries()
         self.lengths[path].add(length, window)
 
-    def _add_array(self, path: str, array: "np.ndarray[Any, Any]", seconds: float, window: int) -> None:
+    def _add_array(self, path: str, array: tuple[float, ...], seconds: float, window: int) -> None:
         self._add_length(path, len(array), window)
-        if len(array) > MOST_ELEMENTS:
-            return
         if len(array) <= MOST_SINGLE and len(self.lengths[path].windows) == 1:
             row = self.elements.setdefault(path, [Series(self._period) for _ in array])
-            for series, value in zip(row, array.tolist(), strict=True):
+            for series, value in zip(row, array, strict=True):
                 series.add(value, seconds, window)
         else:
             self.elements.pop(path, None)
         if path not in self.numbers:
             self.numbers[path] = Series(self._period)
-        finite = array[np.isfinite(array)] if array.dtype.kind == "f" else array
-        nan = bool(np.isnan(array).any()) if len(finite) < len(array) else False
-        infinite = bool(np.isinf(array).any()) if len(finite) < len(array) else False
-        low, high = (float(finite.min()), float(finite.max())) if len(finite) else (1.0, 0.0)
+        finite = array if math.isfinite(sum(array)) else [value for value in array if math.isfinite(value)]
+        nan = len(finite) < len(array) and any(map(math.isnan, array))
+        infinite = len(finite) < len(array) and any(map(math.isinf, array))
+        low, high = (float(min(finite)), float(max(finite))) if finite else (1.0, 0.0)
         self.numbers[path].add_array(low, high, nan, infinite, window)

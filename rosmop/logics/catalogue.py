@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position
 from rosmop.logics.cfg import compile_cfg
 from rosmop.logics.ere import compile_ere
 from rosmop.logics.fsm import compile_fsm

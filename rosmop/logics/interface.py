@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, Self
 
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position
 from rosmop.logics.automaton import Automaton
 
 Categories = tuple[str, ...]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
 
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic
 from rosmop.logics.interface import FormulaError, Source
 
 MAX_CHARACTERS = 100_000

@@ -18,19 +18,22 @@ Theory of operation:
 
 import sys
 import weakref
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import msgspec
+
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.connected_groups import channel_of
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
 from rosmop.run.execution import Asked, MonitorExecution, OnFault
 from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes
 from rosmop.run.interpreter import Interpreter
+from rosmop.run.margins import begin_margins, taken_margins
 from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, monitors_of
-from rosmop.run.outcomes import NOBODY, MessageSender, Outcome
+from rosmop.run.outcomes import NOBODY, SHADOW_BUDGET, Margin, MessageSender, Outcome
 from rosmop.run.slice_quota import HolderOf, no_holder
 from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
@@ -45,9 +48,9 @@ from rosmop.run.state import (
     types_of,
 )
 from rosmop.run.state_of_runs import StateTooLargeError
-from rosmop.run.state_of_slices import SliceParts
+from rosmop.run.state_of_slices import BUCKETS, SliceParts
 from rosmop.run.timers import Agenda, Patience
-from rosmop.runtime.action_context import SHADOW_BUDGET, Context
+from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
@@ -78,6 +81,69 @@ class ShadowCopy(NamedTuple):
         if self.part is None:
             return self.shadow.process(self.resource, self.data, self.time, sender)
         return self.shadow.process_service(self.resource, self.part, self.data, self.time, sender)
+
+
+class KeptGroup:
+    """A group of specifications, and its state as data that the caller keeps (`MonitorSet.kept_groups`).
+
+    The state is `base`; or `base` and newer `cells`, whose layout is `layout` and whose size is `size` (bytes). The
+    slices of parametric specifications are kept in parts, of the specifications in `part_names`.
+    """
+
+    def __init__(
+        self,
+        group: MonitorGroup,
+        variables: Mapping[str, Any],
+        types: Mapping[str, bytes],
+        slices: Sequence[tuple[str, SliceParts]],
+    ) -> None:
+        self._group, self._variables, self._types = group, variables, types
+        self._slices = [parts for _, parts in slices]
+        self.names = [monitor.name for monitor in group.monitors]
+        self.channels = group.channels
+        self.part_names = [name for name, _ in slices for _ in range(BUCKETS)]
+
+    @property
+    def layout(self) -> bytes:
+        """Return the layout of the cells (`CellNames` as MessagePack)."""
+        return msgspec.msgpack.encode(None if self._group.home is None else self._group.home.names)
+
+    @property
+    def size(self) -> int:
+        """Return the size of the cells in bytes; 0 without cells."""
+        return 0 if self._group.home is None else self._group.home.size
+
+    def cells(self) -> bytes | None:
+        """Return the cells if only they may have changed (empty: nothing has). None: keep `base` and the parts."""
+        if self._group.changed:
+            return None
+        return b"" if self._group.home is None else self._group.home.cells()
+
+    def base(self) -> bytes:
+        """Return the state as data. If the state is too large, return the reason why it is not saved."""
+        group = self._group
+        try:
+            data = encoded([
+                kept_monitor(monitor, self._variables, self._types[monitor.name]) for monitor in group.monitors
+            ])  # fmt: skip
+        except StateTooLargeError as error:
+            data = refused(str(error))
+        group.changed = False
+        if group.home is not None:
+            group.home.left = False
+        return data
+
+    def parts(self) -> list[bytes]:
+        """Return all parts."""
+        return [data for parts in self._slices for data in parts.all()]
+
+    def changed_parts(self) -> dict[int, bytes]:
+        """Return the parts that have changed since the last call, by number."""
+        return {
+            place * BUCKETS + number: data
+            for place, parts in enumerate(self._slices)
+            for number, data in parts.changed().items()
+        }
 
 
 class MonitorSet:
@@ -115,6 +181,7 @@ class MonitorSet:
         self.on_fault: OnFault = on_fault
         self.patience = patience
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices, holder_of)
+        begin_margins(self._monitors, self.interpreter.variables)
         self.groups = tuple(_groups(compiled, self._monitors))
         self._guards = guards(compiled)
         self._types = types_of(compiled)
@@ -296,6 +363,11 @@ class MonitorSet:
         for shadow in self.shadows:
             shadow.explain_when(shadowed, shadowed)
 
+    @staticmethod
+    def channel_of(service: str, part: str) -> str:
+        """Return what replaces a topic (of `lane`, `process_fast`) for the `request` or `response` of a service."""
+        return channel_of(service, part)
+
     @property
     def area(self) -> memoryview | None:
         """Return memory to receive frames in, so that lanes need no copy; None without lanes."""
@@ -329,6 +401,26 @@ class MonitorSet:
         monitor.move_to_python()
         return self.interpreter.variables[monitor.code.variables[variable]]
 
+    def take_margins(self) -> Iterator[Margin]:
+        """Yield the closest true and the closest false result of each comparison since the last call.
+
+        There are none unless the set was compiled with `margins`.
+        """
+        return taken_margins(self.monitors, self.interpreter.variables)
+
+    @staticmethod
+    def topics_of(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
+        """Return the topics and services on whose messages these monitors have events."""
+        return frozenset(
+            step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic
+        )
+
+    def replaced_topics(self, before: "MonitorSet | None") -> frozenset[str]:
+        """Return `topics_of` the monitors, of either set, that do not continue unchanged after `succeed`."""
+        earlier = before.monitors if before is not None else ()
+        kept = {monitor.name for monitor in earlier}.intersection(self.names) - set(self.began)
+        return self.topics_of(one for one in (*earlier, *self.monitors) if one.name not in kept)
+
     # Changes
 
     def start(
@@ -345,25 +437,12 @@ class MonitorSet:
             monitor.held = monitor.code.hold
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
-    def state_of(self, group: MonitorGroup) -> bytes:
-        """Return the state of a group as data. If the state is too large, return the reason why it is not saved."""
-        try:
-            states = [
-                kept_monitor(monitor, self.interpreter.variables, self._types[monitor.name])
-                for monitor in group.monitors
-            ]
-            data = encoded(states)
-        except StateTooLargeError as error:
-            data = refused(str(error))
-        group.changed = False
-        if group.home is not None:
-            group.home.left = False
-        return data
-
-    def slice_parts(self, group: MonitorGroup) -> list[tuple[str, SliceParts]]:
-        """Return, by name, the slices of a group's parametric specifications, to be saved in parts."""
-        sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
-        return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
+    def kept_groups(self) -> "list[KeptGroup]":
+        """Return the groups, to keep their state outside the process; from now on, changes of slices are noted."""
+        return [
+            KeptGroup(group, self.interpreter.variables, self._types, _slice_parts(group))
+            for group in self.groups
+        ]
 
     def recover(
         self, kept: Sequence[GroupSnapshot], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
@@ -653,6 +732,12 @@ class MonitorSet:
             return False
 
         return tap
+
+
+def _slice_parts(group: MonitorGroup) -> list[tuple[str, SliceParts]]:
+    """Return, by name, the slices of a group's parametric specifications, to be saved in parts."""
+    sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
+    return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
 
 
 def _groups(compiled: Compiled, monitors: Sequence[MonitorInstance]) -> Iterator[MonitorGroup]:

@@ -18,7 +18,7 @@ from functools import partial
 from math import inf
 from typing import Literal
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
 from rosmop.run.explain import Bound, of_slice

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Protocol
 from rosmop.form.compiled import Compiled
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import MonitorInstance
-from rosmop.run.outcomes import Outcome, Verdict
-from rosmop.runtime.action_context import FUEL_PER_SECOND, LogLine
+from rosmop.run.outcomes import FUEL_PER_SECOND, Outcome, Verdict
+from rosmop.runtime.action_context import LogLine
 from rosmop.runtime.wire import Buffer
 
 MESSAGE_FUEL = FUEL_PER_SECOND // 100

@@ -89,6 +89,13 @@ class RunningProperty:
     run: Run
     history: Exits | Steps
 
+    @property
+    def drawable(self) -> bool:
+        """Whether it has a finite automaton."""
+        from rosmop.logics.picture import dot_of  # noqa: PLC0415  only tools draw
+
+        return dot_of([self.code.property]) is not None
+
     def begin(self, time_ns: int) -> None:
         """Restart."""
         self.run = self.code.property.start(time_ns)
@@ -175,6 +182,12 @@ class MonitorInstance:
     def failing(self) -> bool:
         """Whether the monitor failed to start or has faulted often."""
         return self.broken or self.faults >= FAILING_AFTER
+
+    def picture(self) -> str | None:
+        """Return the automata of its properties (SVG); None if no automaton is finite."""
+        from rosmop.logics.picture import svg_of  # noqa: PLC0415  only tools draw
+
+        return svg_of([code.property for code in self.code.properties])
 
     def hold(self, why: str = "") -> None:
         """Drop messages of its topics until `resume`."""

@@ -1,17 +1,34 @@
-"""Outcomes of messages, ticks and deadlines, as values for the relay and for `rosmop run`."""
+"""Outcomes of messages, ticks and deadlines: as values, with their causes as data (for a record, the CLI and REST), and
+as lines of text. Also the margins of comparisons, and the bounds that a caller may state.
 
-from collections.abc import Mapping, Sequence
+Data about causes are limited in size, and use the words of the specification. `who` names the source of a message.
+"""
+
+import datetime
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Source
+from rosmop.run.subformulas import deciding
 from rosmop.runtime.action_context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 
+_EACH_END = 5
+"""The number of first events, and of last events, that are listed; the events between are only counted."""
+
 Result = Literal["passed", "changed", "dropped"]
+
+SHADOW_BUDGET = 100_000
+"""The maximum number of instructions of a specification in shadow mode for one message: some tens of milliseconds, for
+which other messages wait.
+"""
+
+FUEL_PER_SECOND = 1_500_000_000
+"""The number of a module's instructions that take about a second."""
 
 DROPPED = -1
 """The key of the drop in `Outcome.handling`."""
@@ -27,6 +44,9 @@ class MessageSender(NamedTuple):
     number: int = 0
     kind: int = 0
 
+
+Who = Callable[[int], Mapping[str, Any]]
+"""Returns data about a source (`MessageSender.source`)."""
 
 NOBODY = MessageSender()
 NO_NUMBER, SEQ = range(2)
@@ -164,3 +184,172 @@ class Outcome:
     def __repr__(self) -> str:
         told = {name: value for name, value in vars(self).items() if name != "buffer"}
         return f"Outcome({self.result}, {told})"
+
+
+class Margin(NamedTuple):
+    """The two sides of a comparison when they were closest, while it was true (`holds`) or while it was false.
+
+    `number` counts the monitor's comparisons in the order of the text. `threshold` is the constant side, 0 or 1 (None:
+    neither side is a constant).
+    """
+
+    monitor: str
+    number: int
+    position: Position
+    threshold: int | None
+    holds: bool
+    left: float
+    right: float
+
+    @property
+    def distance(self) -> float:
+        """Return the difference of the sides."""
+        return abs(self.left - self.right)
+
+    @property
+    def threshold_at(self) -> float | None:
+        """Return the constant at which the result would have changed; None if neither side is a constant."""
+        return None if self.threshold is None else (self.right, self.left)[self.threshold]
+
+
+def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """Return the causes of the drop of the message, with the position of the statement."""
+    return {
+        **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
+        **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),
+        **_led(outcome, who, outcome.handling.get(DROPPED)),
+    }
+
+
+def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """Return the causes of the change of the message, with the positions of the statements."""
+    return {
+        "changed_by": list(outcome.changed_by),
+        "at": [str(position) for position in outcome.changed_at],
+        **_led(outcome, who),
+    }
+
+
+def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
+    """Return the causes of a published message, with the position of the statement."""
+    message = outcome.published[number]
+    position = outcome.sites[message.site].position
+    return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
+
+
+def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
+    """Return the causes of the fault, its position, and the values of variables there."""
+    where = fault.position
+    return {
+        "file": where.file,
+        "line": where.line,
+        "column": where.column,
+        "text": fault.text,
+        "values": dict(fault.values),
+        "at": [str(where)],
+        **_led(outcome, who),
+    }
+
+
+def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
+    """Return the causes of the verdict, with the position of its property."""
+    return {
+        "property": verdict.property,
+        "logic": verdict.logic,
+        "category": verdict.category,
+        **({"binding": dict(verdict.binding)} if verdict.binding else {}),
+        "at": [str(verdict.source.origin)],
+        **_led(outcome, who),
+        **why_of(verdict, who),
+    }
+
+
+def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
+    """Return the events (or the timer), the conditions with the compared values, and the verdict whose handler
+    acted.
+    """
+    return {
+        "events": list(outcome.events),
+        **({"timer": outcome.timer} if outcome.timer is not None else {}),
+        **({"conditions": outcome.conditions} if outcome.looked else {}),
+        **({"handler": named(handled), **why_of(handled, who)} if handled is not None else {}),
+    }
+
+
+def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
+    """Return the field `why` of a verdict; empty if the explanation was not requested or is unknown."""
+    why = verdict.why
+    if why is None:
+        return {}
+    events = [_event(verdict, event, who) for event in why.events]
+    between = len(events) - 2 * _EACH_END
+    said: dict[str, Any] = {"events": events}
+    if between > 0:
+        said = {"events": [*events[:_EACH_END], *events[-_EACH_END:]], "left_out": between}
+    said["fewest"] = why.fewest
+    if why.since is not None:
+        said["since"] = moment(why.since)
+    decided = decided_by(verdict.source, why)
+    if decided:
+        said["decided"] = decided
+    return {"why": said}
+
+
+def moment(time_ns: int) -> str:
+    """Return a time in UTC, with microseconds."""
+    return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
+
+
+def _event(verdict: Verdict, happened: EventOccurrence, who: Who) -> dict[str, Any]:
+    event: dict[str, Any] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
+    event |= {"state": happened.state} if happened.state else {}
+    event |= who(happened.sender.source) if happened.sender.source else {}
+    return event | ({"seq": happened.sender.number} if happened.sender.kind == SEQ else {})
+
+
+def decided_by(source: Source, why: Explanation) -> list[str]:
+    """Return the subformulas that decide the formula at the last event, with their values; empty if earlier events
+    matter.
+    """
+    if why.since is not None:
+        return []
+    return deciding(source, [event.event for event in why.events], [event.time for event in why.events])
+
+
+def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each event of an explanation (`why_of`), and how far the events explain the verdict."""
+    events = _list(why.get("events"))
+    if not why:
+        return
+    if not events:
+        yield "because: no event was needed: time has passed"
+    between = why.get("left_out")
+    for number, event in enumerate(events):
+        if between and number == len(events) // 2:
+            yield f"because: … {between} more …"
+        yield f"because: {_named(event if isinstance(event, dict) else {})}"
+    if "since" in why:
+        yield (
+            f"but: this is enough only for the property as it was at {why['since']}; earlier events are not kept"
+        )
+    if why.get("fewest") is False:
+        yield "but: fewer of them might suffice"
+    for part in _list(why.get("decided")):
+        yield f"so: {part}"
+
+
+def _named(event: Mapping[str, Any]) -> str:
+    """Return one event: name, time, sender, and the state after it."""
+    index = f" #{event['index']}" if "index" in event else ""
+    seq = f" seq {event['seq']}" if "seq" in event else ""
+    who = "".join(
+        f", {word} {event[name]}"
+        for name, word in (("on", "on"), ("node", "by"), ("host", "on"))
+        if event.get(name)
+    )
+    state = f" -> {event['state']}" if event.get("state") else ""
+    return f"{event.get('event')}{index} at {event.get('time')}{who}{seq}{state}"
+
+
+def _list(value: object) -> list[Any]:
+    return value if isinstance(value, list) else []

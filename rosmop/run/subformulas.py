@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from rosmop.logics import mtl, ptcaret, ptltl
 from rosmop.logics.formula import Bounds, Formula, Syntax, nodes, read_formula
 from rosmop.logics.interface import Source
-from rosmop.run.outcomes import Explanation
 
 _SYNTAXES: dict[str, Syntax] = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}
 _BOOLEAN: dict[str, Callable[[list[bool]], bool]] = {
@@ -25,22 +24,21 @@ _MOST_EVENTS = 24
 _MOST = 8
 
 
-def deciding(source: Source, why: Explanation) -> list[str]:
+def deciding(source: Source, events: Sequence[int], times: Sequence[int]) -> list[str]:
     """Return the subformulas that decide the formula at the last event, with their values there.
 
-    The result is empty for other logics, for formulas about the future, and if earlier events also matter.
+    `events` are the numbers of the events in the source, `times` their times (ns). The result is empty for other
+    logics, and for formulas about the future.
     """
     syntax = _SYNTAXES.get(source.logic)
-    if syntax is None or why.since is not None or not 0 < len(why.events) <= _MOST_EVENTS:
+    if syntax is None or not 0 < len(events) <= _MOST_EVENTS:
         return []
     formula = read_formula(source, syntax)
     if any(node.operator in mtl.FUTURE for node in nodes(formula)):
         return []
     words = _Words(syntax)
-    meaning = Meaning(
-        [source.events[event.event] for event in why.events], [event.time for event in why.events]
-    )
-    last = len(why.events) - 1
+    meaning = Meaning([source.events[event] for event in events], times)
+    last = len(events) - 1
     found = [
         f"{words.text(part)} is {str(value).lower()}" for part, value in _decisive(meaning, formula, last)
     ]

@@ -17,12 +17,6 @@ from typing import Any, NamedTuple
 BUDGET = 1_000_000
 """The maximum number of instructions of a specification for one message."""
 
-SHADOW_BUDGET = 100_000
-"""The same for a specification in shadow mode: some tens of milliseconds, for which other messages wait."""
-
-FUEL_PER_SECOND = 1_500_000_000
-"""The number of a module's instructions that take about a second."""
-
 STEP = 250
 """Instructions between two readings of the processor time."""
 

@@ -8,13 +8,12 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from rosmop.check.sources import compiled_from
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome
 from rosmop.run.timers import Patience
 from rosmop.runtime.action_context import BUDGET
-from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 

@@ -10,7 +10,6 @@ from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.fast_path import FastLane
-from rosmop.run.margins import MarginReader
 from rosmop.run.outcomes import Verdict, named
 from rosmop.runtime.action_context import LogLine, Published
 from rosmop.tests.interpreted import beside
@@ -47,7 +46,6 @@ class BothWays:
         self.monitors = on_module(compiled_from(sources, definitions(), margins=margins), on_fault)
         self.interpreter = beside(self.monitors)
         for one in (self.monitors, self.interpreter):
-            MarginReader(one)
             one.start(0)
             for monitor in one.monitors:
                 monitor.seen = True

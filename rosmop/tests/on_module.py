@@ -2,7 +2,7 @@
 
 from collections.abc import Collection
 
-from rosmop.fast.wasm_build import fast_path_of
+from rosmop.fast.build import fast_path_of
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.run.timers import MAX_TICKS
@@ -16,7 +17,6 @@ from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications
 from rosmop.tests.random_specifications import definitions as random_definitions
 from rosmop.tests.reload import replaced
-from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 
 SECOND = 10**9

@@ -16,6 +16,7 @@ from rosmop.fast.batch_codegen import MAX_EFFECTS
 from rosmop.fast.codegen_access import MOST_TEXTS
 from rosmop.fast.memory_layout import LINES
 from rosmop.fast.wasm_runner import BEGINNING
+from rosmop.form.findings import SpecificationError
 from rosmop.run.outcomes import MessageSender, Outcome
 from rosmop.runtime.wire import Buffer
 from rosmop.tests.acting import message
@@ -26,7 +27,6 @@ from rosmop.tests.random_messages import RandomMessages, cuts, lies
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.tests.reload import replaced
 from rosmop.tests.transcripts import Case, cases, table
-from rosmop.text.errors import SpecificationError
 
 FEW = settings(max_examples=examples(90), suppress_health_check=list(HealthCheck))
 PROGRAMS = Path(__file__).parent / "programs.txt"

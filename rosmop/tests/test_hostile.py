@@ -6,10 +6,10 @@ import tracemalloc
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.action_context import BUDGET as BUDGET_SIZE
 from rosmop.tests.acting import act, definitions, load, message, refused, refused_action
-from rosmop.text.errors import SpecificationError
 
 PATIENCE = 20.0  # seconds of processor time; an endless loop would take longer
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
 from rosmop.form import nodes
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
-from rosmop.run.margins import MarginReader
 from rosmop.runtime.values import ValueCodec
 from rosmop.tests.acting import message
 from rosmop.tests.both_ways import state_of
@@ -20,7 +20,6 @@ from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
 from roswire.definitions import Definitions
@@ -33,8 +32,6 @@ FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthChec
 def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
     """Fail if the two ways differ for any of these messages, or in the variables at the end."""
     other, monitors = beside(given), on_module(given.compiled, given.on_fault)
-    for either in (monitors, other):
-        MarginReader(either)
     check_same(monitors.start(0), other.start(0))
     for number, (topic, body) in enumerate(traffic):
         time = number * step_ns

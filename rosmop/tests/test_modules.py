@@ -13,16 +13,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
+from rosmop.fast.build import part_of
 from rosmop.fast.serialization import decoded_part, encoded_part
-from rosmop.fast.wasm_build import part_of
 from rosmop.fast.wasm_instance import WasmError
 from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
-from rosmop.text.errors import SpecificationError
 
 FEW = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
 RULE = """
@@ -36,7 +36,7 @@ RULE = """
 }}"""
 PROGRAM = """
 import hashlib, sys
-from rosmop.fast.wasm_build import part_of
+from rosmop.fast.build import part_of
 from rosmop.fast.serialization import encoded_part
 from rosmop.tests.test_modules import compiled
 print(hashlib.sha256(encoded_part(part_of(compiled("b", "a"), ["a"], []))).hexdigest())

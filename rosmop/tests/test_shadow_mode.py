@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.logics.catalogue import LOGICS
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
@@ -15,7 +16,6 @@ from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
-from rosmop.text.errors import SpecificationError
 
 FEW = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
 PROPERTIES = {

@@ -328,7 +328,7 @@ def test_nan_is_one_binding() -> None:
 def test_the_automaton_of_a_slice_is_certified() -> None:
     """The automaton is the same as for the formula without parameters."""
     with_, without = (
-        certificates_of(load(one).monitors)[0]["goals"]
+        certificates_of(load(one).compiled.specifications)[0]["goals"]
         for one in (GOALS, GOALS.replace("goals(std::string id)", "goals()").replace("id.c_str()", '"x"'))
     )
     assert with_ == without

@@ -16,8 +16,8 @@ from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaEr
 from rosmop.run import explain
 from rosmop.run.engine import MonitorSet
 from rosmop.run.explain import ClockedSteps, Steps, history_of
-from rosmop.run.outcomes import NOBODY, SEQ, EventOccurrence, Explanation, MessageSender
-from rosmop.run.subformulas import Meaning, deciding
+from rosmop.run.outcomes import NOBODY, SEQ, EventOccurrence, Explanation, MessageSender, decided_by
+from rosmop.run.subformulas import Meaning
 from rosmop.tests.acting import definitions, message
 from rosmop.tests.logics.driving import compiled, seeded
 from rosmop.tests.logics.temporal import ARITY, BOOLEAN, Printer, draw
@@ -336,7 +336,7 @@ def test_sub_formulas_that_decide_a_formula() -> None:
     explanation = history.explain("violation")
     assert explanation is not None
     assert [one.event for one in explanation.events] == [0]
-    assert deciding(made.source, explanation) == ["a is true", "once[0ns,500ms] b is false"]
+    assert decided_by(made.source, explanation) == ["a is true", "once[0ns,500ms] b is false"]
 
 
 def test_an_old_event_is_explained_by_its_effect() -> None:
@@ -350,7 +350,7 @@ def test_an_old_event_is_explained_by_its_effect() -> None:
     assert [one.event for one in explanation.events] == [0]
     assert explanation.since is not None
     assert explanation.since > 2 * explain.KEPT
-    assert deciding(made.source, explanation) == []
+    assert decided_by(made.source, explanation) == []
 
 
 @pytest.mark.parametrize("between", [10, 1500])

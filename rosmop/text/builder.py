@@ -14,10 +14,9 @@ from typing import Any, TypeVar
 from lark import Token, Transformer_NonRecursive, v_args
 from lark.tree import Meta
 
-from rosmop.form.positions import Diagnostic, Position
+from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.text import tree
 from rosmop.text.complaints import FORBIDDEN
-from rosmop.text.errors import SpecificationError
 
 _T = TypeVar("_T", bound=tree.SyntaxNode)
 

@@ -9,11 +9,10 @@ from functools import lru_cache
 from lark import Lark, Token, Tree
 from lark.exceptions import UnexpectedInput, UnexpectedToken
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
 from rosmop.text.builder import TreeBuilder, check
 from rosmop.text.complaints import FORBIDDEN, RESERVED, describe, misplaced
-from rosmop.text.errors import SpecificationError
 from rosmop.text.grammar import GRAMMAR
 
 MAX_CHARACTERS = 128 * 1024

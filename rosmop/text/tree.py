@@ -7,7 +7,7 @@ is the tuple of its parts (`std::string` is `("std", "string")`).
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 
 
 @dataclass(frozen=True)

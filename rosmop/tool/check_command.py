@@ -7,11 +7,10 @@ from pathlib import Path
 from rosmop.certify.properties import certificates_of
 from rosmop.fast.slow_paths import slow_paths
 from rosmop.form.compiled import Compiled
-from rosmop.form.positions import Diagnostic
+from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.picture import dot_of, svg_of
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import explained, say_finding
 from rosmop.tool.specification_input import load
@@ -39,7 +38,7 @@ def check(
         )
     try:
         monitors = MonitorSet.of(load(program, files, folders))
-        certificates, wrong = certificates_of(monitors.monitors)
+        certificates, wrong = certificates_of(monitors.compiled.specifications)
         findings = [*wrong, *monitors.warnings]
     except SpecificationError as error:
         monitors, certificates = None, {}

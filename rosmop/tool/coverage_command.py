@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.table import Column
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import CoverageItem, covered
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from rosmop.tool.bag import RecordedBag, open_bag, refusals
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import read_definitions, read_specifications

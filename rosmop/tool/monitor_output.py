@@ -4,11 +4,9 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rosmop.form.positions import Diagnostic
-from rosmop.run.explanations import why_of
+from rosmop.form.findings import Diagnostic
 from rosmop.run.monitor import MonitorInstance
-from rosmop.run.outcomes import Fault, Outcome, Verdict, bound
-from rosmop.run.why_text import lines_of_why
+from rosmop.run.outcomes import Fault, Outcome, Verdict, bound, lines_of_why, why_of
 from rosmop.tool.terminal import say, say_json
 
 BILLION = 1_000_000_000

@@ -4,9 +4,9 @@ from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
-from rosmop.fast.wasm_build import fast_path_of
+from rosmop.fast.build import fast_path_of
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from rosmop.tool.bag import OutputBag, definitions_of, open_bag, refusals, replay
 from rosmop.tool.bounded_bag import BoundedReader
 from rosmop.tool.command_context import CommandContext

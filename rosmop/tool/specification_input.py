@@ -5,9 +5,8 @@ from pathlib import Path
 
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
 from rosmop.tool.command_context import CommandContext
 from roswire.definitions import Definitions

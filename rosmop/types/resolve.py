@@ -1,8 +1,7 @@
 """Resolve the type names of a specification."""
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes, UnknownNameError, nearest

@@ -27,29 +27,13 @@ def test_no_module_needs_one_that_needs_it(imports: dict[str, set[str]]) -> None
 
 
 PUBLIC = {
-    "certify.properties": "proofs of properties",
-    "certify.steps": "the steps of a module differ from the automata",
     "check.sources": "compiling texts",
-    "fast.abi": "what a relay runs of a set",
-    "fast.serialization": "sending it",
-    "fast.wasm_build": "making it",
-    "fast.wasm_instance": "loading the library of WebAssembly",
-    "fast.wasm_runner": "the fast path of `MonitorSet`",
-    "form.connected_groups": "specifications that belong together",
-    "form.positions": "places in a text",
-    "logics.picture": "drawing automata",
+    "fast.build": "certifying a set, and making the parts that relays run",
+    "fast.load": "loading such a part",
+    "form.findings": "errors of a text, and their positions",
     "run.engine": "`MonitorSet`",
-    "run.explanations": "why something came of a message",
     "run.fast_path": "lanes of the fast path",
-    "run.margins": "how close comparisons came in a replay",
-    "run.monitor": "a monitor and its state",
-    "run.outcomes": "what came of a message",
-    "run.slice_quota": "who is charged for slices",
-    "run.state": "keeping state",
-    "run.state_of_slices": "keeping the state of slices",
-    "run.why_text": "explanations as text",
-    "runtime.action_context": "what actions print and publish, and their bounds",
-    "text.errors": "what is wrong with a text",
+    "run.outcomes": "what came of a message, and why",
 }
 """The modules of the language that the appliance imports, besides those of the command (`rosmop.tool`)."""
 

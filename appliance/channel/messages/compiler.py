@@ -8,11 +8,11 @@ from appliance.channel.messages.message import Message
 class Contents(msgspec.Struct, frozen=True):
     """The contents of valid specifications: the monitors (name to file), and the topics that they use.
 
-    `uses` maps a monitor to the other monitors whose variables it uses. `published_by` maps a file to the topics that
-    it publishes. `types` maps a topic to its message type, and `texts` maps such a type to its full definition.
-    `certificates` has each property of a monitor, and whether its automaton was proved equal to its formula. `places`
-    maps a topic to its first position in the files (`file:line:column`). Each relay runs its part of `compiled`
-    (`PartsWanted`).
+    `sharing` has the groups of monitors that share variables, directly or indirectly. `published_by` maps a file to
+    the topics that it publishes. `types` maps a topic to its message type, and `texts` maps such a type to its full
+    definition. `certificates` has each property of a monitor, and whether its automaton was proved equal to its
+    formula. `places` maps a topic to its first position in the files (`file:line:column`). Each relay runs its part of
+    `compiled` (`PartsWanted`).
     """
 
     monitors: dict[str, str] = {}
@@ -22,7 +22,7 @@ class Contents(msgspec.Struct, frozen=True):
     warnings: tuple[str, ...] = ()
     types: dict[str, str] = {}
     texts: dict[str, str] = {}
-    uses: dict[str, frozenset[str]] = {}
+    sharing: tuple[frozenset[str], ...] = ()
     published_by: dict[str, frozenset[str]] = {}
     certificates: dict[str, list[str]] = {}
     compiled: bytes = b""

@@ -151,7 +151,7 @@ def load(
     Example: rosrv monitor load safe_zone.rv --shadow
     """
     from appliance.cli.monitor.sources_to_send import read_to_send  # noqa: PLC0415  slow to import
-    from rosmop.text.errors import SpecificationError  # noqa: PLC0415  as above
+    from rosmop.form.findings import SpecificationError  # noqa: PLC0415  as above
 
     try:
         sent = read_to_send(files, msg or [])

@@ -16,13 +16,10 @@ from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.monitor.recorder_input import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import say_json
 from rosmop.check.sources import compiled_from
-from rosmop.fast.wasm_build import fast_path_of
-from rosmop.form.connected_groups import sharing
-from rosmop.form.positions import Position, line_of
+from rosmop.fast.build import fast_path_of
+from rosmop.form.findings import Position, SpecificationError, line_of
 from rosmop.run.engine import MonitorSet
-from rosmop.run.margins import Margin, MarginReader
-from rosmop.run.outcomes import Outcome, bound
-from rosmop.text.errors import SpecificationError
+from rosmop.run.outcomes import Margin, Outcome, bound
 from rosmop.tool.bag import ReplayStep, definitions_of, open_bag, refusals, replay
 from rosmop.tool.bounded_bag import BoundedReader
 from rosmop.tool.monitor_output import BILLION, because
@@ -163,9 +160,8 @@ def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str
 def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
     """Enable only the chosen monitor and monitors that share variables with it; if None, enable all monitors."""
     if chosen is not None:
-        uses = {monitor.name: monitor.code.uses for monitor in monitors.monitors}
-        together = next(group for group in sharing(uses) if chosen in group)
-        monitors.switch({name: name in together for name in uses}, 0)
+        (together,) = monitors.compiled.groups([chosen])
+        monitors.switch({name: name in together for name in monitors.names}, 0)
     return monitors
 
 
@@ -204,13 +200,13 @@ class _Report:
 
     def of(self, monitors: MonitorSet, reader: BoundedReader, piece: Piece, topics: Sequence[str]) -> int:
         """Replay a recording, print its effects and return the number of messages."""
-        given, margins = 0, MarginReader(monitors)
+        given = 0
         with progress("replaying", lambda: reader.message_count, shares_screen=True) as report:
             for number, replayed in enumerate(replay(monitors, reader, None, topics, piece.span)):
                 given += replayed.topic is not None
                 for found in _found(replayed.outcome):
                     self._say(piece.name, replayed, found)
-                for margin in margins.take():
+                for margin in monitors.take_margins():
                     known = self._closest.get(key := (margin.position, margin.number, not margin.holds))
                     if known is None or margin.distance < known.margin.distance:
                         self._closest[key] = _Closest(

@@ -10,7 +10,7 @@ from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.in_force import say_replaced
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import say_diff, say_json, usage_error
 from rosmop.tool.terminal import say
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision (default: the one in force)")]
@@ -66,8 +66,7 @@ def diff(
     if appliance.as_json:
         say_json({"old": before, "new": later.revision, "lines": lines})
         raise typer.Exit(1 if lines else 0)
-    for line in lines:
-        say(line, {"+": "green", "-": "red"}.get(line[0], ""))
+    say_diff(lines)
     raise typer.Exit(1 if lines else 0)
 
 

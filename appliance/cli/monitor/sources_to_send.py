@@ -7,8 +7,7 @@ from pathlib import Path
 
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.specifications.specification_files import Sources, signatures_of
-from rosmop.form.positions import Position
-from rosmop.text.errors import SpecificationError
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications
 
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")

@@ -320,4 +320,6 @@ class ServiceClient:
 
 def _why(error: Exception) -> str:
     """Return the error without the address of the service's node: the client must not learn the address."""
-    return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no usable address")
+    return errno.errorcode.get(
+        (error.errno if isinstance(error, OSError) else None) or 0, "it has no usable address"
+    )

@@ -10,8 +10,10 @@ if TYPE_CHECKING:
     from rosmop.run.fast_path import BatchResult, FastLane
 
 
-_Count = tuple[int, int]
-"""The number of occurrences, and the time of the last one (nanoseconds)."""
+_Count = tuple[int, int, int]
+"""The number of occurrences, and the times of the first and the last one (nanoseconds)."""
+
+_NONE: _Count = (0, 0, 0)
 
 
 class FastPathCounts:
@@ -30,10 +32,10 @@ class FastPathCounts:
         """Count the messages that a walk dropped; return their number."""
         for number, count in enumerate(walked.dropped):
             if count:
-                self._dropped[number] = self._dropped[number][0] + count, time
+                self._dropped[number] = _more(self._dropped[number], count, time)
         for number, count in enumerate(walked.told):
             if count:
-                self._told[number] = self._told[number][0] + count, time
+                self._told[number] = _more(self._told[number], count, time)
         return sum(walked.dropped)
 
     def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
@@ -46,5 +48,9 @@ class FastPathCounts:
     def _clear(self) -> None:
         self.begun = False
         self.changed.clear()
-        self._dropped: list[_Count] = [(0, 0)] * len(self.lane.events)
-        self._told: list[_Count] = [(0, 0)] * len(self.lane.verdicts)
+        self._dropped: list[_Count] = [_NONE] * len(self.lane.events)
+        self._told: list[_Count] = [_NONE] * len(self.lane.verdicts)
+
+
+def _more(counted: _Count, count: int, time: int) -> _Count:
+    return counted[0] + count, counted[1] or time, time

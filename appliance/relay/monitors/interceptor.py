@@ -17,7 +17,7 @@ Invariants:
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -36,14 +36,11 @@ from appliance.relay.monitors.shadow import ShadowMonitors
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
-from rosmop.form.connected_groups import channel_of
 from rosmop.run.outcomes import MessageSender
-from rosmop.runtime.action_context import Published
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
     from rosmop.run.fast_path import BatchOptions, FastLane
-    from rosmop.run.monitor import MonitorInstance
     from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
@@ -61,8 +58,8 @@ class ServiceVerdict:
 class Interceptor:
     """The monitors of one relay.
 
-    `budget` is the most seconds of processor time that a message may take. `publish(published)` sends a message that a
-    monitor publishes. `changed(topics)` is called when monitors may want other topics; `topics` are those whose
+    `budget` is the most seconds of processor time that a message may take. `publish(topic, data)` sends a message that
+    a monitor publishes. `changed(topics)` is called when monitors may want other topics; `topics` are those whose
     messages may now be judged differently (None: all). For messages of a host, `holder(host)` is charged for the slices
     that they create, and `payer(host)` for their processor time.
     """
@@ -73,7 +70,7 @@ class Interceptor:
         reporter: Reporter,
         *,
         budget: float,
-        publish: Callable[[Published], None],
+        publish: Callable[[str, bytes], None],
         changed: Callable[[frozenset[str] | None], None],
         holder: Callable[[str], str] = str,
         payer: Callable[[str], str] = str,
@@ -105,7 +102,9 @@ class Interceptor:
         self._publish = publish
         self._keeper: StateKeeper | None = None
         self.observer = Observer(self.observations, self._published, self.senders)
-        self._shadow_observer = Observer(self.observations, lambda _published: None, self.senders, "shadow ")
+        self._shadow_observer = Observer(
+            self.observations, lambda _topic, _data: None, self.senders, "shadow "
+        )
         self.shadow = ShadowMonitors(loop, self.now, self._shadow_observer)
 
     def remember(self, keeper: StateKeeper) -> None:
@@ -162,7 +161,7 @@ class Interceptor:
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
         self.observer.report(outcome, NOWHERE)
         self.shadow.take(result, outcome)
-        anew = None if first else _topics(_replaced(before, result))
+        anew = None if first else result.replaced_topics(before)
         self._taken(message, began, anew)
 
     def _start_outcome(self, monitors: MonitorSet, now: int, *, restarted: bool) -> Outcome:
@@ -186,7 +185,7 @@ class Interceptor:
         if self.monitors is not None:
             both = (*self.monitors.monitors, *self.monitors.shadowed)
             switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
-            switched = _topics(self.monitors.switch(switches, self.now()))
+            switched = self.monitors.topics_of(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
             because = {one.name: one.why_held for one in self.monitors.monitors if one.why_held}
@@ -214,7 +213,7 @@ class Interceptor:
                 self.keep_all()
                 self.schedule()
                 self.shadow.schedule()
-                self._changed(_topics(switched))
+                self._changed(self.monitors.topics_of(switched))
 
     def resume(self, name: str) -> frozenset[str]:
         """Make a monitor release its held topics; return the topics."""
@@ -225,7 +224,7 @@ class Interceptor:
         for monitor in held:
             self.monitors.resume(monitor.name)
         self.keep_all()
-        return _topics(held)
+        return self.monitors.topics_of(held)
 
     # --- queries when something changes ---
 
@@ -289,9 +288,9 @@ class Interceptor:
         if self._keeper is not None:
             self._keeper.keep_all()
 
-    def _published(self, published: Published) -> None:
+    def _published(self, topic: str, data: bytes) -> None:
         self.keep_all()
-        self._publish(published)
+        self._publish(topic, data)
 
     # --- messages ---
 
@@ -317,7 +316,8 @@ class Interceptor:
             return ServiceVerdict(body)
         now, due = self.now(), self.monitors.next_due
         view = memoryview(body)
-        outcome = self._walked(self.monitors, point, channel_of(service, part), body, now)
+        channel = self.monitors.channel_of(service, part)
+        outcome = self._walked(self.monitors, point, channel, body, now)
         if outcome is None:
             self.invalidate_prepared()
             time_budget = self.time_budget(point)
@@ -334,7 +334,7 @@ class Interceptor:
                 self.shadow.wait(point, None)
         elif self.monitors.next_due != due:
             self.invalidate_prepared()
-        self.keep(channel_of(service, part))
+        self.keep(channel)
         self.observer.report(outcome, point)
         self.schedule()
         if outcome.result == "dropped":
@@ -370,8 +370,8 @@ class Interceptor:
     def _rows(self) -> list[MonitorRow]:
         if self.monitors is None:
             return []
-        rows = self.observer.rows(self.monitors.monitors, self.now())
-        return rows + self._shadow_observer.rows(self.monitors.shadowed, self.now())
+        rows = self.observer.rows(self.monitors, self.now())
+        return rows + self._shadow_observer.rows(self.monitors, self.now())
 
     def _walked(
         self, monitors: MonitorSet, point: ObservationPoint, way: str, body: bytes, now: int
@@ -430,19 +430,6 @@ class Interceptor:
             return
         self.keep_all()
         self.schedule()
-
-
-def _topics(monitors: Iterable[MonitorInstance]) -> frozenset[str]:
-    return frozenset(step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic)
-
-
-def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[MonitorInstance]:
-    """Return the monitors, of either set, that do not continue unchanged."""
-    earlier = before.monitors if before is not None else ()
-    kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in earlier} - set(
-        after.began
-    )
-    return [monitor for monitor in (*earlier, *after.monitors) if monitor.name not in kept]
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:

@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Union
 
 from appliance.channel.messages import SpecificationsStated
@@ -14,7 +14,6 @@ from appliance.relay.loop import READ, EventLoop
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
-    from rosmop.run.slice_quota import HolderOf
 
 _SWITCH_SECONDS = 0.0005  # the longest time that the loop waits for the loading thread
 
@@ -29,7 +28,10 @@ class Loader:
     """
 
     def __init__(
-        self, loop: EventLoop, done: Callable[[SpecificationsStated, Result], None], holder_of: "HolderOf"
+        self,
+        loop: EventLoop,
+        done: Callable[[SpecificationsStated, Result], None],
+        holder_of: Callable[[int], Hashable],
     ) -> None:
         self._loop = loop
         self._holder_of = holder_of
@@ -84,7 +86,7 @@ class Loader:
             self._begin()
 
     @staticmethod
-    def load(message: SpecificationsStated, holder_of: "HolderOf") -> Result:
+    def load(message: SpecificationsStated, holder_of: Callable[[int], Hashable]) -> Result:
         """Return the monitors of these specifications, or the errors."""
         try:
             from appliance.relay.monitors import monitor_sets  # noqa: PLC0415  half a second of a small machine

@@ -3,34 +3,32 @@
 import functools
 import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 import msgspec
 
 from appliance.channel.messages import SpecificationsStated
-from rosmop.fast.abi import SetPart
-from rosmop.fast.serialization import decoded_part
-from rosmop.fast.wasm_instance import load
-from rosmop.fast.wasm_runner import WasmFastPath
+from rosmop.fast import load
 from rosmop.run.engine import MonitorSet
-from rosmop.run.slice_quota import HolderOf
 
 _TICKS_SECONDS = 0.2  # seconds of processor time that ticks and deadlines may take at once
 _SHADOW_TICKS_SECONDS = 0.02
 _DEADLINES = 100  # deadlines of slices that are processed at once: some milliseconds
 
 
-def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> MonitorSet | list[str]:
+def monitor_set(
+    message: SpecificationsStated, holder_of: Callable[[int], Hashable]
+) -> MonitorSet | list[str]:
     """Return the set of monitors of these specifications, or the reasons why there is none."""
     try:
-        part = decoded_part(message.part) if message.part else SetPart.empty()
+        compiled, fast = load.loaded(message.part)
     except msgspec.MsgspecError as error:
         return [f"control's specifications cannot be decoded: {error}"]
     return MonitorSet.of(
-        part.compiled,
+        compiled,
         message.on_fault,
         _patience,
-        fast=WasmFastPath(part.module),
+        fast=fast,
         shadows=message.shadows,
         shadow_patience=lambda: _patience(_SHADOW_TICKS_SECONDS),
         slices=message.slices,
@@ -42,7 +40,7 @@ def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> MonitorSe
 @functools.cache
 def prepare() -> None:
     """Load the WebAssembly library, and exclude its objects from garbage collection, which would delay messages."""
-    load()
+    load.prepare()
     gc.freeze()
 
 

@@ -2,9 +2,11 @@
 counts.
 
 Invariants:
-- For each monitor, kind and distinction (the category of a verdict, the text of a log line), one event a second is
-  reported in full. The others of that second become one event with a count, whose detail holds what they have in
-  common. Counts are complete.
+- For each monitor, kind and distinction (the category of a verdict, the text of a log line without its numbers), one
+  event a second is reported in full. The others of that second become one event with a count, whose detail holds what
+  they have in common. Counts are complete.
+- The event with a count has the last text, if the texts differ at most in numbers, and the first and last text in its
+  detail if they differ. It has no text if the words differ or a text is unknown.
 - Each full report gives the sender of the message (caller id and host), and the message's number in its publication.
 - The number of distinctions is bounded (`_DISTINCT`); beyond it, events are counted under the kind alone.
 - Counters are sent after the events that they count. Once a second, counters without a reported event are sent as well.
@@ -13,9 +15,11 @@ Invariants:
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
+from appliance.base.varying_numbers import without_numbers
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.observation_points import ObservationPoint, ObservedMessage
@@ -24,7 +28,9 @@ from appliance.relay.report import Reporter
 SHOWN = 1024
 """The most bytes reported of a message, before and after a change."""
 
-_TEXT = 4096
+LONGEST_TEXT = 4096
+"""The most characters reported of a text."""
+
 _DISTINCT = 100
 _KEPT = 10_000
 _AT_ONCE = 200  # events in one message
@@ -38,6 +44,44 @@ _Key = tuple[str, str, str, str, str, str]
 """Kind, monitor, key of the incarnation, resource, host, distinction: clients of one host are counted together."""
 
 
+@dataclass(slots=True)
+class _Repeated:
+    """The events of a key in this second since the first one: their number, their times, what they have in common.
+
+    `first_time` is 0 if it is unknown. `caller_id` is empty if there were several callers.
+    """
+
+    caller_id: str
+    shared: Mapping[str, Any]
+    count: int = 0
+    first_time: int = 0
+    last_time: int = 0
+    first_text: str = ""
+    last_text: str = ""
+    alike: bool = True
+
+    def add(self, count: int, first_time: int, last_time: int, text: str) -> None:
+        """Count further events; `text` is that of the last one, empty if unknown."""
+        if not self.count:
+            self.first_time, self.first_text = first_time, text
+        else:
+            self.first_time = min(self.first_time, first_time)
+            self.alike = self.alike and (
+                text == self.last_text or without_numbers(text) == without_numbers(self.last_text)
+            )
+        self.count += count
+        self.last_time, self.last_text = max(last_time, self.last_time), text
+
+    def detail(self) -> dict[str, Any]:
+        """Return what the events have in common, their first and last time, and their first and last text if known."""
+        found = dict(self.shared)
+        if self.first_time:
+            found |= {"first_time": self.first_time, "last_time": self.last_time}
+        if self.alike and self.first_text != self.last_text:
+            found |= {"first_text": self.first_text, "last_text": self.last_text}
+        return found
+
+
 class Observations:
     """The events of monitors, sent in batches; `rows()` returns the counters of all monitors."""
 
@@ -45,11 +89,8 @@ class Observations:
         self._loop = loop
         self._reporter = reporter
         self._rows = rows
-        self._told: dict[_Key, int] = {}
+        self._told: dict[_Key, _Repeated] = {}
         self._distinct: dict[tuple[str, str], int] = {}
-        self._callers: dict[_Key, str] = {}
-        self._last: dict[_Key, int] = {}
-        self._shared: dict[_Key, Mapping[str, Any]] = {}
         self._waiting: deque[MonitorEvent] = deque()
         self._lost = 0
         self._timer: LoopTimer | None = None
@@ -64,6 +105,7 @@ class Observations:
         text: str,
         *,
         distinction: str = "",
+        only_number: bool = False,
         shared: Mapping[str, Any] = _NOTHING,
         detail: Mapping[str, Any] | None = None,
         before: bytes = b"",
@@ -73,16 +115,15 @@ class Observations:
     ) -> None:
         """Note an event at `point`, concerning the `observed` message.
 
-        `shared` is the detail for the count of further events with this distinction.
+        `shared` is the detail for the count of further events with this distinction. With `only_number`, that count has
+        no text, as that of `add` without one.
         """
-        text = text[:_TEXT]
-        key = self._known(kind, monitor, point, distinction, shared)
-        self._said(key, point)
-        if key in self._told:
-            self._told[key] += 1
-            self._last[key] = time
+        text = text[:LONGEST_TEXT]
+        repeated = self._repeated(kind, monitor, point, distinction)
+        if repeated is not None:
+            repeated.add(1, time, time, "" if only_number else text)
             return
-        self._told[key] = 0
+        self._begin(kind, monitor, point, distinction, shared)
         plain = _plain({**(detail or {}), **(observed.detail() if observed is not None else {})})
         self._add(
             MonitorEvent(
@@ -109,14 +150,19 @@ class Observations:
         time: int,
         count: int,
         *,
+        text: str = "",
+        first: int = 0,
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
-        """Add `count` events, the last of them at this time, and report only their number."""
-        key = self._known(kind, monitor, point, distinction, shared)
-        self._said(key, point)
-        self._told[key] = self._told.get(key, 0) + count
-        self._last[key] = max(time, self._last.get(key, 0))
+        """Add `count` events, the last of them at this time, and report only their number.
+
+        `first` is the time of the first one, 0 if unknown; `text` is empty if the texts are unknown.
+        """
+        repeated = self._repeated(kind, monitor, point, distinction)
+        if repeated is None:
+            repeated = self._begin(kind, monitor, point, distinction, shared)
+        repeated.add(count, first, time, text)
 
     def was_reported(self, kind: str, monitor: str, point: ObservationPoint, distinction: str = "") -> bool:
         """Whether such an event was already reported in this second, so the next one is only counted."""
@@ -124,13 +170,10 @@ class Observations:
 
     def tick(self) -> None:
         """Send the counts of this second, and the state of the monitors if it changed."""
-        for key, count in self._told.items():
-            if count:
-                self._add(self._count_of(key, count))
+        for key, repeated in self._told.items():
+            if repeated.count:
+                self._add(_count_of(key, repeated))
         self._told.clear()
-        self._callers.clear()
-        self._last.clear()
-        self._shared.clear()
         self._distinct.clear()
         self.tell_counters()
 
@@ -139,41 +182,29 @@ class Observations:
         self._counted = []
         self.flush()
 
-    def _count_of(self, key: _Key, count: int) -> MonitorEvent:
-        kind, monitor, owner, resource, host, distinction = key
-        return MonitorEvent(
-            kind,
-            monitor,
-            owner,
-            resource,
-            self._last[key],
-            distinction,
-            _plain(self._shared.get(key, _NOTHING)),
-            count=count,
-            host=host,
-            caller_id=self._callers[key],
-        )
-
-    def _said(self, key: _Key, point: ObservationPoint) -> None:
-        """Note the sender; a count for several clients of a host names none of them."""
-        if self._callers.setdefault(key, point.caller_id) != point.caller_id:
-            self._callers[key] = ""
-
     def _key(self, kind: str, monitor: str, point: ObservationPoint, distinction: str) -> _Key:
-        key = (kind, monitor, *point[:3], distinction[:_TEXT])
+        key = (kind, monitor, *point[:3], distinction[:LONGEST_TEXT])
         beyond = key not in self._told and self._distinct.get((kind, monitor), 0) >= _DISTINCT
         return (kind, monitor, *point[:3], "") if beyond else key
 
-    def _known(
+    def _repeated(
+        self, kind: str, monitor: str, point: ObservationPoint, distinction: str
+    ) -> _Repeated | None:
+        """Return the counted events of a key, or None; a count for several clients of a host names none of them."""
+        repeated = self._told.get(self._key(kind, monitor, point, distinction))
+        if repeated is not None and repeated.caller_id != point.caller_id:
+            repeated.caller_id = ""
+        return repeated
+
+    def _begin(
         self, kind: str, monitor: str, point: ObservationPoint, distinction: str, shared: Mapping[str, Any]
-    ) -> _Key:
-        """Return the key, and count it among the distinctions."""
+    ) -> _Repeated:
+        """Begin to count the events of a new key, and count it among the distinctions."""
         key = self._key(kind, monitor, point, distinction)
-        if key[-1] and key not in self._told:
+        if key[-1]:
             self._distinct[kind, monitor] = self._distinct.get((kind, monitor), 0) + 1
-            if shared:
-                self._shared[key] = shared
-        return key
+        self._told[key] = _Repeated(point.caller_id, shared if key[-1] else _NOTHING)
+        return self._told[key]
 
     def _add(self, event: MonitorEvent) -> None:
         if len(self._waiting) >= _KEPT:
@@ -200,6 +231,22 @@ class Observations:
         if rows != self._counted:
             self._counted = rows
             self._reporter.send(MonitorsCounted(rows))
+
+
+def _count_of(key: _Key, repeated: _Repeated) -> MonitorEvent:
+    kind, monitor, owner, resource, host, _distinction = key
+    return MonitorEvent(
+        kind,
+        monitor,
+        owner,
+        resource,
+        repeated.last_time,
+        repeated.last_text if repeated.alike else "",
+        _plain(repeated.detail()),
+        count=repeated.count,
+        host=host,
+        caller_id=repeated.caller_id,
+    )
 
 
 def _plain(detail: Mapping[str, Any]) -> dict[str, Any]:

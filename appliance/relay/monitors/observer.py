@@ -6,20 +6,28 @@ of them, and names them all. The change counts once for each of these monitors, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from appliance.base.varying_numbers import without_numbers
 from appliance.channel.messages import MonitorRow
 from appliance.relay.monitors.fast_path_counts import FastPathCounts
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, ObservedMessage, Senders
-from appliance.relay.monitors.observations import SHOWN, Observations
-from rosmop.run.explanations import of_change, of_drop, of_fault, of_published, of_verdict
-from rosmop.run.outcomes import Outcome, Verdict, named
-from rosmop.runtime.action_context import LogLine, Published
+from appliance.relay.monitors.observations import LONGEST_TEXT, SHOWN, Observations
+from rosmop.run.outcomes import (
+    Outcome,
+    Verdict,
+    named,
+    of_change,
+    of_drop,
+    of_fault,
+    of_published,
+    of_verdict,
+)
 
 if TYPE_CHECKING:
-    from rosmop.run.monitor import MonitorInstance
+    from rosmop.run.engine import MonitorSet
 
 _EXPLAINED = 10
 
@@ -42,7 +50,7 @@ class Observer:
     def __init__(
         self,
         observations: Observations,
-        publish: Callable[[Published], None],
+        publish: Callable[[str, bytes], None],
         senders: Senders,
         prefix: str = "",
     ) -> None:
@@ -105,7 +113,9 @@ class Observer:
         self._verdicts(outcome, point, observed)
         self._faults(outcome, point, observed)
         for line in outcome.log:
-            self.report_line(line, point, outcome.time, observed)
+            self.report_line(
+                line.monitor, line.level, line.text, point=point, time=outcome.time, observed=observed
+            )
         for number, published in enumerate(outcome.published):
             self._observations.note(
                 f"{self._prefix}publish",
@@ -118,20 +128,28 @@ class Observer:
                 after=published.data[:SHOWN],
                 size=len(published.data),
             )
-            self._publish(published)
+            self._publish(published.topic, published.data)
 
     def report_line(
-        self, line: LogLine, point: ObservationPoint, time: int, observed: ObservedMessage | None = None
+        self,
+        monitor: str,
+        level: str,
+        text: str,
+        *,
+        point: ObservationPoint,
+        time: int,
+        observed: ObservedMessage | None = None,
     ) -> None:
         """Report a line of output."""
         self._observations.note(
             f"{self._prefix}log",
-            line.monitor,
+            monitor,
             point,
             time,
-            line.text,
-            distinction=f"{line.level} {line.text}",
-            detail={"level": line.level},
+            text,
+            distinction=f"{level} {without_numbers(text[:LONGEST_TEXT])}",
+            shared={"level": level},
+            detail={"level": level},
             observed=observed,
         )
 
@@ -156,7 +174,7 @@ class Observer:
             monitors[-1],
             point,
             outcome.time,
-            f"{' and '.join(monitors)} changed a message",
+            _of_change(monitors),
             distinction=", ".join(together),
             shared={"changed_by": together} if together else {},
             detail=of_change(outcome, self._who),
@@ -181,6 +199,7 @@ class Observer:
             point,
             outcome.time,
             outcome.reason or _why(outcome),
+            only_number=True,  # the fast path does not know the texts of further drops
             detail=of_drop(outcome, self._who),
             before=bytes(body[:SHOWN]),
             size=len(body),
@@ -237,6 +256,7 @@ class Observer:
                 point,
                 time,
                 count,
+                text=_of_change(monitors),
                 distinction=", ".join(together),
                 shared={"changed_by": together} if together else {},
             )
@@ -256,11 +276,11 @@ class Observer:
             dropped, changed, told = owed.take()
             for events, count in zip(lane.events, lane.happened(), strict=True):
                 self._happened[events] = self._happened.get(events, 0) + count
-            for monitor, (times, last) in zip(lane.monitors, dropped, strict=True):
+            for monitor, (times, first, last) in zip(lane.monitors, dropped, strict=True):
                 if times:
                     self._counter(monitor).drops += times
-                    self._observations.add(f"{self._prefix}drop", monitor, point, last, times)
-            for verdict, (times, last) in zip(lane.verdicts, told, strict=True):
+                    self._observations.add(f"{self._prefix}drop", monitor, point, last, times, first=first)
+            for verdict, (times, first, last) in zip(lane.verdicts, told, strict=True):
                 if times:
                     self._counter(verdict.monitor).verdicts += times
                     self._observations.add(
@@ -269,6 +289,8 @@ class Observer:
                         point,
                         last,
                         times,
+                        text=named(verdict),
+                        first=first,
                         distinction=named(verdict),
                         shared={"category": verdict.category},
                     )
@@ -276,29 +298,28 @@ class Observer:
                 self._again[writers, point] = self._again.get((writers, point), 0) + messages
         self._owed.clear()
 
-    def rows(self, monitors: Iterable[MonitorInstance], time: int) -> list[MonitorRow]:
-        """Return the state and counters of these monitors."""
+    def rows(self, monitors: MonitorSet, time: int) -> list[MonitorRow]:
+        """Return the state and counters of the set's monitors in force, or of those in shadow mode."""
         self._sum_up(time)
-        return [self._row(monitor) for monitor in monitors]
-
-    def _row(self, monitor: MonitorInstance) -> MonitorRow:
-        counters, slices = self._counter(monitor.name), monitor.slices
-        return MonitorRow(
-            monitor.name,
-            monitor.code.file,
-            monitor.enabled,
-            monitor.held,
-            monitor.failing,
-            counters.events,
-            counters.verdicts,
-            counters.drops,
-            counters.changes,
-            monitor.faults,
-            bool(self._prefix),
-            counters.missed,
-            slices.live if slices is not None else 0,
-            slices.limit if slices is not None else 0,
-        )
+        return [
+            MonitorRow(
+                monitor.name,
+                monitor.code.file,
+                monitor.enabled,
+                monitor.held,
+                monitor.failing,
+                (counters := self._counter(monitor.name)).events,
+                counters.verdicts,
+                counters.drops,
+                counters.changes,
+                monitor.faults,
+                bool(self._prefix),
+                counters.missed,
+                monitor.slices.live if monitor.slices is not None else 0,
+                monitor.slices.limit if monitor.slices is not None else 0,
+            )
+            for monitor in (monitors.shadowed if self._prefix else monitors.monitors)
+        ]
 
     def _verdicts(self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None) -> None:
         for verdict in outcome.verdicts:
@@ -366,6 +387,10 @@ def _said(outcome: Outcome) -> str:
     """Return the last log line of the monitor that dropped a message, after a colon; empty if there is none."""
     said = [line.text for line in outcome.log if line.monitor == outcome.dropped_by]
     return f": {said[-1]}" if said else ""
+
+
+def _of_change(monitors: Sequence[str]) -> str:
+    return f"{' and '.join(monitors)} changed a message"
 
 
 def _monitor(event: str) -> str:

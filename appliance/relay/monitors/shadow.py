@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, ObservedMessage
 from appliance.relay.monitors.observer import Observer
-from rosmop.run.outcomes import MessageSender, Outcome
-from rosmop.runtime.action_context import SHADOW_BUDGET
+from rosmop.run.outcomes import SHADOW_BUDGET, MessageSender, Outcome
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet, ShadowCopy

@@ -19,10 +19,7 @@ from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.state_memory import Memory, StateMemory, read
 
 if TYPE_CHECKING:
-    from rosmop.run.engine import MonitorSet
-    from rosmop.run.monitor import MonitorGroup
-    from rosmop.run.state import GroupSnapshot
-    from rosmop.run.state_of_slices import SliceParts
+    from rosmop.run.engine import KeptGroup, MonitorSet
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
@@ -30,7 +27,7 @@ _STEP = 1_000_000_000  # nanoseconds; a larger difference means that the clock w
 
 
 class _GroupHead(msgspec.Struct, array_like=True):
-    """The monitors of a section, and the layout of its cells (`CellNames`)."""
+    """The monitors of a section, and the layout of its cells (`KeptGroup.layout`)."""
 
     monitors: list[str]
     cells: msgspec.Raw
@@ -49,9 +46,12 @@ class _Head(msgspec.Struct, array_like=True):
 
 @dataclass(slots=True)
 class RecoveredState:
-    """The states that earlier processes left, newest last, and why states are lost (by monitor; key "": all)."""
+    """The states that earlier processes left, newest last, and why states are lost (by monitor; key "": all).
 
-    groups: "list[GroupSnapshot]" = field(default_factory=list)
+    A state of a group has the names of its monitors, the layout of its cells, its base, and newer cells.
+    """
+
+    groups: list[tuple[list[str], bytes, bytes, bytes | None]] = field(default_factory=list)
     lost: dict[str, str] = field(default_factory=dict)
 
 
@@ -59,14 +59,14 @@ class RecoveredState:
 class _Entry:
     """A group of monitors and its section; `base` and `cells` hold the bytes last written."""
 
-    group: "MonitorGroup"
+    group: "KeptGroup"
     section: int = 0
     base: bytes = b""
     cells: bytes | None = None
     refused: bool = False
     """Whether the memory has no space for the state; the state is then lost when the process ends."""
-    slices: "list[tuple[str, SliceParts, list[bytes]]]" = field(default_factory=list)
-    """For each parametric specification: name, parts (stored in the next sections), and their bytes as last written."""
+    parts: list[bytes] = field(default_factory=list)
+    """The parts of the slices (stored in the next sections) as last written."""
 
 
 class StateKeeper:
@@ -76,7 +76,6 @@ class StateKeeper:
         self._given = given
         self._memory = StateMemory(own)
         self._left = [own] if _has_head(own) else [*earlier]
-        self._monitors: MonitorSet | None = None
         self._entries: list[_Entry] = []
         self._by_channel: dict[str, _Entry] = {}
 
@@ -127,14 +126,13 @@ class StateKeeper:
 
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these monitors from now on."""
-        self._monitors = monitors
-        self._entries = [_Entry(group, slices=_parts(monitors, group)) for group in monitors.groups]
+        self._entries = [_Entry(group, parts=group.parts()) for group in monitors.kept_groups()]
         self._by_channel = {channel: entry for entry in self._entries for channel in entry.group.channels}
         self._lay_out()
 
     def take_nothing(self) -> None:
         """Keep no state, because there are no monitors."""
-        self._monitors, self._entries, self._by_channel = None, [], {}
+        self._entries, self._by_channel = [], {}
         self._lay_out()
 
     def keep(self, channel: str) -> None:
@@ -151,21 +149,16 @@ class StateKeeper:
     def _keep(self, entry: _Entry) -> None:
         if entry.refused:
             return
-        group = entry.group
-        home = group.home
-        if not group.changed:
-            if home is None:
-                return
-            cells = home.cells()
-            if cells is not None:
-                if cells and cells != entry.cells:
-                    entry.cells = cells
-                    self._memory.write_cells(entry.section, cells)
-                return
+        cells = entry.group.cells()
+        if cells is not None:
+            if cells and cells != entry.cells:
+                entry.cells = cells
+                self._memory.write_cells(entry.section, cells)
+            return
         if not self._keep_slices(entry):
             self._lay_out()
             return
-        base = self._base(group)
+        base = entry.group.base()
         if base != entry.base or entry.cells is not None:
             entry.base, entry.cells = base, None
             if not self._memory.write_base(entry.section, base):
@@ -173,25 +166,18 @@ class StateKeeper:
 
     def _keep_slices(self, entry: _Entry) -> bool:
         """Write the parts of slices that have changed; return False if one does not fit."""
-        first, fits = entry.section + 1, True
-        for _, parts, written in entry.slices:
-            for number, data in parts.changed().items():
-                written[number] = data
-                fits = fits and self._memory.write_base(first + number, data)
-            first += len(written)
+        fits = True
+        for number, data in entry.group.changed_parts().items():
+            entry.parts[number] = data
+            fits = fits and self._memory.write_base(entry.section + 1 + number, data)
         return fits
-
-    def _base(self, group: "MonitorGroup") -> bytes:
-        assert self._monitors is not None  # noqa: S101  the group is one of its groups
-        return self._monitors.state_of(group)
 
     def _lay_out(self) -> None:
         for entry in self._entries:
             if not entry.refused:
-                entry.base, entry.cells = self._base(entry.group), None
-                for _, parts, written in entry.slices:
-                    for number, data in parts.changed().items():
-                        written[number] = data
+                entry.base, entry.cells = entry.group.base(), None
+                for number, data in entry.group.changed_parts().items():
+                    entry.parts[number] = data
         while not self._memory.lay_out(
             self._head(), [section for entry in self._entries for section in _sections(entry)]
         ):
@@ -201,7 +187,7 @@ class StateKeeper:
                 self._memory.lay_out(self._head(_NO_ROOM), [])
                 return
             largest = max(rest, key=lambda entry: sum(len(data) for data, _ in _sections(entry)))
-            largest.refused, largest.slices = True, []
+            largest.refused, largest.parts = True, []
             largest.base = msgspec.msgpack.encode(_NO_ROOM)
         section = 0
         for entry in self._entries:
@@ -211,24 +197,16 @@ class StateKeeper:
     def _head(self, lost: str = "") -> bytes:
         groups = []
         for entry in self._entries:
-            home = entry.group.home
-            names = msgspec.Raw(msgspec.msgpack.encode(None if home is None else home.names))
-            groups.append(_GroupHead([monitor.name for monitor in entry.group.monitors], names))
-            for name, _, written in entry.slices:
-                groups += [_GroupHead([name], _NO_CELLS)] * len(written)
+            groups.append(_GroupHead(entry.group.names, msgspec.Raw(entry.group.layout)))
+            if entry.parts:
+                groups += [_GroupHead([name], _NO_CELLS) for name in entry.group.part_names]
         head = _Head(self._given.boot, self.offset, self.offset + time.monotonic_ns(), groups, lost)
         return msgspec.msgpack.encode(head)
 
 
-def _parts(monitors: "MonitorSet", group: "MonitorGroup") -> "list[tuple[str, SliceParts, list[bytes]]]":
-    return [(name, parts, parts.all()) for name, parts in monitors.slice_parts(group)]
-
-
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
     """Return the sections of a group: its state with the size of its cells, then the parts of its slices."""
-    home = entry.group.home
-    own = [(entry.base, 0 if home is None else home.size)]
-    return own + [(data, 0) for _, _, written in entry.slices for data in written]
+    return [(entry.base, entry.group.size), *((data, 0) for data in entry.parts)]
 
 
 _NO_CELLS = msgspec.Raw(b"\xc0")

@@ -6,7 +6,7 @@ as long, up to 16 seconds. A message that is cut off during a reduction does not
 not name share one budget, because each of many addresses could send such a message.
 """
 
-from rosmop.runtime.action_context import FUEL_PER_SECOND
+from rosmop.run.outcomes import FUEL_PER_SECOND
 
 _SHORTEST = 4_000_000_000
 _LONGEST = 16_000_000_000

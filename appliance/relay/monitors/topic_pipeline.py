@@ -137,13 +137,14 @@ class TopicPipeline:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._point[1]) else 0
-        for position, said in walked.output:
+        for position, line in walked.output:
             first = position + 4
             size = _unpack_length(progress.view, position)[0]
             observed = ObservedMessage(
                 progress, position, bytes(progress.view[first : first + min(size, head)])
             )
-            interceptor.observer.report_line(said, self._point, progress.time, observed)
+            said = line.monitor, line.level, line.text
+            interceptor.observer.report_line(*said, point=self._point, time=progress.time, observed=observed)
 
     def _prepare(self, monitors: MonitorSet, lane: FastLane) -> tuple[BatchOptions, FastPathCounts]:
         """Prepare the options and counts of all batches until something changes."""

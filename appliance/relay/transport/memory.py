@@ -13,7 +13,7 @@ Invariants, besides those of `Pool`:
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from appliance.quotas.pool import Pool, QuotaClass
 from appliance.quotas.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
@@ -96,7 +96,12 @@ class RelayMemory:
 
     def held(self) -> dict[str, int]:
         """Return the bytes in each pool."""
-        return {pool.name: getattr(self, pool.name).total for pool in fields(self)}
+        return {
+            "frames": self.frames.total,
+            "queues": self.queues.total,
+            "latched": self.latched.total,
+            "headers": self.headers.total,
+        }
 
 
 class HeldBytes:

@@ -12,13 +12,12 @@ import rosmop.certify
 from rosmop.certify.check import MOST_STEPS, AutomatonTables, certify
 from rosmop.certify.properties import DEFECT, certificate_of, certificates_of
 from rosmop.check.sources import compiled_from
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.logics import catalogue
 from rosmop.logics.automaton import Automaton
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Logic, Source
 from rosmop.logics.tfsm import TimedStateMachine
-from rosmop.run.engine import MonitorSet
 from rosmop.tests.examples import examples
 from roswire.standard import standard_definitions
 
@@ -276,7 +275,7 @@ guard() {
 def certified() -> tuple[dict[str, list[str]], list[str]]:
     """Return the certificates and the errors of `SPECIFICATION`."""
     compiled = compiled_from({"guard.rv": SPECIFICATION}, standard_definitions())
-    lines, wrong = certificates_of(MonitorSet.of(compiled).monitors)
+    lines, wrong = certificates_of(compiled.specifications)
     return lines, [str(finding) for finding in wrong]
 
 

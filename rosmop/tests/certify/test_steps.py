@@ -11,18 +11,18 @@ import pytest
 
 from rosmop.certify.steps import StepDiffersError, check_steps
 from rosmop.check.sources import compiled_from
-from rosmop.fast import batch_codegen, wasm_build
+from rosmop.fast import batch_codegen, build
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.fast.wasm_instance import WasmError
 from rosmop.form import nodes, specification_groups
 from rosmop.form.compiled import Compiled
+from rosmop.form.findings import SpecificationError
 from rosmop.form.specification_groups import groups
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.values import ValueCodec
 from rosmop.tests.certify.step_mutants import tables, walks
 from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Specifications, definitions
-from rosmop.text.errors import SpecificationError
 
 GUARD = """s() { int n = 0;
     event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) { return; } }
@@ -149,10 +149,10 @@ TWO = """s() { event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) 
 def test_faults_of_one_line_are_rejected(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the generator has a fault, no module is built."""
     of = compiled(TWO)
-    assert wasm_build.part_of(of, ["s"], [])
+    assert build.part_of(of, ["s"], [])
     monkeypatch.setattr(*FAULTS[fault])
     with pytest.raises(StepDiffersError):
-        wasm_build.part_of(of, ["s"], [])
+        build.part_of(of, ["s"], [])
 
 
 def test_functions_in_another_order_are_rejected() -> None:

@@ -8,7 +8,7 @@ import pytest
 from rosmop.check.margins import MOST_NOTED
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
-from rosmop.run.margins import Margin, MarginReader
+from rosmop.run.outcomes import Margin
 from rosmop.tests.on_module import on_module
 from roswire.standard import standard_definitions
 
@@ -24,12 +24,11 @@ NEAR = """near() {
 """
 
 
-def started(text: str, *, margins: bool = True) -> tuple[MonitorSet, MarginReader]:
-    """Start the specifications in `text`, with their module if there is one; return them with their margins."""
+def started(text: str, *, margins: bool = True) -> MonitorSet:
+    """Start the specifications in `text`, with their module if there is one."""
     monitors = on_module(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
-    reader = MarginReader(monitors)
     monitors.start(0)
-    return monitors, reader
+    return monitors
 
 
 def give(monitors: MonitorSet, form: str, *values: int | float, walking: bool = True) -> list[str]:
@@ -51,13 +50,13 @@ def said(margins: Sequence[Margin]) -> list[tuple[int, bool, float, float, float
 @pytest.mark.parametrize("walking", [True, False])
 def test_the_nearest_on_both_sides_since_it_was_asked_last(walking: bool) -> None:
     """Module and engine record them for constants, but not in loops or `when`, nor for `==` or known results."""
-    monitors, margins = started(NEAR)
+    monitors = started(NEAR)
     assert (monitors.lane("/t") is not None) is True
     give(monitors, "<i", 1, 9, 5, walking=walking)
-    assert said([*margins.take()]) == [(3, True, 9, 7, 9), (3, False, 5, 7, 5), (6, False, 5, 5, 5)]
-    assert not [*margins.take()]
+    assert said([*monitors.take_margins()]) == [(3, True, 9, 7, 9), (3, False, 5, 7, 5), (6, False, 5, 5, 5)]
+    assert not [*monitors.take_margins()]
     give(monitors, "<i", 20, walking=walking)
-    assert said([*margins.take()]) == [(3, True, 20, 7, 20)]
+    assert said([*monitors.take_margins()]) == [(3, True, 20, 7, 20)]
 
 
 def test_answers_are_those_of_the_text_as_it_is() -> None:
@@ -71,10 +70,10 @@ def test_answers_are_those_of_the_text_as_it_is() -> None:
     ):
         source = text % (kind, message, operator, side)
         for walking in (True, False):
-            (noting, margins), (plain, none) = started(source), started(source, margins=False)
+            noting, plain = started(source), started(source, margins=False)
             assert give(noting, code, *values, walking=walking) == give(plain, code, *values, walking=walking)
-            assert all(margin.distance < 2**65 for margin in margins.take())
-            assert not [*none.take()]
+            assert all(margin.distance < 2**65 for margin in noting.take_margins())
+            assert not [*plain.take_margins()]
 
 
 def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
@@ -86,21 +85,25 @@ def test_a_message_that_faults_is_noted_as_far_as_it_came() -> None:
     } }"""
     outcomes = {}
     for noting in (True, False):
-        monitors, margins = started(text, margins=noting)
+        monitors = started(text, margins=noting)
         outcomes[noting] = give(monitors, "<i", 1, 12, 11, 3), monitors.value("s", "n")
-        noted = said([*margins.take()])
+        noted = said([*monitors.take_margins()])
     assert outcomes[True] == outcomes[False]
     assert not noted
-    monitors, margins = started(text)
+    monitors = started(text)
     give(monitors, "<i", 1, 12)
-    assert said([*margins.take()]) == [(3, True, 12, 10, 12), (3, False, 1, 10, 1), (4, False, 1, 2, 1)]
+    assert said([*monitors.take_margins()]) == [
+        (3, True, 12, 10, 12),
+        (3, False, 1, 10, 1),
+        (4, False, 1, 2, 1),
+    ]
 
 
 def test_no_more_is_noted_than_is_bounded() -> None:
     """Comparisons beyond the limit still work, but are not recorded."""
     lines = "\n".join(f"if (x > {number}) {{ n = n + 1; }}" for number in range(MOST_NOTED + 9))
     text = f"s() {{ int n = 0; event e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{lines}\n}} }}"
-    monitors, margins = started(text)
+    monitors = started(text)
     give(monitors, "<i", 20, 100)
-    assert len({margin.number for margin in margins.take()}) == MOST_NOTED
+    assert len({margin.number for margin in monitors.take_margins()}) == MOST_NOTED
     assert monitors.value("s", "n") == 20 + MOST_NOTED + 9

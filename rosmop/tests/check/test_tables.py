@@ -5,12 +5,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import act, action, definitions, load, message
 from rosmop.tests.both_ways import BothWays
 from rosmop.tests.stories import Step, Story, tell
 from rosmop.tests.transcripts import Case, table
-from rosmop.text.errors import SpecificationError
 
 TABLES = Path(__file__).parent
 

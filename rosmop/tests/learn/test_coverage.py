@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import pytest
 
+from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import covered
 from rosmop.tests.acting import message
 from rosmop.tests.learn.test_learner import START, Recorded
-from rosmop.text.errors import SpecificationError
 from roswire.standard import standard_definitions
 
 TEXT = """gate() {

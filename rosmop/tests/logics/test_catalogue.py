@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 from rosmop.logics.catalogue import LOGICS, compile_property
 from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError
 from rosmop.tests.examples import examples
@@ -191,7 +191,7 @@ PROGRAM = """
 import json, resource, sys
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import FormulaError, RunFaultError
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position
 resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
 resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
 logic, formula = json.load(sys.stdin)

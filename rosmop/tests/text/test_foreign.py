@@ -3,8 +3,8 @@
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
 from roswire.standard import standard_definitions
 

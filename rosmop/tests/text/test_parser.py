@@ -4,9 +4,8 @@
 
 import pytest
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import MAX_CHARACTERS, parse
 
 

@@ -2,10 +2,9 @@
 
 import pytest
 
-from rosmop.form.positions import Position
+from rosmop.form.findings import Position, SpecificationError
 from rosmop.tests.acting import definitions
 from rosmop.text import tree
-from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
 from rosmop.types.resolve import resolve

@@ -2,14 +2,7 @@
 
 import pytest
 
-from appliance.api.monitor_judgement import (
-    Compiler,
-    events_of,
-    findings_of,
-    picture_of,
-    properties_of,
-    refusal,
-)
+from appliance.api.monitor_judgement import Compiler, findings_of, refusal
 from appliance.channel.answers.monitor_answers import Monitors
 from tests.support.answers import example
 
@@ -31,11 +24,12 @@ def test_findings_without_a_position_stay_in_the_detail() -> None:
 def test_a_monitor_is_described() -> None:
     """The description has events of topics, services and clocks, properties with handlers, and a picture if finite."""
     compiler = Compiler()
-    a = compiler.monitor(example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a")
-    b = compiler.monitor(
-        example(Monitors, revision=1), "b"
-    )  # already compiled: the same revision is not compiled again
-    (said,) = events_of(a)
+    a = compiler.described(
+        example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a"
+    )
+    again = example(Monitors, revision=1)  # already compiled: the same revision is not compiled again
+    b = compiler.described(again, "b")
+    (said,) = a.events
     assert (said.name, said.topic, said.type, said.part, said.every) == (
         "said",
         "/chatter",
@@ -43,13 +37,13 @@ def test_a_monitor_is_described() -> None:
         None,
         None,
     )
-    tick, asked = events_of(b)
+    tick, asked = b.events
     assert (tick.topic, tick.every) == (None, 0.5)
     assert (asked.topic, asked.type, asked.part) == ("/set", "std_srvs/SetBool", "request")
-    (matched,) = properties_of(a)
+    (matched,) = a.properties
     assert (matched.logic, matched.handled, matched.drawn) == ("ere", ["match"], True)
-    assert str(picture_of(a)).startswith("<svg ")
-    assert picture_of(b) is None
+    assert str(compiler.picture(again, "a")).startswith("<svg ")
+    assert compiler.picture(again, "b") is None
     with pytest.raises(KeyError):
-        compiler.monitor(example(Monitors, revision=1), "nobody")
+        compiler.described(again, "nobody")
     assert {one.file for one in compiler.warnings("a.rv")} <= {"a.rv"}

@@ -63,10 +63,10 @@ def test_a_flood_is_cut_and_reported() -> None:
     desk = Desk()
     for _ in range(60):
         desk.rosout.reported(LINE)
-    desk.rosout.reported(msgspec.structs.replace(LINE, text="WARN ünsafe", count=5, detail={}))
+    desk.rosout.reported(msgspec.structs.replace(LINE, count=5))
     assert len(desk.sent) == 50
     desk.now += 1
-    desk.rosout.reported(msgspec.structs.replace(LINE, text="WARN ünsafe", count=3, detail={}))
+    desk.rosout.reported(msgspec.structs.replace(LINE, count=3))
     assert [one["msg"] for one in desk.said()[50:]] == [
         "15 more lines of monitors; the audit log has them",
         "3 more in the same second: ünsafe",

@@ -36,7 +36,7 @@ def publisher() -> Iterator[socket.socket]:
         yield sock
 
 
-def _nothing(_what: object) -> None:
+def _nothing(*_what: object) -> None:
     """Do nothing: there are no publishers and no monitors."""
 
 

@@ -19,10 +19,10 @@ from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.transport.frames import FrameReceiver, Scratch
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
 from rosmop.run.fast_path import BatchResult
-from rosmop.runtime.action_context import Published
 from rosmop.tests.acting import message
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import (
@@ -31,7 +31,6 @@ from rosmop.tests.random_specifications import (
     Traffic,
     definitions,
 )
-from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 from tests.support.examples import examples
 from tests.support.relay_memory import share
@@ -74,14 +73,14 @@ class Monitored:
     ) -> None:
         self.heard = Heard()
         self.time = began
-        self.published: list[Published] = []
+        self.published: list[tuple[str, bytes]] = []
         """Return the messages that monitors published."""
         self._loop = EventLoop()
         self.interceptor = Interceptor(
             self._loop,
             self.heard,
             budget=1000.0,
-            publish=self.published.append,
+            publish=lambda *message: self.published.append(message),
             changed=lambda _topics: None,
         )
         self.interceptor.over = lambda: False
@@ -142,7 +141,7 @@ class Monitored:
 
     def rows(self) -> list[MonitorRow]:
         """Return the counters."""
-        return self.interceptor.observer.rows(self.set.monitors, self.interceptor.now())
+        return self.interceptor.observer.rows(self.set, self.interceptor.now())
 
     def state(self) -> list[object]:
         """Return variables, states of properties and due times. (`next_due` is left out: it may be too early.)"""

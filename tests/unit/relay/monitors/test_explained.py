@@ -20,7 +20,7 @@ from appliance.channel.messages import MonitorEvent
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail
-from rosmop.run.explanations import moment
+from rosmop.run.outcomes import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
 from tests.support.idle import idle_class

@@ -3,7 +3,7 @@
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.transport.frames import Batch
-from rosmop.run.slice_quota import HolderOf
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import (
@@ -85,7 +84,7 @@ def compiled(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Return an event; while it is not set, specifications stay uncompiled."""
     compiled, load_now = threading.Event(), Loader.load
 
-    def load_late(message: SpecificationsStated, holder_of: HolderOf) -> Any:
+    def load_late(message: SpecificationsStated, holder_of: Callable[[int], Hashable]) -> Any:
         compiled.wait()
         return load_now(message, holder_of)
 
@@ -302,7 +301,7 @@ def test_a_verdict_is_reported_with_its_property_logic_and_category(world: Monit
     assert verdict.detail["logic"] == "fsm"
     assert verdict.detail["category"] == "pressed"
     again = world.event("verdict", count=2)
-    assert (again.monitor, again.text, again.detail) == ("latch", verdict.text, {"category": "pressed"})
+    assert (again.monitor, again.text, again.detail["category"]) == ("latch", verdict.text, "pressed")
 
     def counted() -> Any:
         rows = [row for one in world.told if isinstance(one, MonitorsCounted) for row in one.rows]

@@ -12,7 +12,7 @@ from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.loader import Loader
 monitors = Loader.load(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False), lambda _: None)
 assert monitors.monitors, monitors
-written = tuple(f"rosmop.fast.{name}" for name in ("wasm_build", "batch_codegen", "codegen", "memory_layout"))
+written = tuple(f"rosmop.fast.{name}" for name in ("build", "batch_codegen", "codegen", "memory_layout"))
 compiler = ("lark", "rosmop.text", "rosmop.check.", *written)
 assert not [name for name in sys.modules if name.startswith(compiler)]
 gc.collect()

@@ -79,8 +79,8 @@ def test_a_change_of_two_monitors_names_both_and_counts_for_both(told: Told) -> 
     assert (full.monitor, full.text) == ("turn", "stop and turn changed a message")
     assert full.detail["changed_by"] == ["stop.drive", "turn.drive"]
     assert sorted((one.monitor, one.count, one.text, str(one.detail)) for one in summed) == [
-        ("turn", 2, "stop.drive, turn.drive", "{'changed_by': ['stop.drive', 'turn.drive']}"),
-        ("turn", 5, "", "{}"),
+        ("turn", 2, "stop and turn changed a message", "{'changed_by': ['stop.drive', 'turn.drive']}"),
+        ("turn", 5, "turn changed a message", "{}"),
     ]
     assert told.counts() == {"stop": (0, 3), "turn": (0, 8), "look": (0, 0)}
 
@@ -252,4 +252,46 @@ def test_counted_events_have_no_explanation(
     full = [one for one in told.events("verdict") if not one.count]
     assert full[-1].monitor == "turned"
     assert [len(one.detail["why"]["events"]) for one in full] == [1] * len(full)
+    told.monitored.close()
+
+
+SAYS = """says() { event drive(double v, double w) /cmd geometry_msgs/Twist '{linear:{x:v}, angular:{z:w}}' {
+    if (w > 1) { ROS_WARN("turn %g", w); return; } ROS_INFO("speed %g", v); } }"""
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_lines_that_differ_only_in_numbers_are_one_count(together: bool) -> None:
+    """The count has the last line as text, its level, and the first and last line and time."""
+    told = Told(together=together, texts=(SAYS,))
+    told.send(*[(speed, 0, 0) for speed in (0.25, 0.5, 0.75, 1)], (0, 0, 5))
+    first, warning, more = told.events("log")
+    assert (first.text, first.count) == ("speed 0.25", 0)
+    assert (warning.text, warning.detail["level"]) == ("turn 5", "WARN")
+    assert (more.text, more.count) == ("speed 1", 3)
+    times = {"first_time": more.detail["first_time"], "last_time": more.time}
+    assert 0 < times["first_time"] <= times["last_time"]
+    assert more.detail == {"level": "INFO", **times, "first_text": "speed 0.5", "last_text": "speed 1"}
+    told.monitored.close()
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_further_drops_have_a_number_and_times(together: bool) -> None:
+    """The texts of further drops are unknown to the fast path, so their count claims none."""
+    told = Told(together=together, texts=(SAYS,))
+    told.send(*[(0, 0, turn) for turn in (5, 6, 7)])
+    first, more = told.events("drop")
+    assert (first.text, first.count) == ("says.drive dropped it: turn 5", 0)
+    assert (more.text, more.count, set(more.detail)) == ("", 2, {"first_time", "last_time"})
+    told.monitored.close()
+
+
+def test_a_count_of_different_words_has_no_text() -> None:
+    """Beyond the number of distinctions, a count has the number of lines, and no line stands for the others."""
+    told = Told(together=True)
+    observations, point = told.monitored.interceptor.observations, ObservationPoint("k", "/t", "h", "/n")
+    for number, words in enumerate(["a" * (length + 1) for length in range(110)]):
+        observations.note("log", "gate", point, number + 1, words, distinction=f"INFO {words}")
+    *full, more = told.events("log")
+    assert (len(full), more.count, more.text) == (101, 9, "")
+    assert more.detail == {"first_time": 102, "last_time": 110}
     told.monitored.close()

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.state_keeper import StateKeeper
 from rosmop.check.sources import compiled_from
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.interpreted import check_same
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
-from rosmop.text.errors import SpecificationError
 from roswire.standard import standard_definitions
 from tests.support.examples import examples
 

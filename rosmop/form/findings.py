@@ -1,9 +1,10 @@
-"""Positions in files of specifications, and findings about them.
+"""The errors and warnings of specifications: findings, with their positions in the files.
 
 Lines and columns count from 1; a column is a character (a tab is one). The names of the fields are those of
 ``rosrv monitor check --json``.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -45,3 +46,16 @@ class Diagnostic:
 
     def __str__(self) -> str:
         return f"{self.position}: {self.severity}: {self.text}"
+
+
+class SpecificationError(Exception):
+    """A rejected file: all its errors, in the order of the text."""
+
+    def __init__(self, findings: Iterable[Diagnostic]) -> None:
+        self.findings = tuple(sorted(findings, key=lambda finding: finding.position))
+        super().__init__("\n".join(map(str, self.findings)))
+
+    @classmethod
+    def at(cls, position: Position, text: str) -> "SpecificationError":
+        """Return an error with one finding."""
+        return cls([Diagnostic(position, "error", text)])
