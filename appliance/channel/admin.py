@@ -13,15 +13,12 @@ docstring of a request is its description in the REST contract, unless the row h
 """
 
 import functools
-from collections.abc import Callable, Coroutine, Iterator
 from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
     Generic,
     Literal,
-    NamedTuple,
-    ParamSpec,
     TypeVar,
     Union,
     cast,
@@ -47,7 +44,6 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
 
 A = TypeVar("A")
-P = ParamSpec("P")
 
 POLICY = Versioned("policy", "/v1/policy", "The policy in force is not the one that If-Match names.")
 MONITORS = Versioned(
@@ -103,32 +99,6 @@ class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", fo
 
 class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
     """A request that waits for charon, the signer, the recorder or a topic's messages: others go past it."""
-
-
-def answers(
-    request: type[AdminRequest[A]], *, who: bool = False
-) -> Callable[[Callable[P, Coroutine[Any, Any, A]]], Callable[P, Coroutine[Any, Any, A]]]:
-    """Mark a method of control as the answer to a request. `who`: the method also takes the client's name."""
-
-    def mark(method: Callable[P, Coroutine[Any, Any, A]]) -> Callable[P, Coroutine[Any, Any, A]]:
-        method.answers = Answers(request, who)  # type: ignore[attr-defined]  # read by `methods_of`
-        return method
-
-    return mark
-
-
-class Answers(NamedTuple):
-    """The mark of a method that answers a request."""
-
-    request: type[AdminRequest[Any]]
-    who: bool
-
-
-def methods_of(kind: type) -> Iterator[tuple[Answers, Callable[..., Coroutine[Any, Any, Any]]]]:
-    """Yield the functions of a class that answer requests, with their marks."""
-    for method in (method for base in kind.__mro__ for method in vars(base).values()):
-        if isinstance(mark := getattr(method, "answers", None), Answers):
-            yield mark, method
 
 
 def verb_of(request: AdminRequest[Any]) -> str:

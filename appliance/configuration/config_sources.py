@@ -24,6 +24,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from appliance.base.input_files import read_given_text
+from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import must_be, not_yaml
 from appliance.configuration.settings import Settings
 
@@ -60,7 +61,7 @@ class Mistake:
         return f"{self.place}: {self.text}"
 
 
-class ConfigError(Exception):
+class ConfigError(UserError):
     """The configuration has mistakes; the message lists all of them."""
 
     def __init__(self, mistakes: list[Mistake]) -> None:

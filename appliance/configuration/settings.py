@@ -229,7 +229,8 @@ class Syslog:
     key: Path | None = key(default=None, description="key of `certificate`; readable by user rosrv-syslog")
 
     def __post_init__(self) -> None:
-        given = [name for name in ("ca", "name", "certificate", "key") if getattr(self, name) is not None]
+        keys = {"ca": self.ca, "name": self.name, "certificate": self.certificate, "key": self.key}
+        given = [name for name, value in keys.items() if value is not None]
         if given and (self.to is None or not self.to.startswith("tls://")):
             raise ValueError(f"{', '.join(given)} would have no effect: only tls:// uses certificates")
         if (self.certificate is None) != (self.key is None):

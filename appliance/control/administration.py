@@ -1,38 +1,33 @@
 """Carry out operators' orders and queries, from the admin socket and from REST.
 
-Each request is a class in `appliance.channel.admin`. The method that is marked with `answers` for this class answers
-the request. To add a request, define its class with a row in the table of operations, and write such a method.
+Each request is a class in `appliance.channel.admin`. To add a request, define its class with a row in the table of
+operations, write the method that answers it, and add the method to the table in `control/request_methods.py`.
 """
 
-from collections.abc import Awaitable, Callable
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any
 
 from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
+from appliance.control.evidence_orders import NotSealedError
+from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.control.queries import Queries
-from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
-from appliance.control.token_orders import TokenOrders, TokenRefusedError
-from appliance.hosts.certification import Certification
-from appliance.hosts.checked_ports import PortChecks
-from appliance.hosts.enrolment import HostEnrolment
+from appliance.control.recording_orders import RecorderAwayError
+from appliance.control.request_methods import RequestMethod
+from appliance.control.token_orders import TokenRefusedError
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
     HostsChangedError,
     UnknownHostError,
 )
-from appliance.hosts.self_service import HostSelfService
 from appliance.master.endpoints.topic_taps_control import TooManyTapsError
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.specifications.specification_manager import (
     DryRunUnderWayError,
     MonitorsChangedError,
-    SpecificationManager,
     UnknownMonitorError,
 )
 from appliance.store.writer_thread import StoreError
@@ -60,19 +55,6 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
 KEPT = (admin.CHANGES | {admin.TokenAdd, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}) - {
     admin.HostRevoke, admin.TokenRevoke, admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove
 }  # fmt: skip
-Orders = (
-    Policies | SpecificationManager | TokenOrders | RecordingOrders | EvidenceOrders
-    | HostEnrolment | HostSelfService | PortChecks | Certification
-)  # fmt: skip
-_Method = Callable[..., Awaitable[Any]]
-
-
-class _Taken(NamedTuple):
-    """The method that answers a request. `who`: the method takes the author. `orders`: the request is not a query."""
-
-    method: _Method
-    who: bool
-    orders: bool
 
 
 class Administration:
@@ -84,17 +66,15 @@ class Administration:
     def __init__(
         self,
         queries: Queries,
-        *orders: Orders,
+        methods: Iterable[RequestMethod[Any]],
+        *,
         durable: Callable[[], Awaitable[object]],
         require_room: Callable[[], None],
     ) -> None:
         self._queries = queries
         self._durable = durable
         self._require_room = require_room
-        self._methods: dict[type, _Taken] = {}
-        for part in (queries, *orders):
-            for mark, method in admin.methods_of(type(part)):
-                self._methods[mark.request] = _Taken(partial(method, part), mark.who, part is not queries)
+        self._methods = {method.request: method for method in methods}
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         """Carry out a request of `who`: the name of a token, or `operator` for the admin socket.
@@ -103,17 +83,17 @@ class Administration:
         the client gives up before the order takes effect, the order is withdrawn (`appliance/base/withdrawal.py`).
         """
         answer = await self._answer(request, who)
-        if self._methods[type(request)].orders:
+        if self._methods[type(request)].order:
             await self._durable()
         return answer
 
     async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
-        method, with_who, _ = self._methods[type(request)]
+        method = self._methods[type(request)]
         try:
             require_awaited()
             if type(request) in KEPT:
                 self._require_room()
-            return admin.AdminAnswer(True, await (method(request, who) if with_who else method(request)))
+            return admin.AdminAnswer(True, await method.answer(request, *([who] if method.who else [])))
         except (PolicyRefusedError, SpecificationsRefusedError) as error:
             text = self._in_force(error)
             return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")

@@ -21,13 +21,11 @@ class EvidenceOrders:
         self._log = log
         self._trail = trail
 
-    @admin.answers(admin.LogSealed)
     async def seal(self, _request: admin.LogSealed) -> Sealed:
         """Wait until a signed checkpoint seals all records."""
         await self._seal()
         return Sealed()
 
-    @admin.answers(admin.EvidenceExported, who=True)
     async def exported(self, request: admin.EvidenceExported, who: str) -> Sealed:
         """Record an exported bundle. Once a signed checkpoint seals the record, return its id."""
         record = self._trail.happened(

@@ -11,6 +11,7 @@ from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder_link import ForwarderLink
 from appliance.control.foundation import Current, Foundation
 from appliance.control.queries import Queries
+from appliance.control.request_methods import request_methods
 from appliance.control.rest import RestLink
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.control.token_orders import TokenOrders
@@ -75,15 +76,16 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     )
     administration = Administration(
         looks,
-        base.policies,
-        parts.monitors,
-        hosts,
-        hosts.itself,
-        hosts.ports,
-        certification,
-        tokens,
-        ends.recordings,
-        EvidenceOrders(base.audit, trail),
+        request_methods(
+            queries=looks,
+            policies=base.policies,
+            monitors=parts.monitors,
+            hosts=hosts,
+            certification=certification,
+            tokens=tokens,
+            recordings=ends.recordings,
+            evidence=EvidenceOrders(base.audit, trail),
+        ),
         durable=trail.durable,
         require_room=base.store.database.require_room,
     )

@@ -145,7 +145,6 @@ class Policies(Revisions[RevisionRow]):
             await self.store.settled()
             await self._carried_out()
 
-    @admin.answers(admin.PolicyReload, who=True)
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again: check, test and load it, and decide all live rights again.
 
@@ -157,7 +156,6 @@ class Policies(Revisions[RevisionRow]):
             policy, signature = await self._prepared(self._read, str(self.file), by)
             return self._keep(policy, signature, who=DISK, note="reloaded from disk", by=by, within=within)
 
-    @admin.answers(admin.PolicyLoad, who=True)
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force, as `reload` does with the file.
 
@@ -182,7 +180,6 @@ class Policies(Revisions[RevisionRow]):
             return 0
         return self._changed(before, self._current)
 
-    @admin.answers(admin.PolicyRollback, who=True)
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
         """Bring a kept revision into force. Raises `PolicyRefusedError` and `RevisionChangedError`."""
         async with self._changing(request.expected):
@@ -197,7 +194,6 @@ class Policies(Revisions[RevisionRow]):
         policy = self._judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
-    @admin.answers(admin.PolicyConfirm, who=True)
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
         async with self._changing(request.expected):
@@ -207,19 +203,16 @@ class Policies(Revisions[RevisionRow]):
                 self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
             return answers.PolicyConfirmed(waited, self.revision)
 
-    @admin.answers(admin.PolicyRevisions)
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
         """Return the kept revisions."""
         rows = [self._described(row) for row in await self._kept()]
         return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
-    @admin.answers(admin.PolicyWanted)
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
         """Return a revision and the context for checks of its text. Raises `UnknownThingError`."""
         row = await self._kept_revision(self.revision if request.revision is None else request.revision)
         return await asyncio.to_thread(self._text, row, self.known)
 
-    @admin.answers(admin.PolicyRevisionWanted)
     async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
         """Return a revision with its text. Raises `UnknownThingError`."""
         row = await self._kept_revision(request.revision)

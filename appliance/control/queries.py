@@ -73,12 +73,10 @@ class Queries:
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
-    @admin.answers(admin.StatusWanted)
     async def status(self, _request: admin.StatusWanted) -> Status:
         """Return the status of all parts of the appliance."""
         return self._status()
 
-    @admin.answers(admin.InventoryWanted)
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
         """Return the parts of the appliance, and the kernel features in use."""
         from appliance.configuration.inventory import inventory  # noqa: PLC0415  only for this query
@@ -95,17 +93,14 @@ class Queries:
         )
         return msgspec.structs.replace(found, in_use=used)
 
-    @admin.answers(admin.GraphWanted)
     async def graph(self, _request: admin.GraphWanted) -> Graph:
         """Return nodes, topics and services with their traffic."""
         return graph_of(self.parts)
 
-    @admin.answers(admin.MonitorsWanted)
     async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
         """Return all monitors with state and counters."""
         return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
 
-    @admin.answers(admin.TopicLook, who=True)
     async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
         """Return the next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyTapsError`."""
         if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
@@ -152,14 +147,12 @@ class Queries:
             seconds=ONE_LOOK,
         )
 
-    @admin.answers(admin.MetricsWanted)
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         """Return the status and all counters."""
         return measures_of(
             self.parts, self.trail.meter, self._status(), self.hosts.rows(), self.queued_deliveries()
         )
 
-    @admin.answers(admin.RegistrationsWanted)
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
         """Return all live rights that a change of the policy may end."""
         return Registrations([Registration(**live.fields()) for live in self.live()])

@@ -68,20 +68,17 @@ class RecordingOrders:
 
     # --- what operators ask -------------------------------------------------------------------------------
 
-    @admin.answers(admin.RecordingsWanted)
     async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
         """Return the kept recordings, oldest first."""
         self._require()
         rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
         return Recordings(kept, list(rules.topics), list(rules.never), rules.before)
 
-    @admin.answers(admin.RecordingWanted)
     async def recording(self, request: admin.RecordingWanted) -> Recording:
         """Return one recording."""
         self._require()
         return self._find(request.id)
 
-    @admin.answers(admin.RecordNow, who=True)
     async def now(self, request: admin.RecordNow, who: str) -> RecordingBegun:
         """Begin a recording now, without a trigger."""
         self._require()
@@ -130,12 +127,10 @@ class RecordingOrders:
         self._plan.opened(charged_to, begun.id, begun.began, begun.ends)
         return begun
 
-    @admin.answers(admin.RecordingFetch, who=True)
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
         """Record who fetches a recording. The api reads its messages from the disk."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)
 
-    @admin.answers(admin.RecordingRead, who=True)
     async def read(self, request: admin.RecordingRead, who: str) -> Recording:
         """Record who reads messages of a recording. Repetitions within a few seconds are only counted."""
         topics = request.topics
@@ -165,7 +160,6 @@ class RecordingOrders:
             raise RecorderAwayError(f"nothing can be fetched while the order cannot be recorded: {failure}")
         return recording
 
-    @admin.answers(admin.RecordingOfMemory, who=True)
     async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
         """Make a temporary recording of the messages in memory."""
         self._require()
@@ -185,7 +179,6 @@ class RecordingOrders:
         self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_TEMPORARY:])
         return lent.recording
 
-    @admin.answers(admin.RecordingRemove, who=True)
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
         """Remove a recording."""
         self._require()

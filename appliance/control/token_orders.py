@@ -36,7 +36,6 @@ class TokenOrders:
         self._untold = bool(store.settings().get(_UNTOLD))
         self._changed = changed
 
-    @admin.answers(admin.TokenList)
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
         """Return all tokens, including ended ones, oldest first."""
         return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
@@ -79,7 +78,6 @@ class TokenOrders:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
 
-    @admin.answers(admin.TokenAdd)
     async def add(self, request: admin.TokenAdd) -> answers.NewToken:
         """Make a token. Only this answer contains its text. Raises `TokenRefusedError` and `StoreError`."""
         name, seconds, now = request.name, request.seconds, time.time()
@@ -110,7 +108,6 @@ class TokenOrders:
             raise
         return answers.NewToken(*_fields(row), token=text)
 
-    @admin.answers(admin.TokenRevoke)
     async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
         """End a token now. Raises `TokenRefusedError` and `StoreError`."""
         name, now = request.name, time.time()

@@ -163,7 +163,6 @@ class Certification:
             kept=kept or {},
         )
 
-    @admin.answers(admin.RevocationsWanted)
     async def revocations(self, _request: admin.RevocationsWanted) -> RevocationList:
         """Return the authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
@@ -172,7 +171,6 @@ class Certification:
             raise HostRefusedError(str(error), ours=True) from error
         return RevocationList(listed.decode())
 
-    @admin.answers(admin.AuthorityWanted)
     async def authority(self, _request: admin.AuthorityWanted) -> AuthorityCertificate:
         """Return the authority's certificate, in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())

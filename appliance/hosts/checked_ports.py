@@ -29,7 +29,6 @@ class PortChecks:
         self._view = view
         self._machines = machines
 
-    @admin.answers(admin.HostPorts, who=True)
     async def tell(self, request: admin.HostPorts, who: str) -> PortsReport:
         """Store and record the result of a check. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)

@@ -66,7 +66,6 @@ class HostEnrolment:
 
     # --- queries ---
 
-    @admin.answers(admin.HostList)
     async def listed(self, _request: admin.HostList) -> answers.Hosts:
         """Return every host and machine, and the state of the tunnels."""
         machines = self.ports.in_clear_text()
@@ -75,7 +74,13 @@ class HostEnrolment:
             self._table.revision,
             self._view.rows(),
             self._view.machines(machines),
-            **{name: getattr(status, name) for name in _OVERVIEW},
+            esp=status.esp,
+            key_exchange=status.key_exchange,
+            post_quantum=status.post_quantum,
+            pool=status.pool,
+            address=status.address,
+            hosts_file=status.hosts_file,
+            troubles=status.troubles,
         )
 
     def status(self) -> IpsecState:
@@ -86,12 +91,10 @@ class HostEnrolment:
         """Return every host, enrolled, awaited or declared."""
         return self._view.rows()
 
-    @admin.answers(admin.HostEndpoint)
     async def endpoint(self, _request: admin.HostEndpoint) -> answers.Endpoint:
         """Return the address at which hosts reach the appliance."""
         return await self._find_endpoint()
 
-    @admin.answers(admin.HostKit)
     async def kit(self, request: admin.HostKit) -> answers.KitParts:
         """Return the parts of an enrolled host's kit. Raises `HostRefusedError`."""
         self._table.enrolled_row(request.name)
@@ -99,7 +102,6 @@ class HostEnrolment:
 
     # --- changes by operators ---
 
-    @admin.answers(admin.HostAdd, who=True)
     async def add(self, request: admin.HostAdd, who: str) -> answers.KitParts:
         """Enrol a host; return its kit's parts. Raises `HostRefusedError`, `HostsChangedError`, `StoreError`."""
         name = request.name
@@ -115,7 +117,6 @@ class HostEnrolment:
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
-    @admin.answers(admin.HostRenew, who=True)
     async def renew(self, request: admin.HostRenew, who: str) -> answers.KitParts:
         """Replace and revoke a host's certificate; return the parts of its kit. Raises as `add`."""
         name = request.name
@@ -130,7 +131,6 @@ class HostEnrolment:
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
 
-    @admin.answers(admin.HostToken, who=True)
     async def token(self, request: admin.HostToken, who: str) -> answers.EnrolmentToken:
         """Return a one-time token for a host. Raises as `add`."""
         name = request.name
@@ -192,7 +192,6 @@ class HostEnrolment:
                 script=filled("enrol.sh", {"name": name, **known}),
             )
 
-    @admin.answers(admin.HostRevoke, who=True)
     async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:
         """Revoke an enrolled host and close its connections, or revoke an awaited host's token. Raises as `add`."""
         name = request.name
@@ -221,7 +220,6 @@ class HostEnrolment:
         await self._carried_out()
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
-    @admin.answers(admin.HostsReload, who=True)
     async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
         """Read hosts.yaml again and open or close tunnels. Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
@@ -285,9 +283,6 @@ class HostEnrolment:
 def _fingerprint(certificate: bytes) -> str:
     """Return the SHA-256 of a certificate (PEM), in hexadecimal."""
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()
-
-
-_OVERVIEW = ("esp", "key_exchange", "post_quantum", "pool", "address", "hosts_file", "troubles")
 
 
 _ENDPOINT_SECONDS = 20.0

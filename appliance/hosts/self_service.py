@@ -43,7 +43,6 @@ class HostSelfService:
             if name.startswith(_RENEWED)
         }
 
-    @admin.answers(admin.HostEnrol)
     async def enrol(self, request: admin.HostEnrol) -> KitParts:
         """Enrol a host by its one-time token and a signing request. Raises `HostRefusedError`."""
         async with self._certification.changing:
@@ -68,7 +67,6 @@ class HostSelfService:
             )
             return await self._certification.finish(name, awaited.kit)
 
-    @admin.answers(admin.HostRenewItself)
     async def renew(self, request: admin.HostRenewItself) -> NewCertificate:
         """Issue the next certificate to a host that requests it through its tunnel. Raises `HostRefusedError`."""
         name = request.name
@@ -96,7 +94,6 @@ class HostSelfService:
                 name, made.serial, made.expires, made.certificate.decode(), authority.decode()
             )
 
-    @admin.answers(admin.HostRenewed)
     async def renewed(self, request: admin.HostRenewed) -> Renewed:
         """Replace a host's certificate by the next one, which the host has installed. Raises `HostRefusedError`."""
         name = request.name

@@ -145,7 +145,8 @@ class Signer:
         try:
             text = self._removals.approve(checkpoint, newest)
         except (RemovalRefusedError, CheckpointRefusedError, OSError) as error:
-            return messages.RemovalRefused(number, str(error), getattr(error, "early", False))
+            early = isinstance(error, RemovalRefusedError) and error.early
+            return messages.RemovalRefused(number, str(error), early)
         return messages.RemovalApproved(number, text, self._key.sign(text), self._public_key)
 
     def _issue(self, wanted: messages.CertificateWanted) -> messages.Message:

@@ -27,6 +27,8 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
+from appliance.base.user_errors import UserError
+
 DIRECTORY = Path("/run/netns")
 _HERE = Path("/proc/thread-self/ns/net")  # the calling thread's namespace
 _CLONE_NEWNET = 0x40000000
@@ -43,7 +45,7 @@ _VALID_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}")
 T = TypeVar("T")
 
 
-class NetworkError(RuntimeError):
+class NetworkError(UserError):
     """Report an obstacle in this machine's network; the message has the cause, the place and the remedy."""
 
 

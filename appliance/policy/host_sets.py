@@ -132,7 +132,8 @@ class HostSets:
         shift = min(
             (shift for shift, table in self._lengths[plain.version] if number >> shift in table), default=0
         )
-        return ipaddress.ip_network((number >> shift << shift if shift else number, bits - shift))
+        network = ipaddress.IPv4Network if plain.version == 4 else ipaddress.IPv6Network
+        return network((number >> shift << shift, bits - shift))
 
     def above(self, atoms: Iterable[Atom]) -> frozenset[Atom]:
         """Return the atoms and every group that contains one of them, at any depth."""

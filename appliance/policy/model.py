@@ -12,13 +12,11 @@ from typing import Literal
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
-class _IPv4(ipaddress.IPv4Address):
-    """An address that stores its hash and its text. The standard library computes both at each use."""
-
-    __slots__ = ("_hash", "_text")
+class _Stored:
+    """Store the hash and the text of an address. The standard library computes both at each use."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(text)
+        super().__init__(text)  # type: ignore[call-arg]  # the next base is an address
         self._hash, self._text = super().__hash__(), super().__str__()
 
     def __hash__(self) -> int:
@@ -28,20 +26,12 @@ class _IPv4(ipaddress.IPv4Address):
         return self._text
 
 
-class _IPv6(ipaddress.IPv6Address):
-    """Like `_IPv4`."""
+class _IPv4(_Stored, ipaddress.IPv4Address):
+    pass
 
-    __slots__ = ("_hash", "_text")
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._hash, self._text = super().__hash__(), super().__str__()
-
-    def __hash__(self) -> int:
-        return self._hash
-
-    def __str__(self) -> str:
-        return self._text
+class _IPv6(_Stored, ipaddress.IPv6Address):
+    pass
 
 
 @lru_cache(4096)

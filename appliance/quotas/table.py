@@ -451,5 +451,12 @@ DESCRIPTORS = QuotaRow(
     shown_by=("unit/quotas/test_descriptors.py::test_all_quotas_together_fit_the_descriptors",),
 )
 
-QUOTA_ROWS: tuple[QuotaRow, ...] = tuple(row for row in list(globals().values()) if isinstance(row, QuotaRow))
-"""Every row above, in the order of the page."""
+QUOTA_ROWS = (
+    RVMASTER_CONNECTIONS, RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_FAREWELLS, RVMASTER_REQUESTS,
+    RVMASTER_TIME, PARAMETER_BYTES, LARGE_WRITES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
+    RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
+    RECORDER_MEMORY, RECORDER_DISK, DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS, REST_STREAM_PEERS,
+    REST_EXPORTS, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
+    IKE_HANDSHAKES, DESCRIPTORS,
+)  # fmt: skip
+"""Every row, in the order of the page. A test checks that none is missing."""

@@ -7,8 +7,8 @@ lifeline as `Failed`, with a text for operators.
 
 import contextlib
 import gc
-import importlib
 import os
+import pkgutil
 import signal
 import socket
 import sys
@@ -132,11 +132,10 @@ def _require(account: Account, path: str, mode: int) -> None:
 def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
     assert plan.entry is not None  # noqa: S101  a plan has either argv or entry
     _require(plan.account, str(Path(appliance.__file__).parent), os.R_OK | os.X_OK)
-    module, _, function = plan.entry.partition(":")
     from appliance.supervisor.logs import configure_logs  # noqa: PLC0415  not for an external program
 
     configure_logs(role)
-    entry = getattr(importlib.import_module(module), function)
+    entry = pkgutil.resolve_name(plan.entry)  # a child imports only the modules of its role
     gc.freeze()  # imported modules live as long as the process, so the collector can skip them
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:

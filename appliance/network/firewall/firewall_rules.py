@@ -281,9 +281,9 @@ class FirewallSettings:
                 PortRange.one(port)
         for network in (*self.api_networks, *self.tunnel_only, *self.neighbours):
             family_of(network)
-        for name in ("control_uid", "rosmaster_uid"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} {getattr(self, name)} is not a user id")
+        for name, uid in (("control_uid", self.control_uid), ("rosmaster_uid", self.rosmaster_uid)):
+            if uid < 0:
+                raise ValueError(f"{name} {uid} is not a user id")
 
     @property
     def api_ports(self) -> PortRange | None:

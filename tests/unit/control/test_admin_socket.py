@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from appliance.base.withdrawal import take_effect
-from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, PolicyConfirm, decode, encode
 from appliance.channel.answers.policy_answers import PolicyConfirmed
 from appliance.cli.connection import admin_client
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
 from appliance.control.admin_socket import AdminServer
 from appliance.control.administration import Administration
+from appliance.control.request_methods import RequestMethod
 
 pytestmark = pytest.mark.anyio
 
@@ -29,8 +29,7 @@ class Slow:
         self.ended: asyncio.Queue[str] = asyncio.Queue()
         self.done = 0
 
-    @admin.answers(admin.PolicyConfirm, who=True)
-    async def confirm(self, _request: admin.PolicyConfirm, who: str) -> PolicyConfirmed:
+    async def confirm(self, _request: PolicyConfirm, who: str) -> PolicyConfirmed:
         """Wait, then change something."""
         self.begun.set()
         try:
@@ -49,9 +48,10 @@ async def served(state: Path) -> AsyncIterator[Slow]:
     async def durable() -> None:
         """Do nothing: the test's state needs no disk."""
 
-    slow: Any = Slow()
+    slow = Slow()
+    methods = [RequestMethod(PolicyConfirm, slow.confirm, who=True)]
     looks: Any = object()
-    administration = Administration(looks, slow, durable=durable, require_room=lambda: None)
+    administration = Administration(looks, methods, durable=durable, require_room=lambda: None)
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listening.bind(str(state / ADMIN_SOCKET))
     listening.listen()

@@ -3,16 +3,43 @@
 import inspect
 import typing
 from collections import Counter
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 from appliance.channel import admin, messages
-from appliance.channel.admin import answer_to, methods_of
+from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
-from appliance.control.administration import Orders
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.policies import Policies
 from appliance.control.queries import Queries
+from appliance.control.recording_orders import RecordingOrders
+from appliance.control.request_methods import request_methods
+from appliance.control.token_orders import TokenOrders
+from appliance.hosts.certification import Certification
+from appliance.hosts.checked_ports import PortChecks
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.hosts.self_service import HostSelfService
+from appliance.specifications.specification_manager import SpecificationManager
 
-MARKED = [marked for part in (Queries, *get_args(Orders)) for marked in methods_of(part)]
+
+class Hosts(HostEnrolment):
+    """The classes of the parts of host enrolment, in place of the parts."""
+
+    itself = cast(HostSelfService, HostSelfService)
+    ports = cast(PortChecks, PortChecks)
+
+
+CLASSES: dict[str, Any] = {
+    "queries": Queries,
+    "policies": Policies,
+    "monitors": SpecificationManager,
+    "hosts": Hosts,
+    "certification": Certification,
+    "tokens": TokenOrders,
+    "recordings": RecordingOrders,
+    "evidence": EvidenceOrders,
+}
+METHODS = request_methods(**CLASSES)
 REQUESTS: tuple[type[Any], ...] = tuple(
     dict.fromkeys([*get_args(admin.AnyRequest), *get_args(admin.RestRequest)])
 )
@@ -56,11 +83,11 @@ ANSWERED = [one for one in REQUESTS if one is not admin.ChallengeWanted]
 
 def test_one_method_answers_each_request() -> None:
     """Each request has exactly one method, which takes the request as its argument; mypy compares the answers."""
-    assert Counter(mark.request for mark, _method in MARKED) == Counter(ANSWERED)
-    for mark, method in MARKED:
-        hints = typing.get_type_hints(method)
+    assert Counter(method.request for method in METHODS) == Counter(ANSWERED)
+    for method in METHODS:
+        hints = typing.get_type_hints(method.answer)
         del hints["return"]
-        assert list(hints.values()) == [mark.request, str] if mark.who else [mark.request], method
+        assert list(hints.values()) == [method.request, *([str] if method.who else [])]
 
 
 def test_every_field_between_processes_has_a_type() -> None:

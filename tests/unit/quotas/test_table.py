@@ -3,10 +3,10 @@
 import ast
 from pathlib import Path
 
-from appliance.quotas.table import QUOTA_ROWS
+from appliance.quotas import table
+from appliance.quotas.table import QUOTA_ROWS, QuotaRow
 from distribution.quotas_page import page
 
-_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 ROOT = Path(__file__).parents[3]
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -14,6 +14,11 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 def test_the_page_is_up_to_date() -> None:
     """docs/reference/quotas.md equals the output of `python -m distribution.quotas_page`."""
     assert (ROOT / "docs/reference/quotas.md").read_text() == page()
+
+
+def test_every_row_is_on_the_page() -> None:
+    """`QUOTA_ROWS` has every row that the module defines, once, in the order of its definition."""
+    assert tuple(row for row in vars(table).values() if isinstance(row, QuotaRow)) == QUOTA_ROWS
 
 
 def test_each_row_is_attacked_by_a_test_that_exists() -> None:
