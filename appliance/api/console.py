@@ -8,11 +8,15 @@ Invariants:
    system.
 3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
    becomes markup (Trusted Types).
+4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking. All
+   modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API.
 """
 
+import gzip
 import hashlib
 import html
 import mimetypes
+import re
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import NamedTuple
@@ -20,11 +24,16 @@ from typing import NamedTuple
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
+from appliance.api.console_bundle import ModuleError, join_modules, join_styles
 from appliance.api.problems import ProblemError
 from appliance.configuration.settings import Settings
 
 VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
 _PREFIX = "/console/static/"
+_PAGE, _SCRIPT, _STYLE = "index.html", "js/main.js", "css/main.css"
+_ADDRESS = re.compile(rf"{_PREFIX}([\w./-]+)")
+_GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(?:\.0*)?\s*(?:,|$))", re.IGNORECASE)
+_LEVEL = 9  # of gzip; the files are compressed once
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
 _HEADERS = {
     "Content-Security-Policy": (
@@ -43,16 +52,41 @@ _HEADERS = {
 class _File(NamedTuple):
     body: bytes
     media_type: str
-    etag: str
+    digest: str
+    packed: bytes | None = None  # gzip, of lasting files that it makes smaller
+    lasting: bool = False  # its address changes with its content
 
 
 def routes(settings: Settings) -> APIRouter:
-    """Return the routes, which are not part of the contract."""
+    """Return the routes, which are not part of the contract.
+
+    Raise `ModuleError` if the console's modules cannot be joined.
+    """
     router = APIRouter(include_in_schema=False)
     served = _collect(files("appliance.api") / "console", "")
-    page = served["index.html"] = _stating(
-        served["index.html"],
-        {"lock-seconds": f"{settings.api_lock_seconds:g}", "notice": settings.api_notice},
+    texts = {name: served[name].body.decode() for name in served if name.endswith((".js", ".css", ".html"))}
+    addresses: dict[str, str] = {}
+    joined = {_SCRIPT: join_modules(texts, _SCRIPT), _STYLE: join_styles(texts, _STYLE)}
+
+    def named(found: re.Match[str]) -> str:
+        """Return the lasting address of a file that a text names."""
+        name = found[1]
+        if name not in served:
+            raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
+        if name not in addresses:
+            body = _ADDRESS.sub(named, joined[name]).encode() if name in joined else served[name].body
+            lasting = _file(body, served[name].media_type, lasting=True)
+            stem, _, ending = name.rpartition(".")
+            addresses[name] = f"{stem}.{lasting.digest}.{ending}"
+            served[addresses[name]] = lasting
+        return _PREFIX + addresses[name]
+
+    page = served[_PAGE] = _file(
+        _stating(
+            _ADDRESS.sub(named, texts[_PAGE]),
+            {"lock-seconds": f"{settings.api_lock_seconds:g}", "notice": settings.api_notice},
+        ).encode(),
+        served[_PAGE].media_type,
     )
 
     async def index(request: Request) -> Response:
@@ -77,10 +111,16 @@ def routes(settings: Settings) -> APIRouter:
 
 
 def _answer(request: Request, found: _File) -> Response:
-    headers = {**_HEADERS, "ETag": found.etag}
-    if request.headers.get("if-none-match") == found.etag:
+    packed = found.packed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
+    etag = f'"{found.digest}{"-gzip" if packed else ""}"'
+    headers = {**_HEADERS, "ETag": etag, "Vary": "Accept-Encoding"}
+    if found.lasting:
+        headers["Cache-Control"] = "public, max-age=31536000, immutable"
+    if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers=headers)
-    return Response(found.body, headers=headers, media_type=found.media_type)
+    if packed:
+        headers["Content-Encoding"] = "gzip"
+    return Response(packed or found.body, headers=headers, media_type=found.media_type)
 
 
 def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
@@ -94,19 +134,20 @@ def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
     return found
 
 
-def _stating(page: _File, said: dict[str, str]) -> _File:
+def _stating(page: str, said: dict[str, str]) -> str:
     """Return the page with the site's settings in its `meta` elements."""
-    body = page.body.decode()
     for name, text in said.items():
         empty = f'<meta name="rosrv:{name}" content="'
-        before, found, after = body.partition(empty)
+        before, found, after = page.partition(empty)
         assert found, name  # noqa: S101  the page has a `meta` element for each setting
-        body = f"{before}{found}{html.escape(text)}{after}"
-    return _file(body.encode(), page.media_type)
+        page = f"{before}{found}{html.escape(text)}{after}"
+    return page
 
 
-def _file(body: bytes, media_type: str) -> _File:
-    return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+def _file(body: bytes, media_type: str, *, lasting: bool = False) -> _File:
+    packed = gzip.compress(body, _LEVEL, mtime=0) if lasting else body
+    digest = hashlib.sha256(body).hexdigest()[:32]
+    return _File(body, media_type, digest, packed if len(packed) < len(body) else None, lasting)
 
 
 def _media_type(name: str) -> str:

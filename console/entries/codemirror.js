@@ -1,4 +1,5 @@
 // The parts of CodeMirror that the editors of policies and specifications use.
+export { autocompletion, closeCompletion, completionKeymap, currentCompletions } from "@codemirror/autocomplete";
 export { defaultKeymap, history, historyKeymap } from "@codemirror/commands";
 export { HighlightStyle, StreamLanguage, syntaxHighlighting } from "@codemirror/language";
 export { lintGutter, setDiagnostics } from "@codemirror/lint";

@@ -108,9 +108,44 @@ def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
     page.get_by_role("link", name=re.compile("^Audit")).first.focus()
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     page.keyboard.press("Enter")
-    page.locator("tbody tr a").first.focus()
+    row = page.locator("tbody tr a").first
+    row.focus()
     page.keyboard.press("Enter")
-    expect(page.get_by_role("region", name=re.compile(r"^Record \d"))).to_be_visible()
+    expect(page.get_by_role("region", name=re.compile(r"^Record \d"))).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(row).to_be_focused()
+
+
+def test_single_keys_can_be_turned_off(opened: Callable[..., Reader]) -> None:
+    """Turned off in the list of keys, they do nothing, also after a reload; the button opens the list again."""
+    page = opened().go("audit?decision=deny")
+    page.keyboard.press("?")
+    switch = page.get_by_role("dialog", name="Keys").get_by_label("Keys without Ctrl or Alt")
+    switch.press("Space")
+    page.keyboard.press("Escape")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page.reload()
+    expect(page.locator("tbody tr").first).to_be_visible()
+    for key in ("j", "4", "t", "?"):
+        page.keyboard.press(key)
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    assert page.url.endswith("/console/audit?decision=deny")
+    page.locator("tbody tr a").first.press("Enter")
+    record = page.get_by_role("region", name=re.compile(r"^Record \d"))
+    expect(record).to_be_focused()
+    page.keyboard.press("Escape")
+    expect(record).to_have_count(0)
+    page.get_by_role("button", name="Keys").press("Enter")
+    switch.press("Space")
+    page.keyboard.press("Escape")
+    page.keyboard.press("4")
+    expect(page.get_by_role("heading", level=1, name="Policy")).to_be_visible()
+    text = page.get_by_label("Access policy")
+    expect(text).to_be_visible()
+    page.keyboard.press("i")
+    expect(text).to_be_focused()
+    page.keyboard.press("5")
+    expect(text).to_contain_text("5[Nodes]")
 
 
 def test_the_theme_is_the_systems_until_the_reader_chooses(opened: Callable[..., Reader]) -> None:

@@ -134,6 +134,26 @@ def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: 
         assert b"/evident" in bundle.read("records.ndjson")
 
 
+def test_a_narrow_list_shows_rule_and_reason(
+    opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
+) -> None:
+    """At the width of a telephone, a card has rule and reason; a record without a rule has no such line."""
+    refuse(attempt, "/narrow")
+    reason = appliance.recorded("--deny", caller_id="/narrow")[0]["reason"]
+    reader = opened(width=390, height=844)
+    page = reader.go("audit?decision=deny&caller_id=/narrow")
+    card = page.locator("tbody tr").first
+    expect(card.locator("td[data-label=Rule]")).to_have_text("[Publishers] /guarded")
+    expect(card.locator("td[data-label=Rule]")).to_be_visible()
+    expect(card.locator("td[data-label=Reason]")).to_contain_text(str(reason)[:60])
+    expect(card.locator("td[data-label=Reason]")).to_be_visible()
+    reader.fits()
+    page = reader.go("audit?event=appliance started")
+    card = page.locator("tbody tr").first
+    expect(card).to_be_visible()
+    expect(card.locator("td[data-label=Rule]")).to_be_hidden()
+
+
 def test_an_unknown_record_shows_an_error(opened: Callable[..., Reader]) -> None:
     """A URL with an unknown record shows the appliance's error, and the list beside it."""
     page = opened().go("audit/ffffffffffffffffffff")

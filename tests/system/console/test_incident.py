@@ -24,6 +24,7 @@ default = *
 [Publishers]
 default = *
 /rude = *
+/guarded = 10.9.9.9
 
 [Subscribers]
 default = *
@@ -38,6 +39,7 @@ api_limits: {requests_per_second: 500, burst: 2000}
 audit: {reserve_bytes: 1MiB}
 recorder: {enabled: true, memory: 16MiB, disk: 512MiB, before: 20, after: 1, triggers: [drop]}
 """
+MOST_KEYS = 25  # from Now to a policy in force, without signing in and without text
 MONITOR = """
 NAME() {
     event said(std::string text) TOPIC std_msgs/String '{data:text}' { return; }
@@ -84,40 +86,110 @@ def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def press(locator: Locator, key: str = "Enter") -> None:
-    """Press a key on an element, as a user without a pointer does.
-
-    This is a single driver action: between two actions the live view may replace the focused element.
-    """
+    """Press a key on an element, as a user without a pointer does."""
     locator.press(key)
 
 
-def come_in(page: Page, token: str) -> None:
-    """Sign out, and in again with another token."""
-    press(page.get_by_role("button", name="Sign out"))
-    expect(page.get_by_label("Access token")).to_be_focused()
-    page.keyboard.insert_text(token)
-    page.keyboard.press("Enter")
-    expect(page.locator("[data-standing=live]")).to_be_visible()
-    expect(page.get_by_role("heading", level=1)).to_be_visible()
+class Keys:
+    """Press keys on the page, wherever its focus is, and count them."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.count = 0
+
+    def press(self, *keys: str) -> None:
+        """Press one key after the other."""
+        for key in keys:
+            self.page.keyboard.press(key)
+            self.count += 1
+
+    def step_to(self, locator: Locator) -> None:
+        """Press `j` until the element has the focus."""
+        expect(locator).to_be_visible()
+        while not locator.evaluate("element => element === document.activeElement"):
+            assert self.count < MOST_KEYS
+            self.press("j")
 
 
 def test_an_incident_by_keys(
     recording: dict[str, Any], appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
 ) -> None:
-    """Keys lead from Now to the drop, its record, the time line, messages and evidence; then to a tighter policy."""
-    reader = opened(token("investigator", "carol"))
-    page = reader.go("now")
+    """At most 25 keys lead from Now to the drop, its record, time line, messages and evidence; then to a new policy."""
+    page = opened(token("investigator", "carol")).go("now")
+    keys = Keys(page)
     actions = page.get_by_role("region", name="Recent actions of monitors").get_by_role("listitem")
-    press(actions.filter(has_text="/rude").get_by_role("link"))
-    panel = page.locator(".record")
-    expect(panel).to_contain_text("/lout")
-    press(panel.get_by_role("link", name="Time line"))
+    keys.step_to(actions.filter(has_text="/rude").get_by_role("link"))
+    keys.press("Enter")
+    record = page.get_by_role("region", name=re.compile(r"^Record \d"))
+    expect(record).to_be_focused()
+    expect(record).to_contain_text("/lout")
+    expect(record.get_by_role("link", name="Time line")).to_be_visible()
+    keys.press("r")
 
     expect(page.get_by_role("heading", level=1, name="Recording")).to_be_visible()
     chosen = page.locator(".incident-grid").get_by_role("region", name="message dropped")
     expect(chosen).to_contain_text("/rude")
     expect(chosen).to_contain_text("127.0.0.1")
     expect(page.get_by_role("img", name="/rude: ")).to_be_visible()
+    keys.press("m")
+    said = page.get_by_role("list", name="Messages")
+    expect(said).to_contain_text("<b>bad</b>")
+    expect(said).to_contain_text("/lout")
+    records = appliance.recorded("--event", "recording read")
+    assert {record["detail"]["who"] for record in records} == {"carol"}
+    with page.expect_download() as bundle:
+        keys.press("e")
+    with zipfile.ZipFile(bundle.value.path()) as archive:
+        assert "recording/recording.bag" in archive.namelist()
+
+    admin = opened()
+    keys.page = page = admin.go("now")
+    keys.press("4")
+    expect(admin.editor()).to_contain_text("/rude")
+    keys.press("i", "Control+a")
+    page.keyboard.insert_text(POLICY.replace("/rude = *", "/rude = 10.9.9.9"))  # pasted
+    keys.press("Control+s")
+    expect(page.get_by_text("It can be loaded")).to_be_visible()
+    keys.press("Escape", "l")
+    expect(page.get_by_role("dialog").get_by_label("Comment")).to_be_focused()
+    keys.press("Enter")
+    expect(admin.toast("is in force")).to_be_visible()
+    assert appliance.rest().get("/v1/policy").json["text"].count("/rude = 10.9.9.9") == 1
+    assert keys.count <= MOST_KEYS
+
+
+def test_a_denial_is_granted_by_keys(
+    appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
+) -> None:
+    """At most 25 keys lead from Now to a denial, the change that would grant it, and its load."""
+    arguments = ("registerPublisher", "/asker", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
+    assert attempt(*arguments)[0] != 1
+    reader = opened()
+    page = reader.go("now")
+    keys = Keys(page)
+    denied = page.get_by_role("region", name="Recently denied").get_by_role("listitem")
+    keys.step_to(denied.filter(has_text="/asker").get_by_role("link"))
+    keys.press("Enter")
+    record = page.get_by_role("region", name=re.compile(r"^Record \d"))
+    expect(record.get_by_role("button", name="Grant this")).to_be_visible()
+    keys.press("g")
+    expect(record.get_by_role("region", name="What would grant it")).to_be_focused()
+    expect(record.get_by_role("button", name="Open in the editor")).to_be_in_viewport()
+    keys.press("g")
+    expect(page.get_by_text("changed here, not loaded")).to_be_visible()
+    keys.press("l")
+    expect(page.get_by_role("dialog").get_by_label("Comment")).to_be_focused()
+    keys.press("Enter")
+    expect(reader.toast("is in force")).to_be_visible()
+    assert attempt(*arguments)[0] == 1
+    assert keys.count <= MOST_KEYS
+
+
+def test_the_time_line_moves_by_keys(
+    recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
+) -> None:
+    """The arrows move the selected time, + and 0 zoom; the messages of one topic are read alone."""
+    page = opened(token("investigator", "dora")).go(f"recordings/{recording['id']}", heading="Recording")
     slider = page.get_by_role("slider", name="Moment")
     before = slider.get_attribute("aria-valuenow")
     press(slider, "ArrowLeft")
@@ -126,28 +198,8 @@ def test_an_incident_by_keys(
     expect(page.locator(".skeleton")).to_have_count(0)
     page.keyboard.press("0")
     press(page.get_by_role("button", name="/rude", exact=True))
-    press(page.get_by_role("button", name="Read messages"))
-    said = page.get_by_role("list", name="Messages")
-    expect(said).to_contain_text("<b>bad</b>")
-    expect(said).to_contain_text("/lout")
-    records = appliance.recorded("--event", "recording read")
-    assert {record["detail"]["who"] for record in records} == {"carol"}
-    with page.expect_download() as bundle:
-        press(page.get_by_role("button", name="Evidence"))
-    with zipfile.ZipFile(bundle.value.path()) as archive:
-        assert "recording/recording.bag" in archive.namelist()
-
-    come_in(page, str(appliance.ready["token"]))
-    page.keyboard.press("4")
-    expect(page.locator("[data-editor] .cm-content").first).to_contain_text("/rude")
-    reader.editor().focus()
-    page.keyboard.press("Control+a")
-    page.keyboard.insert_text(POLICY.replace("/rude = *", "/rude = 10.9.9.9"))
-    page.keyboard.press("Control+s")
-    press(page.get_by_role("button", name="Load", exact=True))
-    press(page.get_by_role("dialog").get_by_role("button", name="Load the policy"))
-    expect(reader.toast("is in force")).to_be_visible()
-    assert appliance.rest().get("/v1/policy").json["text"].count("/rude = 10.9.9.9") == 1
+    page.keyboard.press("m")
+    expect(page.get_by_role("list", name="Messages")).to_contain_text("<b>bad</b>")
 
 
 def test_a_viewer_sees_which_role_may_read_messages(

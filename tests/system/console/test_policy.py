@@ -1,14 +1,19 @@
 """Test the view Policy: edit, explain, test, load with commit-confirm, roll back; two engineers at once."""
 
+import http.client
 import re
+import urllib.parse
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import expect
 
+from roswire.xmlrpc import build_call, parse_response
 from tests.support.appliance import Appliance
+from tests.support.robot import MACHINES, Robot
 from tests.system.console.conftest import CONFIG, POLICY
 from tests.system.console.reader import Reader
 
@@ -44,6 +49,7 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
     before = revision(appliance)
     reader = opened()
     page = reader.go("policy")
+    load = page.get_by_role("button", name="Load", exact=True)
     reader.write(POLICY.replace("[Subscribers]", "bogus\n[Subscribrs]"))
     finding = page.locator(".finding").first
     expect(finding).to_contain_text("9:1")
@@ -52,6 +58,13 @@ def test_an_error_is_shown_at_its_line_and_changes_nothing(
     expect(page.locator(".cm-lint-marker-error")).to_have_count(2)
     finding.click()
     expect(page.locator(".cm-lineNumbers .cm-activeLineGutter")).to_have_text("9")
+    expect(load).to_have_attribute("aria-disabled", "true")
+    expect(load).to_have_accessible_description("2 errors")
+    load.press("Enter")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    reader.write(POLICY + "\n# without errors\n")
+    expect(load).not_to_have_attribute("aria-disabled", "true")
+    expect(page.get_by_text("2 errors", exact=True)).to_have_count(0)
     assert revision(appliance) == before
 
 
@@ -73,6 +86,60 @@ def test_the_editor_has_exactly_the_typed_text(opened: Callable[..., Reader]) ->
     assert reader.editor().inner_text() == first
 
 
+def test_the_editor_completes_by_keys(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """Sections, live topics, groups of the text and live hosts are proposed while typing; arrows and Enter choose."""
+    address = min(MACHINES)
+    with Robot(appliance.master_uri):
+        reader = opened()
+        page = reader.go("policy")
+        reader.write("[Groups]\ntablets = 10.0.0.8\n\n")
+        proposals = page.get_by_role("listbox", name="Completions")
+
+        def choose(typed: str, proposed: str) -> None:
+            """Type, and choose the first proposal."""
+            page.keyboard.type(typed)
+            first = proposals.get_by_role("option").first
+            expect(first).to_have_accessible_name(proposed)
+            page.keyboard.press("ArrowDown")
+            expect(first).to_have_attribute("aria-selected", "true")
+            page.keyboard.press("Enter")
+            expect(proposals).to_have_count(0)
+
+        choose("[Pub", "[Publishers] section")
+        page.keyboard.press("Enter")
+        choose("/lidar/r", "/lidar/range topic")
+        choose(" = tab", "tablets group")
+        choose(f" {address[:-1]}", f"{address} host")
+        expect(reader.editor()).to_contain_text(f"[Publishers]/lidar/range = tablets {address}")
+        page.keyboard.press("Enter")
+        page.keyboard.type("/lid")
+        expect(proposals).to_be_visible()
+        page.keyboard.press("Escape")
+        expect(proposals).to_have_count(0)
+        page.keyboard.type("ar = ")
+        page.keyboard.press("Control+Space")
+        expect(proposals.get_by_role("option", name="robot group")).to_be_visible()
+        assert reader.axe() == []
+    reader.write("[Groups]\ntablets = 10.0.0.8\n\n[Nodes]\n/a = ")
+    page.keyboard.type("tab")
+    expect(proposals).to_be_visible()
+    page.keyboard.press("Enter")  # without a choice: it ends the line
+    page.keyboard.type("/b")
+    assert str(reader.editor().inner_text()).endswith("/a = tab\n/b")
+
+
+def test_the_first_view_does_not_load_the_editor(opened: Callable[..., Reader]) -> None:
+    """The editor is fetched with the first view that has one, and the graph with the first name to complete."""
+    reader = opened()
+    page = reader.go("now")
+    reader.settle()
+    assert not [url for url in reader.asked if "codemirror" in url]
+    page.keyboard.press("4")
+    expect(reader.editor()).to_be_visible()
+    assert [url for url in reader.asked if "codemirror" in url]
+    assert not [url for url in reader.asked if url.endswith("/v1/graph")]
+
+
 def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: Callable[..., Reader]) -> None:
     """A dry run shows the changes and the diff; loading makes a new revision with author and comment."""
     before = revision(appliance)
@@ -91,6 +158,36 @@ def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: C
     expect(page.locator(".head-sub")).to_contain_text("ticket 812")
     assert revision(appliance) == before + 1
     assert appliance.rest().get("/v1/policy").json["who"] == "first"
+
+
+def publish(master: str, address: str, topic: str) -> None:
+    """Register a publisher as a node on this address of the machine."""
+    node, port = f"/mover_{address[-1]}", urllib.parse.urlsplit(master).port
+    call = build_call("registerPublisher", (node, topic, "std_msgs/String", f"http://{address}:1/"))
+    with closing(http.client.HTTPConnection("127.0.0.1", port, source_address=(address, 0))) as connection:
+        connection.request("POST", "/", call, {"Content-Type": "text/xml"})
+        answer = parse_response(connection.getresponse().read())
+    assert isinstance(answer, list), answer
+    assert answer[0] == 1, answer
+
+
+def test_a_dry_run_groups_what_would_end_by_host(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """Each host has one line with the number of its connections, the most first; the line opens to list them."""
+    for address, topics in (("127.0.0.2", ["/wheel"]), ("127.0.0.3", ["/arm", "/hand", "/head"])):
+        for topic in topics:
+            publish(appliance.master_uri, address, topic)
+    reader = opened()
+    page = reader.go("policy")
+    denied = "".join(f"{topic} = 10.9.9.9\n" for topic in ("/wheel", "/arm", "/hand", "/head"))
+    reader.write(POLICY.replace("[Publishers]\n", f"[Publishers]\n{denied}"))
+    page.get_by_role("button", name="Dry run").click()
+    notice = page.get_by_role("status").filter(has_text="would end 4 live connections")
+    lines = notice.locator("summary")
+    expect(lines).to_have_text(["127.0.0.3: 3 connections", "127.0.0.2: 1 connection"])
+    expect(notice.get_by_text("/hand")).to_be_hidden()
+    lines.first.press("Enter")
+    expect(notice.get_by_text("/hand")).to_be_visible()
+    expect(notice.get_by_text("/wheel")).to_be_hidden()
 
 
 def test_commit_confirm_keeps_or_rolls_back_a_policy(

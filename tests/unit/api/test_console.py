@@ -14,6 +14,7 @@ from appliance.api.console import VIEWS, routes
 from appliance.api.problems import ProblemError
 from appliance.api.request_gate import is_console
 from appliance.configuration.settings import Settings
+from appliance.policy import sections
 from appliance.policy.model import Category
 from tests.support.asgi import requested
 
@@ -49,10 +50,8 @@ def client() -> Client:
 def test_the_page_is_served_at_every_view(client: Client) -> None:
     """`/`, `/console` and each view, also with deeper addresses, serve the page; an unknown view is 404."""
     paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
-    page = (
-        (FILES / "index.html").read_text().replace('lock-seconds" content=""', 'lock-seconds" content="900"')
-    )
-    assert {client.get(path).text for path in paths} == {page}
+    [page] = {client.get(path).text for path in paths}
+    assert '<meta name="rosrv:lock-seconds" content="900">' in page
     assert client.get("/console/elsewhere").status_code == 404
 
 
@@ -96,6 +95,29 @@ def test_a_cached_file_is_not_sent_again(client: Client) -> None:
     again = client.get("/console/static/js/main.js", headers={"If-None-Match": first.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
     assert client.get("/console/static/css/base.css").headers["etag"] != first.headers["etag"]
+
+
+def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client) -> None:
+    """The page's files, and those that they name, have addresses by content: kept without asking, sent as gzip."""
+    seen = {"/console"}
+    todo = ["/console"]
+    while todo:
+        text = client.get(todo.pop()).text
+        for address in set(re.findall(r"/console/static/[\w./-]+", text)) - seen:
+            seen.add(address)
+            answer = client.get(address, headers={"Accept-Encoding": "gzip"})
+            assert answer.headers["cache-control"] == "public, max-age=31536000, immutable", address
+            assert address.rsplit(".", 2)[1] == hashlib.sha256(answer.content).hexdigest()[:32]
+            if address.endswith((".js", ".css")):
+                assert answer.headers["content-encoding"] == "gzip", address
+                todo.append(address)
+            plain = client.get(address, headers={"Accept-Encoding": "gzip;q=0"})
+            assert "content-encoding" not in plain.headers
+            assert plain.content == answer.content
+            assert plain.headers["etag"] != answer.headers["etag"] or not address.endswith((".js", ".css"))
+    assert {Path(address).name.partition(".")[0] for address in seen} == {
+        "console", "early", "main", "preact", "dagre", "codemirror", "inter", "jetbrains-mono", "icon"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -225,6 +247,13 @@ def _luminance(colour: str) -> float:
         part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
     )
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def test_the_editor_completes_every_section() -> None:
+    """The editor of the policy proposes the sections that a policy can have, and no other."""
+    text = (FILES / "js" / "policy" / "complete.js").read_text()
+    table = text.partition("SECTIONS = ")[2].partition("});")[0]
+    assert set(re.findall(r"^  (\w+): {", table, re.MULTILINE)) == {*sections.NAMES}
 
 
 def test_the_console_explains_every_category_of_decision() -> None:

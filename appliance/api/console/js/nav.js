@@ -7,6 +7,7 @@ import { Icon, Mark } from "./parts/icon.js";
 import { Link, place, VIEWS } from "./router.js";
 import { end, session } from "./session.js";
 import { Pulse } from "./standing.js";
+import { listKeys } from "./shortcuts.js";
 import { useStore } from "./store.js";
 import { switchTheme, theme } from "./theme.js";
 
@@ -28,6 +29,7 @@ export function Nav() {
     <div class="side-foot"><${Pulse} />
       <div class="who"><span class="who-name"><${Given} value=${current?.name} most=${40} /></span><span class="muted small" data-role=${current?.role}>${current?.role}</span></div>
       <div class="side-buttons"><${ThemeSwitch} />
+        <button class="button plain" onClick=${listKeys} aria-label="Keys" title="Keys" aria-keyshortcuts="?"><${Icon} name="keyboard" /></button>
         <button class="button plain" onClick=${() => end(null)} aria-label="Sign out" title="Sign out"><${Icon} name="out" /></button></div>
     </div></header>`;
 }
@@ -35,5 +37,5 @@ export function Nav() {
 function ThemeSwitch() {
   const dark = useStore(theme) === "dark";
   const word = dark ? "Use the light theme" : "Use the dark theme";
-  return html`<button class="button plain" onClick=${switchTheme} aria-label=${word} title=${word}><${Icon} name=${dark ? "sun" : "moon"} /></button>`;
+  return html`<button class="button plain" onClick=${switchTheme} aria-label=${word} title=${word} aria-keyshortcuts="t"><${Icon} name=${dark ? "sun" : "moon"} /></button>`;
 }

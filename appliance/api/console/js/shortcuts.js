@@ -1,43 +1,88 @@
-/** Keys: 1 to 7 select a view, / searches in the view, t switches the theme, ? shows this list. */
+/**
+ * Single keys. A control names its key in `aria-keyshortcuts`, and the key presses it; a view adds keys that belong to
+ * no control with `useKeys`. They act outside of fields, editors and dialogs, and can be turned off (WCAG 2.1.4).
+ */
 
-import { html, useEffect, useState } from "./html.js";
+import { html, useEffect, useRef } from "./html.js";
 import { Dialog } from "./parts/dialog.js";
-import { go, VIEWS } from "./router.js";
-import { switchTheme } from "./theme.js";
+import { Check } from "./parts/field.js";
+import { createStore, useStore } from "./store.js";
 
-const LIST = [
+const KEPT = "rosrv.keys";
+const LIST = /** @type {[string, string][]} */ ([
   ["1 … 7", "Now, Graph, Audit, Policy, Monitors, Hosts, Recordings"],
   ["/", "Search in the view"],
-  ["j, k", "Next and previous record (Audit) or event (recordings)"],
+  ["j, k", "Next and previous entry (Now), record (Audit) or event (recordings)"],
+  ["Enter, Esc", "Open; close the open record or dialog, leave the editor"],
+  ["g", "In a record: show what would grant it, then open that in the editor"],
+  ["p, r", "In a record: its rule in the policy; its time line in a recording"],
+  ["m, e", "In a recording: read messages; evidence (also in Audit)"],
   ["← →, + −, 0", "Move and zoom on a recording's time line; Shift: ten times as far"],
-  ["Esc", "Close the open record or dialog"],
+  ["i, d, l", "In Policy: into the editor, dry run, load"],
+  ["Ctrl Space", "In the policy's editor: complete; arrows and Enter choose"],
   ["Ctrl S", "Dry run of the text in the editor"],
   ["t", "Dark or light"],
   ["?", "This list"],
-];
+]);
 
+export const keys = createStore({ on: remembered(), listed: false });
+
+export function listKeys() {
+  keys.update({ listed: true });
+}
+
+/** Listen to the keys of controls, and return the list of keys while it is open. */
 export function useShortcuts() {
-  const [open, setOpen] = useState(false);
+  const { on, listed } = useStore(keys);
+  useKeys((key, event) => {
+    if (key.length !== 1 || event.repeat) return false;
+    const named = key === "/" ? "[data-search]" : `[aria-keyshortcuts="${CSS.escape(key)}"]`;
+    const control = /** @type {HTMLElement | undefined} */ ([...document.querySelectorAll(named)].find((one) => one.getClientRects().length));
+    if (!control) return false;
+    // A disabled control takes the focus, so that its reason is read.
+    if (key === "/" || control.shadowRoot || control.ariaDisabled === "true") /** @type {HTMLElement} */ (control.shadowRoot?.querySelector("[contenteditable]") ?? control).focus();
+    else control.click();
+    return true;
+  });
+  return listed && html`<${Dialog} title="Keys" close=${() => keys.update({ listed: false })}>
+    <dl class="facts">${LIST.map(([key, does]) => html`<dt key=${key}><code>${key}</code></dt><dd>${does}</dd>`)}</dl>
+    <${Check} label="Keys without Ctrl or Alt" on=${on} set=${turn} /></${Dialog}>`;
+}
+
+/** Call `does` for each key that is meant for the view; it returns whether it used the key. @param {(key: string, event: KeyboardEvent) => boolean} does */
+export function useKeys(does) {
+  const newest = useRef(does);
+  newest.current = does;
   useEffect(() => {
     const heard = (/** @type {KeyboardEvent} */ event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || typing(event) || document.querySelector("dialog[open]")) return;
-      const view = VIEWS[Number(event.key) - 1];
-      if (view) go(`/console/${view}`);
-      else if (event.key === "t") switchTheme();
-      else if (event.key === "?") setOpen(true);
-      else if (event.key === "/") /** @type {HTMLElement | null} */ (document.querySelector("[data-search]"))?.focus();
-      else return;
-      event.preventDefault();
+      if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented || typing(event) || document.querySelector("dialog[open]")) return;
+      if (event.key.length === 1 && !keys.get().on) return;
+      if (newest.current(event.key, event)) event.preventDefault();
     };
     addEventListener("keydown", heard);
     return () => removeEventListener("keydown", heard);
   }, []);
-  return open && html`<${Dialog} title="Keys" close=${() => setOpen(false)}>
-    <dl class="facts">${LIST.map(([key, does]) => html`<dt key=${key}><code>${key}</code></dt><dd>${does}</dd>`)}</dl></${Dialog}>`;
 }
 
-/** Whether a key press belongs to a field or an editor. @param {Event} event */
-export function typing(event) {
+/** Whether a key press belongs to a field or an editor. */
+function typing(/** @type {Event} */ event) {
   const target = /** @type {HTMLElement} */ (event.composedPath()[0]);
   return target instanceof HTMLElement && (target.isContentEditable || /^(INPUT|TEXTAREA|SELECT)$/.test(target.tagName));
+}
+
+function turn(/** @type {boolean} */ on) {
+  try {
+    localStorage.setItem(KEPT, on ? "on" : "off");
+  } catch {
+    // without storage, the choice lasts until the page is closed
+  }
+  keys.update({ on });
+}
+
+function remembered() {
+  try {
+    return localStorage.getItem(KEPT) !== "off";
+  } catch {
+    return true;
+  }
 }

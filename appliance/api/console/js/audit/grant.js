@@ -1,6 +1,6 @@
 /** "Grant this": the smallest change of the policy that grants a denied request, with a link to the editor. */
 
-import { html, useState } from "../html.js";
+import { html, useEffect, useRef, useState } from "../html.js";
 import { Button } from "../parts/button.js";
 import { UnifiedDiff } from "../parts/difference.js";
 import { Given } from "../parts/given.js";
@@ -14,6 +14,8 @@ export function Grant({ id }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
   const [unsaved, setUnsaved] = useState(false); // whether this change would replace an unsaved text
   const [error, setError] = useState(/** @type {unknown} */ (null));
+  const shown = useRef(/** @type {HTMLElement | null} */ (null));
+  useEffect(() => shown.current?.focus(), [found]);
   const ask = async () => {
     setError(null);
     try {
@@ -32,9 +34,9 @@ export function Grant({ id }) {
     go("/console/policy");
   };
   if (error) return html`<${Failure} error=${error} retry=${ask} />`;
-  if (!found) return html`<div class="row"><${Button} onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;
-  if (!found.added.length) return html`<p role="status">The policy in force grants it: it was denied for another reason, or before this revision.</p>`;
-  return html`<section class="stack-tight" aria-label="What would grant it"><${UnifiedDiff} lines=${found.diff} />
+  if (!found) return html`<div class="row"><${Button} aria-keyshortcuts="g" onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;
+  if (!found.added.length) return html`<p role="status" tabindex="-1" ref=${shown}>The policy in force grants it: it was denied for another reason, or before this revision.</p>`;
+  return html`<section class="stack-tight" tabindex="-1" ref=${shown} aria-label="What would grant it"><${UnifiedDiff} lines=${found.diff} />
     ${found.findings.length > 0 && html`<p>The policy's tests fail with it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
-    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has unloaded changes, which would be lost." : "A dry run there lists the affected hosts; load it with automatic rollback."}</span></div></section>`;
+    <div class="row"><${Button} role="operator" tone="primary" aria-keyshortcuts="g" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has unloaded changes, which would be lost." : "A dry run there lists the affected hosts; load it with automatic rollback."}</span></div></section>`;
 }

@@ -44,7 +44,7 @@ export function Export({ filter }) {
 /** An evidence bundle of the filtered period. @param {{filter: Record<string, string>}} given */
 export function Evidence({ filter: { since, until } }) {
   return html`<${Button} role=${may("investigator") ? "investigator" : "operator"} disabled=${!since} why="Choose a start time first"
-    onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, `rosrv-evidence-${now()}.zip`)}
+    aria-keyshortcuts="e" onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, `rosrv-evidence-${now()}.zip`)}
     title="Everything in this period, with the policy and specifications in force, as a signed bundle"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
 }
 

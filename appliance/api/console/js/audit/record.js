@@ -30,8 +30,9 @@ export function RecordPanel({ id, filter }) {
   useEffect(() => {
     if (matchMedia("(max-width: 1240px)").matches) box.current?.scrollIntoView({ block: "start" });
   }, [id, value !== null]);
+  useEffect(() => box.current?.focus({ preventScroll: true }), []);
   const close = () => go(auditPath(filter));
-  return html`<section class="panel record" aria-labelledby="record" ref=${box}>
+  return html`<section class="panel record" aria-labelledby="record" tabindex="-1" ref=${box}>
     <div class="panel-head"><h2 id="record">Record ${value ? value.record.sequence : ""}</h2><span class="end"><button class="button plain small" onClick=${close} aria-label="Close the record"><${Icon} name="close" size=${16} /></button></span></div>
     ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${6} />` : html`<${Shown} shown=${value} filter=${filter} />`}</section>`;
 }
@@ -49,7 +50,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
       <dt>Severity</dt><dd><${Badge} word=${record.severity} /></dd>
       ${record.duration_us !== null && html`<dt>Decided in</dt><dd>${record.duration_us} µs</dd>`}
       ${record.revision !== null && html`<dt>Policy</dt><dd>revision ${record.revision}</dd>`}
-      ${record.decision && html`<dt>Rule</dt><dd><${Rule} rule=${record.rule} revision=${record.revision} /></dd>`}
+      ${record.decision && html`<dt>Rule</dt><dd><${Rule} rule=${record.rule} revision=${record.revision} keys="p" /></dd>`}
     </dl>
     ${((MONITORS.has(record.event) && !record.detail.count) || isDenial(record)) && html`<${Why} key=${record.id} id=${record.id} />`}
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}

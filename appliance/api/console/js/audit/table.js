@@ -21,13 +21,13 @@ function Row(/** @type {{record: any, chosen: boolean, filter: Record<string, st
     open();
   };
   const who = record.caller_id || record.detail.who;
-  return html`<tr class=${`pick${chosen ? " chosen" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-sequence=${record.sequence}>
+  return html`<tr class=${`pick${chosen ? " chosen" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
     <td class="nowrap"><a href=${auditPath(filter, record.id)} onClick=${link}><${Moment} at=${record.time} /></a></td>
     <td><${Outcome} record=${record} /></td>
     <td><${Given} value=${record.event === "decision" ? record.category : record.event} most=${30} /></td>
     <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono /></td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>
-    <td class="wide-only">${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
-    <td class="wide-only reason"><${Given} value=${record.reason} most=${110} /></td></tr>`;
+    <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
+    <td data-label="Reason" class=${`wide-only reason${record.reason ? "" : " bare"}`}><${Given} value=${record.reason} most=${110} /></td></tr>`;
 }

@@ -5,7 +5,7 @@ import { counted } from "../numbers.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
 import { go, place } from "../router.js";
-import { typing } from "../shortcuts.js";
+import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { auditPath, filterOf, Filters } from "./filters.js";
 import { Presets } from "./presets.js";
@@ -21,6 +21,7 @@ export function Audit() {
   const [following, setFollowing] = useState(false);
   const { records, cursor, notes, error, loading, standing, older, again } = useRecords(filter, following);
   useSteps(records, chosen, filter);
+  useReturn(chosen);
   return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">
         <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
@@ -40,20 +41,25 @@ export function Audit() {
 
 /** j and k move through the records, Escape closes the open one. */
 function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
-  const newest = useRef({ records, chosen, filter });
-  newest.current = { records, chosen, filter };
-  useEffect(() => {
-    const heard = (/** @type {KeyboardEvent} */ event) => {
-      const { records, chosen, filter } = newest.current;
-      if (typing(event) || event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || !records) return;
-      if (event.key === "Escape" && chosen) go(auditPath(filter));
-      const step = { j: 1, k: -1 }[event.key];
-      if (!step) return;
+  useKeys((key) => {
+    const step = { j: 1, k: -1 }[key];
+    if (key === "Escape" && chosen) go(auditPath(filter));
+    else if (step && records?.length) {
       const at = records.findIndex((one) => one.id === chosen || String(one.sequence) === chosen);
-      const next = records[at < 0 ? 0 : Math.min(records.length - 1, Math.max(0, at + step))];
-      if (next) go(auditPath(filter, next.id));
-    };
-    addEventListener("keydown", heard);
-    return () => removeEventListener("keydown", heard);
-  }, []);
+      go(auditPath(filter, records[at < 0 ? 0 : Math.min(records.length - 1, Math.max(0, at + step))].id));
+    } else return false;
+    return true;
+  });
+}
+
+/** When a record closes, the focus that was in it returns to its row. */
+function useReturn(/** @type {string} */ chosen) {
+  const before = useRef(chosen);
+  useEffect(() => {
+    const closed = before.current;
+    before.current = chosen;
+    if (chosen || !closed || document.activeElement !== document.body) return;
+    const name = CSS.escape(closed);
+    /** @type {HTMLElement | null} */ (document.querySelector(`tr:is([data-id="${name}"], [data-sequence="${name}"]) a`) ?? document.getElementById("main"))?.focus();
+  }, [chosen]);
 }

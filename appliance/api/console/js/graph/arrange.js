@@ -4,7 +4,13 @@
  * they are connected to; in a narrow frame, below all other items.
  */
 
-import { Graph, layout } from "/console/static/vendor/dagre.js";
+const SOURCE = "/console/static/vendor/dagre.js";
+let dagre = /** @type {any} */ (null);
+
+/** Load the library for layouts, before the first use of `arrange` and `afresh`. */
+export async function loadLayout() {
+  dagre ??= await import(SOURCE);
+}
 
 /** @typedef {{x: number, y: number, w: number, h: number}} Spot the middle and the size */
 
@@ -76,7 +82,7 @@ function inColumns(parts, left, top) {
 
 /** Compute the whole layout again. @param {Map<string, any>} items @param {Map<string, any>} lines @param {boolean} narrow */
 export function afresh(items, lines, narrow) {
-  const graph = new Graph({ multigraph: false });
+  const graph = new dagre.Graph({ multigraph: false });
   graph.setGraph({ rankdir: "LR", nodesep: GAP, ranksep: COLUMN, edgesep: 8, ranker: items.size > 150 ? "longest-path" : "tight-tree", acyclicer: "greedy" });
   graph.setDefaultEdgeLabel(() => ({}));
   for (const key of [...items.keys()].sort()) {
@@ -88,7 +94,7 @@ export function afresh(items, lines, narrow) {
     if (line.from !== line.to) graph.setEdge(line.from, line.to, { weight: line.kind === "denied" ? 1 : 3 });
   }
   const began = performance.now();
-  layout(graph);
+  dagre.layout(graph);
   performance.measure("layout of the graph", { start: began });
   /** @type {Map<string, Spot>} */
   const spots = new Map();

@@ -1,13 +1,13 @@
 /** Graph: nodes, topics and services, through the relay or past it, and denied hosts. */
 
-import { html, useMemo, useRef, useState } from "../html.js";
+import { html, useEffect, useMemo, useRef, useState } from "../html.js";
 import { live } from "../live.js";
 import { notable } from "../notable.js";
 import { counted } from "../numbers.js";
 import { Check } from "../parts/field.js";
-import { Empty, Loading } from "../parts/notice.js";
+import { Empty, Failure, Loading } from "../parts/notice.js";
 import { useStore } from "../store.js";
-import { afresh, arrange } from "./arrange.js";
+import { afresh, arrange, loadLayout } from "./arrange.js";
 import { collapse } from "./collapse.js";
 import { Details } from "./details.js";
 import { Drawing } from "./drawing.js";
@@ -28,14 +28,20 @@ export function GraphView() {
   const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
   const [form, setForm] = useState("drawing");
   const [round, setRound] = useState(0);
+  const [layout, setLayout] = useState({ loaded: false, error: /** @type {any} */ (null) });
+  const load = () => loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
+  useEffect(() => {
+    load();
+  }, []);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
-  const shown = useMemo(() => (model ? collapse(model, opened, by, MOST) : null), [model, opened, by]);
+  const shown = useMemo(() => (model && layout.loaded ? collapse(model, opened, by, MOST) : null), [model, opened, by, layout]);
   const { spots, arranged, narrow } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`, NARROW.matches);
   const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
+  if (layout.error) return html`${head}<${Failure} error=${layout.error} retry=${load} />`;
   if (!graph || !shown || !model) return html`${head}<section class="panel"><${Loading} rows=${8} /></section>`;
   const choose = (/** @type {string | null} */ key) => setChosen(key === null ? null : shownKey(key, shown));
   const item = chosen ? shown.items.get(chosen) ?? model.items.get(chosen) : null;

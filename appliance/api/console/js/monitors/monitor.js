@@ -24,7 +24,7 @@ import { useStore } from "../store.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
 import { counters, stateOf } from "./state.js";
-import { MonitorSwitch, Promote, Resume } from "./view.js";
+import { MonitorSwitch, Promote, Resume } from "./switches.js";
 
 /** @param {{name: string, row: any, monitors: any}} given `row` is undefined for a monitor that is not loaded */
 export function MonitorPage({ name, row, monitors }) {

@@ -5,7 +5,7 @@ import { live } from "../live.js";
 import { Moment } from "../moments.js";
 import { count, counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
-import { Button, Switch } from "../parts/button.js";
+import { Button } from "../parts/button.js";
 import { By, Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
@@ -17,6 +17,7 @@ import { useStore } from "../store.js";
 import { MonitorPage } from "./monitor.js";
 import { LoadSpecification } from "./load.js";
 import { counters, stateOf, useMonitors } from "./state.js";
+import { MonitorSwitch, Promote, Resume } from "./switches.js";
 
 export function Monitors() {
   const { rest: chosen } = useStore(place);
@@ -64,47 +65,4 @@ function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {
 function summed(/** @type {any[]} */ samples, /** @type {string} */ name) {
   const [first, ...rest] = [0, 1, 2].map((place) => counters(samples, name, place));
   return first.map((point, index) => ({ time: point.time, value: point.value === null ? null : rest.reduce((sum, one) => sum + (one[index].value ?? 0), point.value) }));
-}
-
-/** @param {{row: any, monitors: any}} given */
-export function MonitorSwitch({ row, monitors }) {
-  const on = row.enabled || row.shadow;
-  const change = async () => {
-    try {
-      await monitors.change(row.name, { enabled: !on });
-      done(`${row.name} is ${on ? "disabled" : "enabled"}`, on ? "Messages pass unchanged." : "It handles events from now on.");
-    } catch (failure) {
-      failed(failure);
-    }
-    await monitors.again();
-  };
-  return html`<${Switch} role="operator" on=${on} label=${`${row.name} enabled`} change=${change} />`;
-}
-
-/** Promote from shadow mode, or (disabled) move into shadow mode. @param {{row: any, monitors: any}} given */
-export function Promote({ row, monitors }) {
-  const change = async () => {
-    try {
-      await monitors.change(row.name, { shadow: !row.shadow });
-      done(row.shadow ? `${row.name} is promoted` : `${row.name} is in shadow mode`, row.shadow ? "It acts from now on." : "It only records what it would have done.");
-    } catch (failure) {
-      failed(failure);
-    }
-    await monitors.again();
-  };
-  return html`<${Button} small role="operator" onClick=${change}><${Icon} name=${row.shadow ? "up" : "play"} size=${14} />${row.shadow ? "Promote" : "Try"}</${Button}>`;
-}
-
-/** @param {{row: any, monitors: any}} given */
-export function Resume({ row, monitors }) {
-  const change = async () => {
-    try {
-      await monitors.change(row.name, { held: false });
-      done(`${row.name} is resumed`, "Its topics are released.");
-    } catch (failure) {
-      failed(failure);
-    }
-    await monitors.again();
-  };
-  return html`<${Button} small role="operator" onClick=${change}><${Icon} name="play" size=${14} />Resume</${Button}>`;
 }

@@ -31,7 +31,7 @@ export function Doings() {
 }
 
 function List(/** @type {{records: any[], what: (record: any, more: any[]) => any}} */ { records, what }) {
-  return html`<ul class="event-list">${alike(records).slice(0, SHOWN).map(({ first, more }) => html`<li key=${first.id} class="event">
+  return html`<ul class="event-list">${alike(records).slice(0, SHOWN).map(({ first, more }) => html`<li key=${(more.at(-1) ?? first).id} class="event">
     <span class="event-time"><${Moment} at=${first.time} /></span>${what(first, more)}</li>`)}</ul>`;
 }
 

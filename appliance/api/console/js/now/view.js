@@ -10,6 +10,7 @@ import { By, Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
+import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
 import { activity, droppedByMonitors } from "./activity.js";
@@ -23,6 +24,14 @@ export function Now() {
   const samples = useStore(live, (one) => one.samples);
   const incidents = useStore(notable, (one) => one.incidents);
   const now = useNow(5000);
+  useKeys((key) => {
+    const step = { j: 1, k: -1 }[key];
+    if (!step) return false;
+    const entries = /** @type {HTMLElement[]} */ ([...document.querySelectorAll("main :is(.alarm-text, .event-reason a)")]);
+    const at = entries.indexOf(/** @type {HTMLElement} */ (document.activeElement));
+    entries[at < 0 ? 0 : Math.min(entries.length - 1, Math.max(0, at + step))]?.focus();
+    return true;
+  });
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
   const alarms = [...conditions, ...activity(samples)];
   return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>

@@ -12,11 +12,16 @@ import { policyLanguage, rvLanguage } from "./languages.js";
 const SOURCE = "/console/static/vendor/codemirror.js";
 
 /**
- * @param {{label: string, value: string, change?: (text: string) => void, language: "policy" | "rv", findings?: any[],
- *   line?: {number: number, column?: number, count: number} | null, dry?: () => void, height?: string}} given
- * Without `change`, the editor is read-only. A new `line.count` moves to that line.
+ * The proposals at the end of `before`, and the number of its characters that they replace.
+ * @typedef {(before: string, after: string, asked: boolean) => Promise<{length: number, proposals: {word: string, kind: string}[]} | null>} Complete
  */
-export function Editor({ label, value, change, language, findings = [], line = null, dry, height = "60vh" }) {
+
+/**
+ * @param {{label: string, value: string, change?: (text: string) => void, language: "policy" | "rv", findings?: any[],
+ *   line?: {number: number, column?: number, count: number} | null, dry?: () => void, keys?: string, complete?: Complete, height?: string}} given
+ * `keys`: the key that moves into the editor; Escape leaves it. Without `change`, the editor is read-only. A new `line.count` moves to that line.
+ */
+export function Editor({ label, value, change, language, findings = [], line = null, dry, keys, complete, height = "60vh" }) {
   const host = useRef(/** @type {HTMLElement | null} */ (null));
   const held = useRef(/** @type {any} */ (null));
   const newest = useRef({ change, dry, told: /** @type {Set<string>} */ (new Set()) });
@@ -28,7 +33,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
     import(SOURCE).then((mirror) => {
       if (gone || !host.current) return;
       const root = host.current.shadowRoot ?? host.current.attachShadow({ mode: "open" });
-      held.current = { mirror, view: build(mirror, root, { label, value, language, height, writable: Boolean(change), newest }) };
+      held.current = { mirror, view: build(mirror, root, { label, value, language, height, writable: Boolean(change), complete, newest }) };
       setReady(true);
     });
     return () => {
@@ -65,10 +70,10 @@ export function Editor({ label, value, change, language, findings = [], line = n
     if (line.count > 0) view.focus();
   }, [line?.number, line?.count, ready]);
 
-  return html`<div class="editor" ref=${host} data-editor=${language} data-ready=${String(ready)}></div>`;
+  return html`<div class="editor" ref=${host} data-editor=${language} aria-keyshortcuts=${keys} data-ready=${String(ready)}></div>`;
 }
 
-function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @type {any} */ { label, value, language, height, writable, newest }) {
+function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @type {any} */ { label, value, language, height, writable, complete, newest }) {
   const { EditorView, EditorState, keymap } = mirror;
   const dry = () => (newest.current.dry?.(), true);
   return new EditorView({
@@ -76,9 +81,10 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
     state: EditorState.create({
       doc: value,
       extensions: [
+        ...(complete ? completion(mirror, complete) : []),
         mirror.lineNumbers(), mirror.lintGutter(), mirror.highlightActiveLine(), mirror.highlightActiveLineGutter(),
         mirror.history(), mirror.highlightSpecialChars(), mirror.search({ top: true }), mirror.highlightSelectionMatches(),
-        keymap.of([{ key: "Mod-s", run: dry, preventDefault: true }, ...mirror.searchKeymap, ...mirror.historyKeymap, ...mirror.defaultKeymap]),
+        keymap.of([{ key: "Mod-s", run: dry, preventDefault: true }, ...mirror.searchKeymap, ...mirror.historyKeymap, ...mirror.defaultKeymap, { key: "Escape", run: leave }]),
         mirror.StreamLanguage.define(language === "policy" ? policyLanguage : rvLanguage),
         mirror.syntaxHighlighting(colours(mirror)), look(EditorView, height),
         EditorState.readOnly.of(!writable), EditorView.contentAttributes.of({ "aria-label": label, "aria-readonly": String(!writable), tabindex: "0" }),
@@ -87,6 +93,31 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
       ],
     }),
   });
+}
+
+/**
+ * Complete while typing, or on Ctrl Space. No proposal is selected at first: Enter ends the line, and only a proposal
+ * that was chosen with the arrows changes the text. Escape closes the list; without a list it leaves the editor, also
+ * while proposals are awaited.
+ */
+function completion(/** @type {any} */ mirror, /** @type {Complete} */ complete) {
+  const source = async (/** @type {any} */ { pos, state, explicit }) => {
+    const found = await complete(state.sliceDoc(0, pos), state.sliceDoc(pos), explicit);
+    return found && { from: pos - found.length, options: found.proposals.map(({ word, kind }) => ({ label: word, detail: kind })) };
+  };
+  const escape = (/** @type {any} */ view) => {
+    const listed = mirror.currentCompletions(view.state).length > 0;
+    mirror.closeCompletion(view);
+    return listed;
+  };
+  const keys = mirror.completionKeymap.map((/** @type {any} */ one) => (one.key === "Escape" ? { ...one, run: escape } : one));
+  return [mirror.autocompletion({ override: [source], defaultKeymap: false, selectOnOpen: false, interactionDelay: 0, icons: false }), mirror.keymap.of(keys)];
+}
+
+/** Leave the editor, so that Tab and the keys of the view work again. */
+function leave(/** @type {any} */ view) {
+  view.contentDOM.blur();
+  return true;
 }
 
 function tell(/** @type {any} */ reader, /** @type {string} */ text) {
@@ -136,6 +167,12 @@ function look(/** @type {any} */ EditorView, /** @type {string} */ height) {
     ".cm-selectionBackground, &.cm-focused .cm-selectionBackground, ::selection": { backgroundColor: "var(--chosen) !important" },
     ".cm-cursor": { borderLeftColor: "var(--text)" },
     ".cm-tooltip": { backgroundColor: "var(--surface)", border: "1px solid var(--line-strong)", borderRadius: "5px", color: "var(--text)", maxWidth: "560px" },
+    ".cm-tooltip-autocomplete ul": { fontFamily: "var(--mono) !important", maxHeight: "15em" },
+    ".cm-tooltip-autocomplete ul li": { display: "flex", gap: "16px", justifyContent: "space-between", padding: "3px 10px !important" },
+    ".cm-tooltip-autocomplete ul li[aria-selected]": { background: "var(--accent-fill) !important", color: "var(--on-accent) !important" },
+    ".cm-completionMatchedText": { textDecoration: "none", fontWeight: "700" },
+    ".cm-completionDetail": { fontFamily: "var(--sans)", fontStyle: "normal", color: "var(--muted)", margin: "0" },
+    "li[aria-selected] .cm-completionDetail": { color: "inherit" },
     ".cm-diagnostic": { fontFamily: "var(--sans)", fontSize: "13px", padding: "6px 10px", whiteSpace: "pre-wrap" },
     ".cm-diagnostic-error": { borderLeft: "3px solid var(--deny)" },
     ".cm-diagnostic-warning": { borderLeft: "3px solid var(--warn)" },

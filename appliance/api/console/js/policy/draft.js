@@ -12,13 +12,14 @@ export const draft = createStore({
   signature: "", // the site's signature of the text
   error: /** @type {unknown} */ (null),
   findings: /** @type {any[]} */ ([]),
+  errors: 0, // in the text and its tests, as last checked; an error of the signature is not one of them
   report: /** @type {any} */ (null), // of the last dry run or load
   tested: /** @type {any} */ (null),
 });
 
 session.subscribe(() => {
   const { current, locked } = session.get();
-  if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], report: null, tested: null });
+  if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], errors: 0, report: null, tested: null });
 });
 
 /** Fetch the policy in force. An edited text stays, together with the revision that it started from. */
@@ -34,13 +35,16 @@ export async function look() {
 }
 
 export function write(/** @type {string} */ text) {
-  if (text !== draft.get().text) draft.update({ text, report: null });
+  const { text: before, base } = draft.get();
+  if (text === before) return;
+  draft.update({ text, report: null });
+  if (text === base) draft.update({ error: null, findings: [], errors: 0 }); // it is not checked again
 }
 
 /** Discard the edited text and start again from the policy in force. */
 export function discard() {
   const { live } = draft.get();
-  draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, findings: [], report: null, tested: null });
+  draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, error: null, findings: [], errors: 0, report: null, tested: null });
 }
 
 /** Keep the edited text, but base it on the revision that is now in force. */
@@ -54,9 +58,9 @@ export async function check(/** @type {AbortSignal} */ signal) {
   const { text } = draft.get();
   try {
     const { body } = await ask("POST", "/v1/policy/test", { json: { text }, signal });
-    if (draft.get().text === text) draft.update({ tested: body, findings: [], error: null });
+    if (draft.get().text === text) draft.update({ tested: body, findings: [], errors: 0, error: null });
   } catch (error) {
-    if (!signal.aborted && draft.get().text === text) refused(error);
+    if (!signal.aborted && draft.get().text === text) refused(error, { signed: false });
   }
 }
 
@@ -65,7 +69,7 @@ export async function dryRun() {
   const { text, signature } = draft.get();
   try {
     const { body } = await ask("POST", "/v1/policy", { query: { dry_run: 1 }, json: { text, signature } });
-    draft.update({ report: body, findings: body.warnings, error: null });
+    draft.update({ report: body, findings: body.warnings, errors: 0, error: null });
   } catch (error) {
     refused(error);
     throw error;
@@ -77,7 +81,7 @@ export async function load(note, within) {
   const { text, signature, etag } = draft.get();
   try {
     const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note, signature }, match: etag ?? "" });
-    draft.update({ report: body, findings: body.warnings, base: text, etag: next, error: null });
+    draft.update({ report: body, findings: body.warnings, errors: 0, base: text, etag: next, error: null });
     await look();
     return body;
   } catch (error) {
@@ -100,7 +104,9 @@ export async function revisions(/** @type {AbortSignal} */ signal) {
   return (await get("/v1/policy/revisions", {}, signal)).revisions;
 }
 
-function refused(/** @type {any} */ error) {
+/** @param {any} error @param {{signed?: boolean}} [how] `signed`: the signature was checked too, so an error may be its own */
+function refused(error, { signed = draft.get().live?.site_keys.length > 0 } = {}) {
   const findings = Array.isArray(error?.findings) ? error.findings : [];
   draft.update({ error, findings, report: null, tested: null });
+  if (!signed) draft.update({ errors: findings.filter((/** @type {any} */ one) => one.severity === "error").length });
 }

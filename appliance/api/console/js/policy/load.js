@@ -1,6 +1,7 @@
 /** Load the text, permanently or with commit-confirm. */
 
 import { html, useEffect, useState } from "../html.js";
+import { counted } from "../numbers.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Difference } from "../parts/difference.js";
@@ -22,7 +23,7 @@ function preselected(report) {
 
 /** @param {{close: () => void}} given */
 export function LoadDialog({ close }) {
-  const { live, text, signature, etag, report } = useStore(draft);
+  const { live, text, signature, etag, report, errors } = useStore(draft);
   const [note, setNote] = useState("");
   const [chosen, setWithin] = useState(/** @type {string | null} */ (null));
   const within = chosen ?? preselected(report);
@@ -44,11 +45,15 @@ export function LoadDialog({ close }) {
       else if (/** @type {any} */ (failure).findings?.length && !live.site_keys.length) close();
     }
   };
-  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} tone="primary" role="admin" onClick=${go}>Load the policy</${Button}>`;
+  const submit = (/** @type {Event} */ event) => {
+    event.preventDefault();
+    document.getElementById("load-policy")?.click(); // the button knows whether it is disabled or busy
+  };
+  const foot = html`<button class="button" onClick=${close}>Not yet</button><${Button} id="load-policy" tone="primary" role="admin" disabled=${errors > 0} why=${`The text has ${counted(errors, "error")}`} onClick=${go}>Load the policy</${Button}>`;
   return html`<${Dialog} wide title="Load this policy?" close=${close} foot=${foot}>
     <${Failure} error=${error} />
     ${error?.status === 412 && html`<p>Close this dialog and compare with revision ${live.revision} under Diff, then load again.</p>`}
-    <div class="form-grid"><${Field} label="Comment" value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" hint="kept with the revision" /><${Field} label="Commit-confirm" value=${within} set=${setWithin} options=${WITHIN} /></div>
+    <form class="form-grid" onSubmit=${submit}><${Field} label="Comment" autofocus value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" hint="kept with the revision" /><${Field} label="Commit-confirm" value=${within} set=${setWithin} options=${WITHIN} /></form>
     <${Signature} asked=${live.site_keys.length > 0} value=${signature} set=${(/** @type {string} */ next) => draft.update({ signature: next, report: null })} />
     ${report && !report.loaded && html`<${Report} report=${report} />`}
     <div><h3>Changes to revision ${live.revision}${etag === `"${live.revision}"` ? "" : `, which is newer than the base of this text (${etag})`}</h3>

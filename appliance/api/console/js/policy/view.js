@@ -3,6 +3,7 @@
 import { html, useEffect, useState } from "../html.js";
 import { live as appliance } from "../live.js";
 import { lasting, Moment, useNow } from "../moments.js";
+import { counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Difference } from "../parts/difference.js";
@@ -16,6 +17,7 @@ import { go, place } from "../router.js";
 import { may } from "../session.js";
 import { useStore } from "../store.js";
 import { Check } from "./check.js";
+import { complete } from "./complete.js";
 import { change, check, discard, draft, dryRun, look, rebase, write } from "./draft.js";
 import { Explain } from "./explain.js";
 import { LoadDialog } from "./load.js";
@@ -26,7 +28,7 @@ const PAUSE = 1200; // milliseconds between the last key and the check of the te
 const TABS = /** @type {[string, string][]} */ ([["check", "Check"], ["diff", "Diff"], ["explain", "Explain"], ["tests", "Tests"], ["revisions", "Revisions"]]);
 
 export function PolicyView() {
-  const { live, text, base, findings, error } = useStore(draft);
+  const { live, text, base, findings, errors, error } = useStore(draft);
   const { query } = useStore(place);
   const revision = useStore(appliance, (one) => one.status?.policy.revision ?? null);
   const confirming = useStore(appliance, (one) => one.status?.policy.confirm_by ?? null);
@@ -63,9 +65,10 @@ export function PolicyView() {
       <section class="panel" aria-label="Text of the policy">
         <div class="panel-head">${changed ? html`<${Badge} word="changed here, not loaded" tone="warn" />` : html`<${Badge} word="as in force" tone="allow" />`}<span class="muted small path"><${Given} value=${live.policy_file} most=${120} mono /></span>
           <span class="end">${changed && html`<button class="button small plain" onClick=${discard}>Discard</button>`}
-            <${Button} small role="operator" onClick=${dry} title="Check, test, and list what would be decided differently (Ctrl S)">Dry run</${Button}>
-            <${Button} small role="admin" tone="primary" disabled=${!changed} why="The text is the policy in force" onClick=${() => setLoading(true)}>Load</${Button}></span></div>
-        <${Editor} label="Access policy" language="policy" value=${text} change=${write} findings=${findings.filter((one) => !one.file.includes(".tests."))} line=${line} dry=${() => may("operator") && dry()} height="calc(100dvh - 250px)" />
+            <${Button} small role="operator" aria-keyshortcuts="d" onClick=${dry} title="Check, test, and list what would be decided differently (Ctrl S)">Dry run</${Button}>
+            ${errors > 0 && html`<span id="unloadable"><${Badge} word=${counted(errors, "error")} tone="deny" /></span>`}
+            <${Button} small role="admin" tone="primary" disabled=${!changed || errors > 0} why=${errors > 0 ? `The text has ${counted(errors, "error")}` : "The text is the policy in force"} aria-keyshortcuts="l" aria-describedby=${errors > 0 ? "unloadable" : undefined} onClick=${() => setLoading(true)}>Load</${Button}></span></div>
+        <${Editor} label="Access policy" language="policy" value=${text} change=${write} findings=${findings.filter((one) => !one.file.includes(".tests."))} line=${line} dry=${() => may("operator") && dry()} keys="i" complete=${complete} height="calc(100dvh - 250px)" />
       </section>
       <section class="panel" aria-label="About the policy"><${Tabs} label="About the policy" tabs=${TABS} chosen=${tab} choose=${setTab}>
         ${tab === "check" && html`<${Check} pick=${pick} />`}

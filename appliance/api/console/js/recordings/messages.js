@@ -39,7 +39,7 @@ export function Messages({ path, at, topics, clear, span }) {
   const messages = reading ? found?.messages ?? [] : [];
   return html`<section class="panel" aria-labelledby="said"><div class="panel-head"><h2 id="said">Messages</h2>${topics.length > 0 && html`<span class="small"><${Given} value=${topics.join(", ")} mono most=${80} /> <button class="link" onClick=${clear}>all topics</button></span>`}
       <span class="end">${reading && html`<button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[0].place)}>Earlier</button><button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[messages.length - 1].place)}>Later</button>`}
-        <${Button} small role="investigator" onClick=${() => setReading(!reading)}>${reading ? "Stop reading" : "Read messages"}</${Button}></span></div>
+        <${Button} small role="investigator" aria-keyshortcuts="m" onClick=${() => setReading(!reading)}>${reading ? "Stop reading" : "Read messages"}</${Button}></span></div>
     <div class="panel-body stack-tight">${error ? html`<${Failure} error=${error} />` : null}
       ${!reading ? html`<p class="muted small">As sent, before monitors changed or dropped them. The audit log records who reads them.</p>` : !messages.length && !error ? html`<p class="muted small" role="status">${found ? "No message." : "Reading."}</p>` : null}
       <ul class="said" aria-label="Messages">${messages.map((/** @type {any} */ one, /** @type {number} */ place) => html`<li key=${one.place}><details open=${place === found.chosen || place === found.chosen - 1}>

@@ -10,7 +10,7 @@ import { Failure, Loading, Notice } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { get } from "../rest.js";
 import { go, Link, place } from "../router.js";
-import { typing } from "../shortcuts.js";
+import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { COLUMNS, Lanes } from "./lanes.js";
 import { Messages } from "./messages.js";
@@ -95,16 +95,9 @@ function Event(/** @type {{event: any}} */ { event }) {
 
 /** The keys j and k move through the events, starting at the selected time. */
 function useSteps(/** @type {any[]} */ events, /** @type {number} */ at, /** @type {(event: any) => void} */ pick) {
-  const newest = useRef({ events, at, pick });
-  newest.current = { events, at, pick };
-  useEffect(() => {
-    const heard = (/** @type {KeyboardEvent} */ pressed) => {
-      const { events, at, pick } = newest.current;
-      if (typing(pressed) || pressed.ctrlKey || pressed.metaKey || pressed.altKey || document.querySelector("dialog[open]")) return;
-      const next = pressed.key === "j" ? events.find((one) => one.time > at) : pressed.key === "k" ? events.findLast((one) => one.time < at) : null;
-      if (next) pick(next);
-    };
-    addEventListener("keydown", heard);
-    return () => removeEventListener("keydown", heard);
-  }, []);
+  useKeys((key) => {
+    const next = key === "j" ? events.find((one) => one.time > at) : key === "k" ? events.findLast((one) => one.time < at) : null;
+    if (next) pick(next);
+    return Boolean(next);
+  });
 }

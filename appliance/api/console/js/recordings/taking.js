@@ -20,7 +20,7 @@ export function Taking({ row, small = false }) {
   const evidence = reads ? `${path}/evidence` : `/v1/evidence${queryText({ since: iso(row.began), until: iso(row.ended) })}`;
   return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; the audit log records the download" onClick=${() => take(`${path}/bag`, `rosrv-${row.id}.bag`)}>${icon}Bag</${Button}>
     <${Button} small=${small} role="investigator" title="For Foxglove; the audit log records the download" onClick=${() => take(`${path}/bag?format=mcap`, `rosrv-${row.id}.mcap`)}>${icon}MCAP</${Button}>
-    <${Button} small=${small} role=${reads ? "investigator" : "operator"} title=${`Everything in its period, with the policy and specifications in force, as a signed bundle${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
+    <${Button} small=${small} role=${reads ? "investigator" : "operator"} aria-keyshortcuts=${small ? undefined : "e"} title=${`Everything in its period, with the policy and specifications in force, as a signed bundle${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
 }
 
 /** @param {{row: any, small?: boolean, gone: () => void}} given `gone`: what follows when it is removed */
@@ -56,6 +56,6 @@ export function OnTimeline({ record }) {
     return () => controller.abort();
   }, [record.id, asked]);
   if (!found) return null;
-  return html`<div class="row"><${Link} class="button" to=${`/console/recordings/${found.id}${closed ? "" : `?record=${record.id}`}`}><${Icon} name="recordings" size=${16} />Time line</${Link}>${closed && html`<${Taking} row=${found} />`}
+  return html`<div class="row"><${Link} class="button" aria-keyshortcuts="r" to=${`/console/recordings/${found.id}${closed ? "" : `?record=${record.id}`}`}><${Icon} name="recordings" size=${16} />Time line</${Link}>${closed && html`<${Taking} row=${found} />`}
     <span class="muted small">The messages around it were recorded.</span></div>`;
 }

@@ -1,0 +1,243 @@
+"""Join the console's modules into one script, and its style sheets into one.
+
+The sources stay plain modules, and no build tool is needed. In exchange they use a small part of the module syntax:
+
+- `import { a, b as c } from "./x.js";`, or from an absolute address, which stays a separate file;
+- `export function`, `export async function`, `export class`, `export const NAME`;
+- `export { a, b } from "…";`
+
+Invariants:
+
+1. Every module becomes one function scope, so private names do not collide. It is included once, after all modules
+   that it imports.
+2. Everything else raises `ModuleError`, at the start of the API: other forms of import and export, cycles, missing
+   files, names that a module does not export, unclosed strings and brackets.
+3. Comments and needless spaces are removed, but not inside strings, templates and regular expressions.
+"""
+
+import posixpath
+import re
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+_TOKEN = re.compile(
+    r"""(?P<space>\s+|//[^\n]*|/\*.*?\*/)|(?P<text>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
+    r"""|(?P<word>[\w$]+)|(?P<mark>[^"'\s])""",
+    re.DOTALL,
+)
+_TEMPLATE = re.compile(r"(?:\\.|\$(?!\{)|[^`\\$])*(?:`|\$\{)", re.DOTALL)
+_REGULAR_EXPRESSION = re.compile(r"/(?:\\.|\[(?:\\.|[^\]\\\n])*\]|[^/\\\n\[])+/\w*")
+_BEFORE_A_VALUE = frozenset(
+    {"return", "typeof", "case", "of", "in", "await", "yield", "void", "delete", "throw"}
+)
+_OPENING = {")": "(", "]": "[", "}": "{"}
+_NO_BREAK_AFTER = frozenset("{([,;")  # a statement never ends here by a line break, or it has ended already
+_SEPARATING = frozenset("{}()[],;:?=<>&|!*")
+_FROM = re.compile(r'(?:import|export)\s*\{([\w$,\s]+)\}\s*from\s*"([^"]+)"\s*;')
+_NAME = re.compile(r"([\w$]+)(?:\s+as\s+([\w$]+))?")
+_STYLE_IMPORT = re.compile(r'@import "([^"]+)";')
+_STYLE_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
+
+
+class ModuleError(Exception):
+    """The console's sources cannot be joined; the text names the file and, where known, the line."""
+
+
+class _Token(NamedTuple):
+    kind: str  # space, text, template, word or mark
+    text: str
+    line: int
+    outermost: bool  # outside of all brackets
+
+
+def join_modules(sources: Mapping[str, str], entry: str) -> str:
+    """Return one module with the entry and all that it imports.
+
+    The sources are keyed by their paths, such as `js/main.js`. Raise `ModuleError` for whatever cannot be joined.
+    """
+    joining = _Joining(sources)
+    joining.include(entry)
+    return joining.script()
+
+
+def join_styles(sources: Mapping[str, str], entry: str) -> str:
+    """Return one style sheet: the entry with the files that it imports, without comments and indentation.
+
+    Raise `ModuleError` for a missing file, and for an import of another form.
+    """
+    if entry not in sources:
+        raise ModuleError(f"there is no file {entry}")
+    joined = _STYLE_IMPORT.sub(
+        lambda found: join_styles(sources, _path(entry, found[1])), _STYLE_COMMENT.sub("", sources[entry])
+    )
+    if "@import" in joined:
+        raise ModuleError(f'{entry}: unsupported import; write @import "./FILE.css";')
+    return re.sub(r"\s*\n\s*", "\n", joined).lstrip()
+
+
+class _Joining:
+    def __init__(self, sources: Mapping[str, str]) -> None:
+        self._sources = sources
+        self._exports: dict[str, set[str]] = {}  # of each included module
+        self._constants: dict[str, str] = {}  # with the exports of each included module
+        self._open: list[str] = []
+        self._separate: dict[tuple[str, str], str] = {}  # the alias of each name of a separate file
+        self._scopes: list[str] = []
+
+    def script(self) -> str:
+        heads: dict[str, list[str]] = {}
+        for (address, name), alias in self._separate.items():
+            heads.setdefault(address, []).append(f"{name} as {alias}")
+        imports = [f'import {{{",".join(names)}}} from "{address}";\n' for address, names in heads.items()]
+        return "".join(imports + self._scopes)
+
+    def include(self, path: str) -> None:
+        if path in self._open:
+            raise ModuleError(f"modules import each other: {', '.join([*self._open, path])}")
+        if path in self._exports:
+            return
+        if path not in self._sources:
+            raise ModuleError(
+                f"there is no file {path}{f', imported by {self._open[-1]}' if self._open else ''}"
+            )
+        self._open.append(path)
+        head: list[str] = []
+        body: list[_Token] = []
+        exports: dict[str, str] = {}
+        tokens = list(_tokens(path, self._sources[path]))
+        at = 0
+        while at < len(tokens):
+            token = tokens[at]
+            at += 1
+            if not token.outermost or token.kind != "word" or token.text not in ("import", "export", "await"):
+                body.append(token)
+                continue
+            following = [one for one in tokens[at : at + 8] if one.kind != "space"]
+            if token.text == "export" and (name := _declared(following)):
+                exports[name] = name
+                continue
+            end = next(
+                (i for i in range(at, len(tokens)) if tokens[i].text == ";" and tokens[i].outermost), at
+            )
+            statement = "".join(one.text for one in tokens[at - 1 : end + 1])
+            found = _FROM.fullmatch(statement)
+            if found is None:
+                raise ModuleError(
+                    f"{path}:{token.line}: unsupported in a module of the console: {statement[:80]}"
+                )
+            for name, renamed in self._names(path, found[1], token.line):
+                value = self._value(path, found[2], name, token.line)
+                if token.text == "export":
+                    exports[renamed] = value
+                else:
+                    head.append(f"{renamed}={value}")
+            at = end + 1
+        self._exports[path] = set(exports)
+        constant = self._constants[path] = f"$m{len(self._constants)}"
+        bound = f"const {','.join(head)};\n" if head else ""
+        given = ",".join(f"{name}:{value}" for name, value in exports.items())
+        text = _tightened(body).strip()
+        self._scopes.append(f"const {constant}=(()=>{{{bound}{text}\nreturn {{{given}}};}})();\n")
+        self._open.pop()
+
+    def _names(self, path: str, text: str, line: int) -> Iterator[tuple[str, str]]:
+        for part in text.strip().rstrip(",").split(","):
+            found = _NAME.fullmatch(part.strip())
+            if found is None:
+                raise ModuleError(f"{path}:{line}: unsupported list of names: {text.strip()}")
+            yield found[1], found[2] or found[1]
+
+    def _value(self, path: str, address: str, name: str, line: int) -> str:
+        """Return the expression for an imported name."""
+        if address.startswith("/"):
+            return self._separate.setdefault((address, name), f"$v{len(self._separate)}")
+        imported = _path(path, address)
+        self.include(imported)
+        if name not in self._exports[imported]:
+            raise ModuleError(f"{path}:{line}: {imported} does not export {name}")
+        return f"{self._constants[imported]}.{name}"
+
+
+def _tightened(pieces: list[_Token]) -> str:
+    """Return the text of the tokens, without the spaces that separate nothing."""
+    kept: list[_Token] = []
+    gap = ""
+    for piece in pieces:
+        if piece.kind == "space":
+            gap = "\n" if "\n" in (gap, piece.text) else gap or piece.text
+            continue
+        before = kept[-1].text if kept else ";"
+        if before not in _NO_BREAK_AFTER and (gap == "\n" or (gap and not _apart(before, piece.text))):
+            kept.append(_Token("space", gap, piece.line, piece.outermost))
+        gap = ""
+        kept.append(piece)
+    return "".join(one.text for one in kept)
+
+
+def _apart(before: str, after: str) -> bool:
+    """Whether two tokens of one line stay two tokens without a space between them."""
+    return before in _SEPARATING or after in _SEPARATING
+
+
+def _declared(tokens: list[_Token]) -> str | None:
+    """Return the name that an exported declaration declares."""
+    words = [one.text for one in tokens]
+    if words[:1] == ["async"]:
+        words = words[1:] if words[1:2] == ["function"] else []
+    if len(words) > 1 and words[0] in ("const", "class", "function") and re.fullmatch(r"[\w$]+", words[1]):
+        return words[1]
+    return None
+
+
+def _path(of: str, address: str) -> str:
+    return posixpath.normpath(posixpath.join(posixpath.dirname(of), address))
+
+
+def _tokens(path: str, text: str) -> Iterator[_Token]:
+    """Yield the tokens of a module; comments and spaces become one space or line break."""
+    brackets: list[str] = []
+    at, line, before = 0, 1, _Token("mark", ";", 1, outermost=True)
+    while at < len(text):
+        value_follows = before.text in _BEFORE_A_VALUE or (
+            before.kind == "mark" and before.text not in _OPENING
+        )
+        outermost = not brackets
+        in_template = text[at] == "}" and brackets[-1:] == ["`"]
+        found = _next(text, at, in_template=in_template, value_follows=value_follows)
+        if found is None:
+            raise ModuleError(f"{path}:{line}: unclosed string, template, comment or regular expression")
+        kind, piece = found
+        if in_template or (kind == "mark" and piece in _OPENING):
+            if brackets[-1:] != ["`" if in_template else _OPENING[piece]]:
+                raise ModuleError(f"{path}:{line}: unexpected {piece}")
+            brackets.pop()
+            outermost = not brackets
+        if kind == "template" and piece.endswith("${"):
+            brackets.append("`")
+        elif kind == "mark" and piece in _OPENING.values():
+            brackets.append(piece)
+        shown = piece
+        if kind == "space":
+            shown = "\n" if "\n" in piece else "" if piece.startswith("//") else " "
+        token = _Token(kind, shown, line, outermost)
+        yield token
+        if kind != "space":
+            before = token
+        at += len(piece)
+        line += piece.count("\n")
+    if brackets:
+        raise ModuleError(f"{path}:{line}: unclosed {brackets[-1]}")
+
+
+def _next(text: str, at: int, *, in_template: bool, value_follows: bool) -> tuple[str, str] | None:
+    """Return kind and text of the next token; None if it is not closed."""
+    if text[at] == "`" or in_template:
+        found = _TEMPLATE.match(text, at + 1)
+        return found and ("template", text[at : found.end()])
+    if text[at] == "/" and value_follows and text[at + 1 : at + 2] not in ("/", "*"):
+        found = _REGULAR_EXPRESSION.match(text, at)
+        return found and ("text", found[0])
+    found = _TOKEN.match(text, at)
+    if found is None or (text.startswith("/*", at) and found.lastgroup != "space"):
+        return None
+    return str(found.lastgroup), found[0]

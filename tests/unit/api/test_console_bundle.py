@@ -1,0 +1,75 @@
+"""Tests of `appliance.api.console_bundle`; tests/system/console/test_load_time.py runs joined modules in a browser."""
+
+from pathlib import Path
+
+import pytest
+
+import appliance.api
+from appliance.api.console_bundle import ModuleError, join_modules, join_styles
+
+FILES = Path(appliance.api.__file__).parent / "console"
+
+
+def test_every_module_of_the_console_is_included_once() -> None:
+    """The script contains every module once, and no comment and no import of a module is left."""
+    sources = {str(path.relative_to(FILES)): path.read_text() for path in FILES.rglob("*.js")}
+    joined = join_modules(sources, "js/main.js")
+    modules = [name for name in sources if name.startswith("js/") and name != "js/early.js"]
+    assert joined.count("=(()=>{") == len(modules)
+    assert "@param" not in joined
+    assert [
+        line for line in joined.splitlines() if line.startswith("import ") and "/vendor/" not in line
+    ] == []
+    assert joined.count("function GraphView(") == joined.count("function createStore(") == 1
+
+
+def test_only_comments_and_indentation_are_removed() -> None:
+    """Strings, templates and regular expressions keep what looks like a comment, a bracket or indentation."""
+    kept = "[\"// {\",'/* ( */',/[/`]\\/\\/{/g,`//\n   ${`}${1 / 2} /* b */`} `]"
+    text = f"const a = {kept};  // c\n  let b  /* d */ = 1\n  /* e\n */ a / a / 2 + +b;\n\n"
+    assert join_modules({"a.js": text}, "a.js") == (
+        f"const $m0=(()=>{{const a={kept};let b=1\na / a / 2 + +b;\nreturn {{}};}})();\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("sources", "error"),
+    [
+        ({"a.js": 'import x from "./b.js";'}, "a.js:1: unsupported in a module"),
+        ({"a.js": '\nimport * as x from "./b.js";'}, "a.js:2: unsupported in a module"),
+        ({"a.js": 'import "./b.js";'}, "a.js:1: unsupported in a module"),
+        ({"a.js": 'import { b } from "./b.js"'}, "a.js:1: unsupported in a module"),
+        ({"a.js": 'import { default } as x } from "./b.js";'}, "a.js:1: unexpected }"),
+        ({"a.js": 'import { b } from "./b.js";'}, "there is no file b.js, imported by a.js"),
+        ({"a.js": 'import { b } from "./b.js";', "b.js": ""}, "a.js:1: b.js does not export b"),
+        (
+            {"a.js": 'import { b } from "./b.js";', "b.js": 'import { a } from "./a.js";'},
+            "modules import each other: a.js, b.js, a.js",
+        ),
+        ({"a.js": "export default 1;"}, "a.js:1: unsupported in a module"),
+        ({"a.js": "export let a = 1;"}, "a.js:1: unsupported in a module"),
+        ({"a.js": "export const { a } = b;"}, "a.js:1: unsupported in a module"),
+        ({"a.js": "await a;"}, "a.js:1: unsupported in a module"),
+        ({"a.js": "\n'open"}, "a.js:2: unclosed string"),
+        ({"a.js": "\n`open ${1}"}, "a.js:2: unclosed string"),
+        ({"a.js": "/* open"}, "a.js:1: unclosed string"),
+        ({"a.js": "a = /open"}, "a.js:1: unclosed string"),
+        ({"a.js": "f(() => {"}, "a.js:1: unclosed {"),
+        ({"a.js": "f(]"}, "a.js:1: unexpected ]"),
+    ],
+)
+def test_unsupported_modules_are_an_error(sources: dict[str, str], error: str) -> None:
+    """Unsupported syntax, missing files and names, and cycles raise an error with the file and line."""
+    with pytest.raises(ModuleError) as raised:
+        join_modules(sources, "a.js")
+    assert str(raised.value).startswith(error)
+
+
+def test_styles_are_joined_in_the_order_of_their_imports() -> None:
+    """An import is replaced by the file; a missing file and an import of another form are errors."""
+    sources = {"c/a.css": '/* a */\n@import "./b.css";\na {\n  top: 0;\n}\n', "c/b.css": "b { top: 1px; }\n"}
+    assert join_styles(sources, "c/a.css") == "b { top: 1px; }\na {\ntop: 0;\n}\n"
+    with pytest.raises(ModuleError, match=r"there is no file c/b\.css"):
+        join_styles({"c/a.css": sources["c/a.css"]}, "c/a.css")
+    with pytest.raises(ModuleError, match=r"c/a\.css: unsupported import"):
+        join_styles({"c/a.css": "@import url(./b.css);"}, "c/a.css")
