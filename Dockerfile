@@ -20,7 +20,7 @@ COPY requirements.lock /build/
 # Nothing in it tells when or where it was built: compiled files name their source by its content.
 ENV PYTHONHASHSEED=0 CFLAGS="-O2 -g0" LDFLAGS=-Wl,--build-id=none
 RUN python3 -m venv /opt/rosrv \
- && PYTHONPATH=/usr/lib/python3/dist-packages /opt/rosrv/bin/pip install --quiet --no-cache-dir --require-hashes \
+ && PYTHONPATH=/usr/lib/python3/dist-packages /opt/rosrv/bin/pip install --quiet --no-cache-dir --require-hashes --no-deps \
         --disable-pip-version-check --no-build-isolation --no-compile -r /build/requirements.lock \
  && /opt/rosrv/bin/pip uninstall --quiet --yes pip setuptools \
  # Of the packages' programs and tests nothing is needed; what debuggers want of their libraries neither.

@@ -38,7 +38,7 @@ _LOGS_OWN = {
 }  # fmt: skip
 _MONITOR = (
     "monitor", "happened", "number", "seq", "stamp", "before", "after", "before_fields", "after_fields", "size",
-    "count",
+    "count", "first_time", "last_time", "first_text", "last_text",
 )  # fmt: skip
 _LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
@@ -47,7 +47,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "revoked": ("call", "needs"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
-    "monitor log": _MONITOR,
+    "monitor log": (*_MONITOR, "level"),
     "monitor fault": (*_MONITOR, *_LED, "values"),
     "monitor verdict": (*_MONITOR, *_LED, "why"),
     "message dropped": (*_MONITOR, *_LED, "values", "handler", "why"),

@@ -3,7 +3,8 @@
     python -m distribution.deb amd64 arm64
 
 The tree of the package is made under build/package/ARCH, then debhelper packs it. All its times are that of the newest
-commit, so two builds of one commit are equal, byte by byte.
+commit, so two builds of one commit are equal, byte by byte. DEBFULLNAME and DEBEMAIL name the maintainer, as for
+Debian's own tools.
 """
 
 import os
@@ -30,6 +31,7 @@ COMPLETIONS = {
     "fish": "usr/share/fish/vendor_completions.d/rosrv.fish",
 }
 """Where each shell looks for the completion of a command that a package installs."""
+_NO_ADDRESS = "maintainers@localhost"
 _LAUNCHER = """\
 #!/usr/lib/rosrv/bin/python -P
 import os
@@ -132,10 +134,12 @@ def _copy(folder: Path, target: Path, *without: str) -> None:
 def _debian_folder(target: Path, moment: int) -> None:
     shutil.copytree(HERE / "debian", target)
     control = (target / "control").read_text()
-    (target / "control").write_text(control.replace("@RUNS@", ", ".join(RUNS)))
+    maintainer = f"{os.environ.get('DEBFULLNAME', 'The ROSRV maintainers')} <{os.environ.get('DEBEMAIL', _NO_ADDRESS)}>"
+    control = control.replace("@RUNS@", ", ".join(RUNS)).replace("@MAINTAINER@", maintainer)
+    (target / "control").write_text(control)
     (target / "changelog").write_text(
         f"rosrv ({__version__}) stable; urgency=medium\n\n  * See CHANGELOG.md.\n\n"
-        f" -- The ROSRV maintainers <maintainers@localhost>  {formatdate(moment)}\n"
+        f" -- {maintainer}  {formatdate(moment)}\n"
     )
     lines = [f'u {name} - "ROSRV appliance" - -' for name in NUMERIC_IDS]
     # root reads the audit log as a member of its group if it has no CAP_DAC_OVERRIDE.
@@ -155,7 +159,7 @@ def _missing_packages(architectures: list[str]) -> list[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Build for the given architectures; return exit status 1 with a message on failure."""
+    """Build for the given architectures, print each path and size; return exit status 1 with a message on failure."""
     unknown = [name for name in arguments if name not in ARCHITECTURES]
     if unknown or not arguments:
         sys.stderr.write(f"package: give architectures of {', '.join(ARCHITECTURES)}, not {unknown}\n")
@@ -166,12 +170,13 @@ def main(arguments: list[str]) -> int:
     if re.fullmatch(r"\d+\.\d+\.\d+(~\w+)?", __version__) is None:
         sys.stderr.write(f"package: {__version__} is not a package version\n")
         return 1
+    if "DEBEMAIL" not in os.environ:
+        sys.stderr.write(f"package: DEBEMAIL is not set: the maintainer's address is {_NO_ADDRESS}\n")
     moment = time_of_commit()
     for name in arguments:
-        sys.stdout.write(
+        sys.stderr.write(
             f"package: building for {name}; dpkg's output is in build/package/{name}/build.log\n"
         )
-        sys.stdout.flush()
         made = build(ARCHITECTURES[name], moment=moment)
         sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
     return 0

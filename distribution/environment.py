@@ -122,7 +122,6 @@ def _leave_out(tree: Path) -> None:
     shutil.rmtree(tree / "bin", ignore_errors=True)
     for tests in [path for path in tree.rglob("tests") if path.is_dir()]:
         shutil.rmtree(tests, ignore_errors=True)
-    shutil.rmtree(tree / "apsw/sqlite_extra_binaries", ignore_errors=True)
     for name in (".lock", ".gitignore"):
         (tree / name).unlink(missing_ok=True)
     # These are the installer's notes about this machine, and outdated lists of files.

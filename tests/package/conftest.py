@@ -22,6 +22,8 @@ _NODE_PACKAGES = (
 )
 LATER = "+40h"
 SLOW_SECONDS = 1200.0  # for work that takes seconds on a machine of its own
+PACKAGER = {"DEBFULLNAME": "A packager", "DEBEMAIL": "packager@example.org"}
+"""The maintainer's name and address, in the variables of Debian's tools."""
 
 
 @pytest.fixture(scope="session")
@@ -32,6 +34,7 @@ def package() -> Path:
     done = subprocess.run(
         [sys.executable, "-m", "distribution.deb", "amd64"],
         cwd=ROOT,
+        env=os.environ | PACKAGER,
         capture_output=True,
         text=True,
         check=False,
@@ -60,7 +63,7 @@ def build_later(module: str, *options: str, folder: Path, **environment: str) ->
     done = subprocess.run(
         command,
         cwd=folder,
-        env=os.environ | environment,
+        env=os.environ | PACKAGER | environment,
         capture_output=True,
         text=True,
         umask=0o077,
