@@ -57,13 +57,16 @@ EVENTS: dict[str, str] = {
     " category, the `binding` for parametric specifications, the location `at`, the events `why` that alone give the"
     " verdict, and the `conditions` with the values that they compared.",
     "message dropped": "A monitor dropped a message; the first in each second is recorded in full, the others as"
-    " `detail.count`. `at` is the location of the statement that dropped it, `conditions` the conditions that led"
-    " there, each with the values that it compared; `handler` is the verdict whose handler ran, with its `why`.",
+    " `detail.count` with `first_time` and `last_time` (nanoseconds since the epoch). `at` is the location of the"
+    " statement that dropped it, `conditions` the conditions that led there, each with the values that it compared;"
+    " `handler` is the verdict whose handler ran, with its `why`.",
     "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
     " that changed it, in order, and `monitor` the monitor of the last event. A record with `count` has `changed_by`"
     " if several monitors changed the message.",
     "monitor fault": "An action of a monitor failed; `detail` has file, line, values and `conditions`.",
-    "monitor log": "A monitor logged a line.",
+    "monitor log": "A monitor logged a line; the first in each second is recorded in full, and further ones that differ"
+    " only in numbers as `detail.count`, with `first_time`, `last_time` (nanoseconds since the epoch), `first_text` and"
+    " `last_text` of those. The reason has the last line.",
     "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
     " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
     "publication refused": "A publisher or service uses another type definition than the specifications; it is not"

@@ -61,7 +61,7 @@ class FoldState(msgspec.Struct, kw_only=True):
         """Count a repetition."""
         if not self.count:
             self.first_id, self.first_time = record.id, record.time
-        number = _stands_for(record)
+        number = stands_for(record)
         self.count += number
         self.last_id, self.last_time = record.id, record.time
         if self.scope != KIND:
@@ -161,7 +161,7 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     )  # fmt: skip
 
 
-def _stands_for(record: AuditRecord) -> int:
+def stands_for(record: AuditRecord) -> int:
     """Return `detail.count` of a record whose reporter already counted repetitions, else 1."""
     count = record.detail.get("count")
     return count if type(count) is int and count > 0 else 1

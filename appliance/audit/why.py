@@ -1,10 +1,13 @@
-"""Explain a record in a few lines: author, events, values, location in the specification."""
+"""Explain a record in a few lines: author, events, values, location in the specification, recording."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from appliance.audit.record import AuditRecord
-from appliance.audit.record_format import rule_text
-from rosmop.run.why_text import lines_of_why, list_of, mapping_of
+from appliance.audit.record_format import rfc3339, rule_text
+
+_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
+"""The events of monitors that trigger recordings, if `recorder.triggers` has them."""
 
 
 def lines_of(record: AuditRecord) -> Iterator[str]:
@@ -18,28 +21,54 @@ def lines_of(record: AuditRecord) -> Iterator[str]:
         yield f"by: {message}{' '.join(who) or 'unknown'}"
     if record.rule is not None:
         yield f"rule: {rule_text(record.rule)}"
-    places = list_of(detail.get("at"))
+    places = _list(detail.get("at"))
     if places:
         yield f"at: {', '.join(map(str, places))}"
     if "timer" in detail:
         yield f"timer: {detail['timer']}"
-    events = list_of(detail.get("events"))
+    events = _list(detail.get("events"))
     if events:
         yield f"events: {', '.join(map(str, events))}"
-    for place, values in mapping_of(detail.get("conditions")).items():
+    for place, values in _mapping(detail.get("conditions")).items():
         yield f"where: {place}{_valued(values)}"
     if values := _valued(detail.get("values")):
         yield f"with: {values.removeprefix(', ')}"
     if "handler" in detail:
         yield f"in the handler of: {detail['handler']}"
+    yield from _recorded(record)
     if "withheld" in detail:
         yield "this role may not read contents of messages"
         return
-    yield from lines_of_why(mapping_of(detail.get("why")))
+    if "why" in detail:
+        from rosmop.run.outcomes import lines_of_why  # noqa: PLC0415  slow to import, and few records need it
+
+        yield from lines_of_why(_mapping(detail["why"]))
     is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
     if is_verdict and "why" not in detail and "count" not in detail:
         yield "because: the causing events are no longer known, or that second had too many verdicts to record them"
 
 
+def _recorded(record: AuditRecord) -> Iterator[str]:
+    """Yield whether the flight recorder recorded the messages around a record that may trigger a recording."""
+    detail = record.detail
+    if "not_recorded" in detail:
+        yield f"not recorded: {detail['not_recorded']}"
+    elif "recording" in detail and "charged_to" in detail and not record.event.startswith("recording "):
+        recording = detail["recording"]
+        yield f"recorded: in {recording}; rosrv record messages {recording} --at {rfc3339(record.time)}"
+    elif record.event in _ACTIONS:
+        yield "not recorded: recorder.triggers did not list this kind of event"
+
+
 def _valued(values: object) -> str:
-    return "".join(f", {name} = {value}" for name, value in mapping_of(values).items())
+    return "".join(f", {name} = {value}" for name, value in _mapping(values).items())
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    """Return the value if it is a mapping, otherwise an empty mapping."""
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: object) -> list[Any]:
+    """Return the value if it is a list, otherwise an empty list."""
+    return value if isinstance(value, list) else []

@@ -1,19 +1,27 @@
-"""`rosrv topic echo|info`: a topic's messages, publishers and subscribers on the running robot."""
+"""`rosrv topic echo|info|publishers`: a topic's messages, and its publishers and subscribers, now or in the past."""
 
+import time
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
 import typer
 
 from appliance.api.moments import in_full
+from appliance.audit.publishers import publishers_at
+from appliance.audit.query import Filter
+from appliance.audit.record_format import rfc3339
+from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
+from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error
 from rosmop.tool.terminal import printable, refused, say
 from roswire.message_view import CUT
+from roswire.names import is_global_name
 
 _AT_ONCE = 20  # messages in one request
 _Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]
@@ -65,6 +73,51 @@ def info(appliance: Appliance, topic: _Topic) -> None:
     else:
         for line in _described(found):
             say(line)
+
+
+@speaks
+def publishers(
+    appliance: Appliance,
+    topic: _Topic,
+    *,
+    at: Annotated[
+        str,
+        typer.Option(
+            metavar="TIME", help="10:32, 'yesterday 10:32', 1h (ago), a date, or RFC 3339", show_default=False
+        ),
+    ],
+) -> None:
+    """Show the nodes that were registered as publishers of a topic at a time in the past, from the audit log.
+
+    Print also what the log does not show. The appliance may be stopped. Exit status 1 if no publisher is found.
+
+    Example: rosrv topic publishers /cmd_vel --at 10:32
+    """
+    if not is_global_name(topic):
+        raise usage_error(f"{topic!r} is not a resolved ROS name, such as /cmd_vel")
+    with Errors():
+        now = time.time_ns()
+        then = parse_timestamp(at, now)
+        if then > now:
+            raise usage_error(f"--at {at} is in the future")
+        log = appliance.audit()
+        first = next(iter(log.search(Filter(), None, 1, newest_first=False).entries), None)
+        found = publishers_at(log.export, first, topic, then)
+    rows = [
+        asdict(row) | {"since": None if row.since is None else rfc3339(row.since)} for row in found.publishers
+    ]
+    if appliance.as_json:
+        say_json({"topic": topic, "at": rfc3339(then), "publishers": rows, "unknown": found.unknown})
+    else:
+        say(f"{topic} at {rfc3339(then)}", "bold")
+        for row in rows:
+            began = f"since {row['since']} (#{row['sequence']})" if row["since"] else "before the log begins"
+            say(f"  {row['node']} on {row['host']}, registered {began}")
+        if not found.publishers:
+            say("  no publisher is found")
+        for line in found.unknown:
+            say(f"not known: {line}", "yellow")
+    raise typer.Exit(0 if found.publishers else 1)
 
 
 def _described(topic: Topic) -> Iterator[str]:

@@ -30,7 +30,7 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.evidence.export_verification import verify_export
 from rosmop.tool.progress_bar import progress
 
@@ -42,7 +42,7 @@ _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJ
 _AlwaysJson = Annotated[bool, typer.Option("--json", help="Accepted; the output is always NDJSON")]
 
 
-@speaks
+@speaks_with(_Json)
 @filtered
 def search(
     appliance: Appliance,
@@ -53,22 +53,27 @@ def search(
     ] = 100,
     oldest_first: Annotated[bool, typer.Option("--oldest-first", help="Start with the first record")] = False,
     cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
-    as_json_lines: _Json = False,
+    each: Annotated[
+        bool, typer.Option("--each", help="On a terminal: show each of several equal records in its own row")
+    ] = False,
 ) -> None:
     """Find records, newest first.
+
+    On a terminal, equal consecutive records are one row with their number, the first and last time, the number of the
+    first record and the last value. In a pipe and with --json, each record is one line.
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
     page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
-    if as_json_lines:
-        _print_lines(page.entries, as_json_lines)
+    if appliance.as_json:
+        _print_lines(page.entries, appliance.as_json)
     else:
-        print_entries(page.entries)
+        print_entries(page.entries, each=each)
     if page.cursor is not None:
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
-@speaks
+@speaks_with(_Json)
 @filtered
 def tail(
     appliance: Appliance,
@@ -78,24 +83,22 @@ def tail(
         int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="Records to show first")
     ] = 10,
     follow: Annotated[bool, typer.Option(help="Wait for new records until interrupted")] = True,
-    as_json_lines: _Json = False,
 ) -> None:
     """Show the last records and follow the log.
 
     Example: rosrv audit tail --deny
     """
     for entries in appliance.audit().follow(wanted, lines, on=follow):
-        _print_lines(entries, as_json_lines)
+        _print_lines(entries, appliance.as_json)
 
 
-@speaks
+@speaks_with(_Json)
 def show(
     appliance: Appliance,
     record_id: Annotated[str, typer.Argument(metavar="ID", help="Id or sequence number of the record")],
     neighbours: Annotated[
         int, typer.Option("--neighbours", min=0, max=1000, help="Records to show around it")
     ] = 5,
-    as_json_lines: _Json = False,
 ) -> None:
     """Show one record in full, with the records of the same host or caller around it.
 
@@ -105,7 +108,7 @@ def show(
         shown = appliance.audit().show(record_id, neighbours)
         if shown is None:
             fail(f"no record in the log has the id {record_id!a}; list them: rosrv audit search", 1)
-        if as_json_lines:
+        if appliance.as_json:
             around = {
                 "before": [as_object(record) for record in shown.before],
                 "after": [as_object(record) for record in shown.after],
@@ -115,7 +118,7 @@ def show(
             print_shown(shown)
 
 
-@speaks
+@speaks_with(_Json)
 def verify(
     appliance: Appliance,
     key: Annotated[
@@ -131,7 +134,6 @@ def verify(
             "--export", help="Deprecated: verify this output of `rosrv audit export` instead; needs --key"
         ),
     ] = None,
-    as_json_lines: _Json = False,
 ) -> None:
     """Verify that the log is complete and unchanged. Exit status: 0 yes, 1 no, 2 cannot be read.
 
@@ -142,7 +144,7 @@ def verify(
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
     if export_file is not None:
-        _verify_export(export_file, key, copies=checkpoints is not None, as_json_lines=as_json_lines)
+        _verify_export(export_file, key, copies=checkpoints is not None, as_json_lines=appliance.as_json)
         return
     with Errors():
         source = appliance.audit()
@@ -150,7 +152,7 @@ def verify(
         public_key = None if key is None else read_public_key(key)
         with progress("checking the chain", source.last) as report:
             result = source.verify(public_key, copies, report)
-        if as_json_lines:
+        if appliance.as_json:
             write(json.dumps(msgspec.to_builtins(result)))
         else:
             print_verification(result)
@@ -178,14 +180,13 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
             raise typer.Exit(1)
 
 
-@speaks
+@speaks_with(_AlwaysJson)
 def checkpoints(
     appliance: Appliance,
     after: Annotated[int, typer.Option("--after", min=0, help="Only checkpoints with a greater number")] = 0,
     follow: Annotated[
         bool, typer.Option("--follow", help="Wait for new checkpoints until interrupted")
     ] = False,
-    as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
     """Write the signed checkpoints as NDJSON. Keep them on another machine for `verify --checkpoints`.
 
@@ -206,14 +207,13 @@ def checkpoints(
                 pause.wait(_CHECKPOINT_SECONDS)
 
 
-@speaks
+@speaks_with(_AlwaysJson)
 @filtered
 def export(
     appliance: Appliance,
     wanted: Filter,
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
-    as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
 ) -> None:
     """Write all matching records as NDJSON, oldest first, each with its position in the hash chain.
 

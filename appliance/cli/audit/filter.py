@@ -85,7 +85,9 @@ def filtered(
     verb: Callable[Concatenate[Appliance, Filter, _P], None],
 ) -> Callable[Concatenate[Appliance, _P], None]:
     """Replace a verb's second parameter, a `Filter`, by the filter options."""
-    options = inspect.signature(_filter).parameters
+    options = inspect.signature(
+        _filter
+    ).parameters  # typer reads the options of a verb from its signature only
 
     @functools.wraps(verb)
     def asked(appliance: Appliance, *args: _P.args, **kwargs: _P.kwargs) -> None:

@@ -7,26 +7,29 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from appliance.audit.chain_findings import Elsewhere, FindingKind, Verification
+from appliance.audit.equality import FOLDED, EqualRecords, grouped
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import LogEntry, fields_of, printable, rfc3339, rule_text
 from appliance.audit.search import RecordInContext
 from appliance.evidence.export_verification import ExportVerification
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
-_FOLDED = ("denials folded", "repetitions folded")
-_MILLISECONDS = 23
+_SECONDS, _MILLISECONDS = 19, 23  # characters of a time
+_DATE = 11
 
 
-def print_entries(entries: list[LogEntry]) -> None:
-    """Print records in the order given."""
+def print_entries(entries: list[LogEntry], *, each: bool = False) -> None:
+    """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line."""
     if sys.stdout.isatty():
+        rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
         console = Console(highlight=False)
-        console.print(_table(entries))
+        console.print(_table(rows))
     else:
         for entry in entries:
             write(line(entry))
@@ -145,26 +148,46 @@ def write(text: str) -> None:
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
 
-def _table(entries: list[LogEntry]) -> Table:
+def _table(rows: list[EqualRecords]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("record", no_wrap=True, justify="right")
     table.add_column("time (UTC)", no_wrap=True)
     table.add_column("decision", no_wrap=True)
     for name in ("event", "who", "what", "why"):
         table.add_column(name, overflow="fold")
-    for entry in entries:
-        record = entry.record
+    for row in rows:
+        record = row.first.record
         alarming = record.severity is Severity.ALARM
         table.add_row(
-            str(entry.sequence),
-            rfc3339(record.time)[:_MILLISECONDS].replace("T", " "),
+            str(row.first.sequence),
+            _times(row),
             Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
             Text(printable(record.event), style="bold red" if alarming else ""),
             Text(_joined(record.host, record.caller_id)),
-            Text(_joined(record.category, record.resource)),
-            Text(_why(record)),
+            Text(_joined(record.category, _monitor(record), record.resource)),
+            Text(_why(record) if row.records == 1 else _why_of_several(row)),
         )
     return table
+
+
+def _times(row: EqualRecords) -> str:
+    """Return the time of a record, or the first and the last time of several."""
+    first, last = (rfc3339(entry.record.time).replace("T", " ") for entry in (row.first, row.last))
+    if row.records == 1:
+        return first[:_MILLISECONDS]
+    same_day = first[:_DATE] == last[:_DATE]
+    return f"{first[:_SECONDS]} to {last[_DATE if same_day else 0 : _SECONDS]}"
+
+
+def _monitor(record: AuditRecord) -> str | None:
+    name = record.detail.get("monitor")
+    return str(name) if name else None
+
+
+def _why_of_several(row: EqualRecords) -> str:
+    """Return how often equal records happened, and the newest reason, with the rule."""
+    newest = msgspec.structs.replace(row.last.record, reason=row.value, event="")
+    return f"{row.count} times, last: {_why(newest)}" if row.value else f"{row.count} times"
 
 
 def _joined(*parts: str | None) -> str:
@@ -176,5 +199,5 @@ def _why(record: AuditRecord) -> str:
     rule = record.rule
     named = rule is None or f"{Path(rule.file).name}:{rule.line}" in record.reason
     why = record.reason if named else f"{record.reason} ({rule_text(record.rule)})"
-    count = record.detail.get("count") if record.event in _FOLDED else None
+    count = record.detail.get("count") if record.event in FOLDED else None
     return printable(f"{count} more: {why}" if count else why)

@@ -2,6 +2,7 @@
 
 from appliance.audit.record import AuditRecord, RuleReference, Severity
 from appliance.audit.why import lines_of
+from appliance.recorder.triggers import _BY_EVENT
 
 
 def test_a_verdict_is_explained() -> None:
@@ -25,6 +26,7 @@ def test_a_verdict_is_explained() -> None:
         "by: message number 3 of /a on 10.0.0.1",
         "at: x.rv:1:2",
         "where: x.rv:3:4, x = 2",
+        "not recorded: recorder.triggers did not list this kind of event",
         "because: go at 12:00, on /t, by /a, on 10.0.0.1 seq 7 -> bad",
         "but: this is enough only for the property as it was at 11:00; earlier events are not kept",
         "but: fewer of them might suffice",
@@ -39,12 +41,12 @@ def test_missing_explanations_are_reported() -> None:
     silent = AuditRecord(
         id="1", time=1, event="monitor verdict", reason="bad", detail={"why": {"events": []}}
     )
-    assert list(lines_of(silent)) == ["bad", "because: no event was needed: time has passed"]
+    assert list(lines_of(silent))[::2] == ["bad", "because: no event was needed: time has passed"]
     events = [{"event": str(number), "time": "12:00"} for number in range(10)]
     many = AuditRecord(
         id="1", time=1, event="monitor verdict", detail={"why": {"events": events, "left_out": 4}}
     )
-    assert list(lines_of(many))[6] == "because: … 4 more …"
+    assert list(lines_of(many))[7] == "because: … 4 more …"
 
 
 def test_a_denial_names_its_rule() -> None:
@@ -64,3 +66,28 @@ def test_a_denial_names_its_rule() -> None:
 def test_an_event_without_a_reason_is_described() -> None:
     """The line describes the event instead of being empty."""
     assert list(lines_of(AuditRecord(id="1", time=1, event="log begun"))) == ["log begun"]
+
+
+def test_a_drop_says_whether_it_was_recorded() -> None:
+    """The line has the command that shows the messages around the drop, or the reason why there is no recording."""
+    planned = {"recording": "18e9aa02efc40abb0e51", "charged_to": "robot"}
+    drop = AuditRecord(id="1", time=1_500_000_000, event="message dropped", reason="no", detail=planned)
+    assert list(lines_of(drop)) == [
+        "no",
+        "recorded: in 18e9aa02efc40abb0e51; rosrv record messages 18e9aa02efc40abb0e51"
+        " --at 1970-01-01T00:00:01.500000000Z",
+    ]
+    off = AuditRecord(
+        id="1", time=1, event="message dropped", reason="no", detail={"not_recorded": "it is off"}
+    )
+    assert list(lines_of(off)) == ["no", "not recorded: it is off"]
+    own = AuditRecord(id="1", time=1, event="recording closed", reason="done", detail=planned)
+    assert list(lines_of(own)) == ["done"]
+    withheld = AuditRecord(id="1", time=1, event="message dropped", detail=planned | {"withheld": ["before"]})
+    assert list(lines_of(withheld))[1].startswith("recorded: in ")
+
+
+def test_every_monitors_trigger_says_whether_it_was_recorded() -> None:
+    """An event of a monitor that may trigger a recording is never silent about it."""
+    for event in _BY_EVENT:
+        assert any("not recorded: " in line for line in lines_of(AuditRecord(id="1", time=1, event=event)))

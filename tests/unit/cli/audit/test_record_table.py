@@ -1,5 +1,6 @@
 """The output of `rosrv audit` on a terminal."""
 
+import re
 import sys
 
 import pytest
@@ -8,6 +9,8 @@ from appliance.audit.chain_findings import Verification
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import LogEntry
 from appliance.cli.audit.record_table import print_entries, print_verification
+
+_STYLE = re.compile(r"\x1b\[[\d;]*m")
 
 
 @pytest.mark.parametrize(
@@ -39,3 +42,39 @@ def test_a_table_of_records_has_their_numbers(
     print_entries([LogEntry(4711, AuditRecord(id="0" * 20, time=0, event="decision", decision="deny"))])
     head, row = capsys.readouterr().out.splitlines()
     assert (head.split()[0], row.split()[0]) == ("record", "4711")
+
+
+def test_equal_records_are_one_row(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The row has monitor, topic, the first record's number, count, times and the last value; `each` shows all."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
+    entries = [
+        LogEntry(
+            number,
+            AuditRecord(
+                id="0" * 20,
+                time=(86_000 + number) * 1_000_000_000,
+                event="message dropped",
+                category="monitor",
+                resource="/cmd_vel",
+                reason=f"speed 0.{number}",
+                detail={"monitor": "speedLimit"},
+            ),
+        )
+        for number in (5, 4, 3)
+    ]
+    print_entries(entries)
+    _head, row = _STYLE.sub("", capsys.readouterr().out).splitlines()
+    assert " ".join(row.split()) == (
+        "3 1970-01-01 23:53:23 to 23:53:25 message dropped monitor speedLimit /cmd_vel 3 times, last: speed 0.5"
+    )
+    print_entries(entries, each=True)
+    assert [_STYLE.sub("", row).split()[0] for row in capsys.readouterr().out.splitlines()] == [
+        "record",
+        "5",
+        "4",
+        "3",
+    ]

@@ -1,0 +1,112 @@
+"""Compute the publishers of a topic at a time in the past, from the records of registrations. No I/O."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+from appliance.audit.query import Filter
+from appliance.audit.record_format import LogEntry, rfc3339
+
+_NODES = ("node lost", "node returned", "replaced", "takeover")
+_LOG = ("appliance started", "appliance stopped", "records lost", "log begun")
+
+
+@dataclass(frozen=True, slots=True)
+class PastPublisher:
+    """A node that was registered as a publisher.
+
+    `since` is nanoseconds since the epoch, and `sequence` the record of the registration or of the node's return. Both
+    are None if the log only has the end of the registration.
+    """
+
+    node: str
+    host: str
+    since: int | None
+    sequence: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class PastPublishers:
+    """The publishers, ordered by name, and sentences on what the log does not show."""
+
+    publishers: tuple[PastPublisher, ...]
+    unknown: tuple[str, ...]
+
+
+def publishers_at(
+    export: Callable[[Filter], Iterable[LogEntry]], first: LogEntry | None, topic: str, at: int
+) -> PastPublishers:
+    """Return the publishers of a topic at a time (nanoseconds since the epoch).
+
+    `export` yields the records that match a filter; `first` is the first record of the log, None if it is empty.
+    """
+    registrations = (
+        Filter(event=event, category="publication", resource=topic)
+        for event in ("registered", "unregistered")
+    )
+    others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
+    entries = [entry for wanted in (*registrations, *others) for entry in export(wanted)]
+    entries.sort(key=lambda entry: entry.sequence)
+    past = [entry for entry in entries if entry.record.time <= at]
+    known = _registered(past)
+    seen = {
+        (entry.record.host, entry.record.caller_id) for entry in past if entry.record.event == "registered"
+    }
+    reaches = first is not None and first.record.time <= at
+    ended = _ended_later((entry for entry in entries if entry.record.time > at), seen) if reaches else ()
+    found = sorted([*known, *ended], key=lambda one: (one.node, one.host))
+    return PastPublishers(tuple(found), tuple(_unknown(past, first, at)))
+
+
+def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
+    """Return the publishers after these records, without those that were lost."""
+    holders: dict[str, PastPublisher] = {}
+    lost: dict[str, PastPublisher] = {}
+    for sequence, record in past:
+        name, host = record.caller_id or "", record.host or ""
+        match record.event:
+            case "registered":
+                holders[name] = PastPublisher(name, host, record.time, sequence)
+                lost.pop(name, None)
+            case "unregistered":
+                for nodes in (holders, lost):
+                    if name in nodes and nodes[name].host == host:
+                        del nodes[name]
+            case "replaced" | "takeover":
+                holders.pop(name, None)
+                lost.pop(name, None)
+            case "node lost" if name in holders and holders[name].host == host:
+                lost[name] = holders.pop(name)
+            case "node returned" if name in lost and lost[name].host == host:
+                holders[name] = replace(lost.pop(name), since=record.time, sequence=sequence)
+    return list(holders.values())
+
+
+def _ended_later(
+    later: Iterable[LogEntry], seen: set[tuple[str | None, str | None]]
+) -> Iterator[PastPublisher]:
+    """Yield the nodes whose registration ended later, and of which the log does not have the beginning."""
+    for entry in later:
+        key = entry.record.host, entry.record.caller_id
+        if key not in seen and entry.record.event == "unregistered":
+            yield PastPublisher(key[1] or "", key[0] or "", None, None)
+        seen.add(key)
+
+
+def _unknown(past: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[str]:
+    if first is None or at < first.record.time:
+        begins = "the log is empty" if first is None else f"the log begins at {rfc3339(first.record.time)}"
+        yield f"{begins}: registrations before are not known"
+    elif first.record.event != "log begun":
+        yield (
+            f"records before {rfc3339(first.record.time)} were removed: nodes that registered earlier, and are still"
+            " registered, are missing"
+        )
+    elif first.record.detail.get("earlier_log_missing"):
+        yield f"an earlier log is missing: registrations before {rfc3339(first.record.time)} are not known"
+    if any(entry.record.event == "records lost" for entry in past):
+        yield "records were lost before this time: rosrv audit search --event 'records lost'"
+    runs = [
+        entry.record for entry in past if entry.record.event in ("appliance started", "appliance stopped")
+    ]
+    if runs and runs[-1].event == "appliance stopped":
+        yield f"the appliance was stopped at {rfc3339(runs[-1].time)}: these were registered then"
