@@ -175,8 +175,16 @@ async def _load(call: OperationCall[admin.PolicyLoad]) -> Tagged[Report]:
         if call.dry_run:
             return tagged(report)
         loaded = await call.ask(order)
-    told = {name: getattr(loaded, name) for name in ("revision", "replaced", "revoked", "confirm_by")}
-    return tagged(replace(report, loaded=True, **told))
+    return tagged(
+        replace(
+            report,
+            loaded=True,
+            revision=loaded.revision,
+            replaced=loaded.replaced,
+            revoked=loaded.revoked,
+            confirm_by=loaded.confirm_by,
+        )
+    )
 
 
 ANSWERS = {"load_policy": Answer(_load)}

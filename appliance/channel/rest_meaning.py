@@ -77,7 +77,8 @@ def filled_in(order: AdminRequest[Any], given: AdminRequest[Any]) -> AdminReques
     operation = operation_of(order)
     if operation is None or type(order) is not type(given):
         return order
-    left = {name: getattr(given, name) for name in operation.filled if not getattr(order, name)}
+    ours, theirs = msgspec.structs.asdict(order), msgspec.structs.asdict(given)
+    left = {name: theirs[name] for name in operation.filled if not ours[name]}
     return msgspec.structs.replace(order, **left)
 
 

@@ -39,17 +39,16 @@ class PolicyInForce(RevisionText, frozen=True):
     warnings: list[str]
     confirm_by: Moment | None
     site_keys: Annotated[list[str], doc("if there are any, one of them must have signed what is loaded")]
+    robot: Annotated[list[str], doc("addresses and networks of the group robot")]
+    hosts: Annotated[dict[str, str], doc("address of each enrolled host, for host:NAME")]
 
 
 class PolicyKnown(PolicyInForce, frozen=True):
     """A revision, with all data for the comparison with another text.
 
-    `robot` are the robot's addresses and networks, `hosts` the addresses of enrolled hosts by name. `cases` are the
-    policy's tests, None where there are none; `cases_error` is the reason if they cannot be read.
+    `cases` are the policy's tests, None where there are none; `cases_error` is the reason if they cannot be read.
     """
 
-    robot: list[str]
-    hosts: dict[str, str]
     cases_file: str
     cases: str | None
     cases_error: str | None

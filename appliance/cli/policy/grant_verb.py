@@ -24,7 +24,7 @@ def why(
     appliance: Appliance,
     record: Annotated[str, typer.Argument(metavar="RECORD", help="Id or sequence number of the record")],
 ) -> None:
-    """Explain a record: its sender, events, values and line, and the rule that would allow a denied request.
+    """Explain a record: its sender, events, values, line and recording, and the rule that would allow a denied request.
 
     The listed events alone lead to a monitor's verdict. The appliance may be stopped; only the rule that would allow a
     denied request needs the running appliance.

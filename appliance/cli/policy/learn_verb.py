@@ -13,7 +13,7 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.durations import Since
 from appliance.cli.output import say_json
 from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
@@ -26,17 +26,18 @@ from rosmop.tool.terminal import counted, refused
 _OWN_NODE = "the appliance's own node"
 
 
-@speaks
+@speaks_with(
+    Annotated[
+        bool,
+        typer.Option("--json", help="One JSON object: the policy, and the number of requests it is based on"),
+    ]
+)
 def learn_policy(
     appliance: Appliance,
     *,
     since: Since = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     robot: Robot = None,
-    as_json: Annotated[
-        bool,
-        typer.Option("--json", help="One JSON object: the policy, and the number of requests it is based on"),
-    ] = False,
 ) -> None:
     """Write a policy that grants the requests in the audit log and no others.
 
@@ -52,7 +53,7 @@ def learn_policy(
     _check(learned, robot)
     if output is not None:
         _write(output, learned.text)
-    if as_json:
+    if appliance.as_json:
         say_json({"requests": learned.requests, "left_out": learned.left_out, "text": learned.text})
         return
     if output is None:

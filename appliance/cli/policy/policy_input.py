@@ -6,15 +6,17 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import msgspec
 import typer
 from msgspec.structs import asdict
 
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.base.input_files import read_given_text
-from appliance.channel.admin import RegistrationsWanted
+from appliance.channel.admin import PolicyWanted, RegistrationsWanted
+from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
@@ -71,6 +73,34 @@ def _enrolled(text: str) -> tuple[str, Address]:
         return name, canonical_address(ipaddress.ip_address(address))
     except ValueError as error:
         raise usage_error(f"--enrolled: expected NAME=ADDRESS, found {text!r}") from error
+
+
+def policy_in_force(
+    appliance: Appliance, robot: list[str] | None, enrolled: list[str] | None
+) -> tuple[str, str, PolicyContext]:
+    """Return the text of the policy in force, its file, and the appliance's hosts, which the options override.
+
+    Exits with status 2 if no appliance answers.
+    """
+    body: PolicyInForce
+    if appliance.place is None:
+        body = appliance.ask_or_exit(PolicyWanted())
+    else:
+        body = msgspec.convert(_over_rest(appliance), PolicyInForce)
+    known = PolicyContext(
+        {name: canonical_address(ipaddress.ip_address(address)) for name, address in body.hosts.items()},
+        [ipaddress.ip_network(place) for place in body.robot],
+    )
+    return body.text, body.file, known_of(robot, enrolled, known)
+
+
+def _over_rest(appliance: Appliance) -> dict[str, Any]:
+    from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
+
+    try:
+        return appliance.rest.call("GET", "/v1/policy")
+    except (NotRunningError, RestProblemError) as error:
+        raise usage_error(str(error)) from error
 
 
 def find_host(text: str, policy: Policy) -> Address:

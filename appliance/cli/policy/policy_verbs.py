@@ -1,9 +1,8 @@
-"""`rosrv policy check|explain|test|diff`: check a policy before it is in force, without an appliance.
+"""`rosrv policy check|explain|test`: check a policy before it is in force, or explain the one in force.
 
-Exit status: 0 allowed, valid, no difference; 1 denied, errors, a failed case, a difference; 2 usage.
+Exit status: 0 allowed, valid; 1 denied, errors, a failed case; 2 usage.
 """
 
-import contextlib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,24 +19,27 @@ from appliance.cli.policy.policy_input import (
     Robot,
     find_host,
     known_of,
-    live_now,
+    policy_in_force,
     read_text,
-    requests_of_audit_log,
-    requests_of_file,
     usage_error,
 )
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.decision_reasons import DecisionExplanation, explain, render
-from appliance.policy.diff import Difference, diff
 from appliance.policy.grant import DecidedRequest, UngrantableError
 from appliance.policy.grant import grant as grant_of
-from appliance.policy.judgement import PolicyJudgement, judge
+from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.model import Category, Decision, Request
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.policy.rights import needs_node, rights_of
 from rosmop.tool.terminal import counted, refused, say
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
+OptionalFile = Annotated[
+    Path | None,
+    typer.Argument(metavar="FILE", help="The policy (default: the one in force)", show_default=False),
+]
 
 
 @speaks
@@ -80,7 +82,7 @@ def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
         say(str(finding), "red" if finding.severity == "error" else "yellow")
 
 
-def _decision_fields(decision: Decision) -> dict[str, object]:
+def decision_fields(decision: Decision) -> dict[str, object]:
     """Return a decision's fields as in the audit log."""
     place = asdict(decision.rule) if decision.rule else None
     return {"decision": decision.word, "rule": place, "reason": decision.reason}
@@ -100,22 +102,31 @@ def _impact(
         return PolicyImpact(error.findings, [])
 
 
-def _allowing(
-    file: Path, request: Request, robot: list[str] | None, enrolled: list[str] | None
-) -> Iterator[str]:
+def _allowing(policy: Policy, request: Request) -> Iterator[str]:
     """Yield the smallest change of the policy that would allow the request."""
+    known = PolicyContext(policy.enrolled, policy.robot)
     try:
-        found = grant_of(
-            read_text(file), str(file), known_of(robot, enrolled), DecidedRequest(request, rights_of(request))
-        )
+        found = grant_of(policy.text, policy.file, known, DecidedRequest(request, rights_of(request)))
     except UngrantableError as error:
         yield str(error)
         return
     yield from (f"would be allowed by: {line}" for line in found.added)
 
 
+def compiled(
+    appliance: Appliance, file: Path | None, robot: list[str] | None, enrolled: list[str] | None
+) -> Policy:
+    """Return the policy of a file, or the one in force. Exits with status 1 if the file has errors."""
+    if file is not None:
+        return _judge_or_exit(file, robot, enrolled).policy
+    text, name, known = policy_in_force(appliance, robot, enrolled)
+    return compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
+
+
+@speaks
 def explain_request(
-    file: _File,
+    appliance: Appliance,
+    file: OptionalFile = None,
     *,
     host: Annotated[str, typer.Option(help="The requesting host: an address, robot, or host:NAME")],
     node: Annotated[
@@ -131,11 +142,12 @@ def explain_request(
     use_node: Annotated[str | None, typer.Option(metavar="NODE", help="use a node name")] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
-    as_json: Json = False,
 ) -> None:
     """Explain whether a request is allowed, by which rule, and which rules were overridden. Exit status 1 if denied.
 
-    Example: rosrv policy explain policies/landshark.ini --host 10.0.0.9 --node /joystick --publish /cmd_vel
+    Without a file, explain the decision of the policy in force.
+
+    Example: rosrv policy explain --host 10.0.0.9 --node /joystick --publish /cmd_vel
     """
     asked = {
         Category.PUBLISH: publish,
@@ -150,7 +162,7 @@ def explain_request(
     chosen = [(category, name) for category, name in asked.items() if name is not None]
     if len(chosen) != 1:
         raise usage_error("give exactly one action of the host: --publish TOPIC, --command CALL, …")
-    policy = _judge_or_exit(file, robot, enrolled).policy
+    policy = compiled(appliance, file, robot, enrolled)
     category, name = chosen[0]
     try:
         request = Request(find_host(host, policy), node, category, check_resource(category, name))
@@ -159,13 +171,13 @@ def explain_request(
     if needs_node(request) and not node:
         raise usage_error("this request needs a node: give its name with --node /NAME")
     explanation = explain(policy, request)
-    if as_json:
+    if appliance.as_json:
         say_json(_explanation_fields(explanation))
     else:
         for line in render(explanation):
             say(line, "green" if explanation.allowed else "red")
         if not explanation.allowed:
-            for line in _allowing(file, request, robot, enrolled):
+            for line in _allowing(policy, request):
                 say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
 
@@ -173,7 +185,7 @@ def explain_request(
 def _explanation_fields(explanation: DecisionExplanation) -> dict[str, object]:
     fields: dict[str, object] = {
         **explanation.request.fields(),
-        **_decision_fields(explanation.decision),
+        **decision_fields(explanation.decision),
         "told": explanation.told,
         "through": list(explanation.through),
         "lost": [
@@ -219,74 +231,12 @@ def test(
         if as_json:
             place = {"file": result.file, "line": result.line, "column": result.column}
             expected = {"passed": result.passed, "expected": "allow" if result.expected else "deny"}
-            say_json({**place, **expected, **result.request.fields(), **_decision_fields(result.decision)})
+            say_json({**place, **expected, **result.request.fields(), **decision_fields(result.decision)})
         else:
             say(str(result), "red")
     if not as_json:
         say(f"{len(results) - len(failed)} passed, {len(failed)} failed", "red" if failed else "green")
     raise typer.Exit(1 if failed else 0)
-
-
-@speaks
-def compare(
-    appliance: Appliance,
-    old: Annotated[Path, typer.Argument(metavar="OLD", help="The current policy", show_default=False)],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="The new policy", show_default=False)],
-    *,
-    requests: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="NDJSON of requests: host, caller_id, category, resource"),
-    ] = None,
-    robot: Robot = None,
-    enrolled: Enrolled = None,
-) -> None:
-    """Show recorded requests that the new policy decides differently. Exit status 1 if there are any.
-
-    Example: rosrv policy diff policies/now.ini policies/next.ini --state /var/lib/rosrv
-    """
-    if requests is None and not appliance.said:
-        raise usage_error(
-            "give the source of requests: --state DIR or --api URL (the audit log), or --requests FILE"
-        )
-    before, after = (_judge_or_exit(file, robot, enrolled).policy for file in (old, new))
-    differences = diff(before, after, _requests(requests, appliance))
-    for difference in differences:
-        if appliance.as_json:
-            say_json(_difference_fields(difference))
-        else:
-            for line in _difference_lines(difference):
-                say(line, "yellow" if difference.granted else "red")
-    if not appliance.as_json:
-        say(f"{counted(len(differences), 'request')} would be decided differently")
-    raise typer.Exit(1 if differences else 0)
-
-
-def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
-    if file is not None:
-        yield from requests_of_file(file)
-    else:
-        yield from requests_of_audit_log(appliance)
-        with contextlib.suppress(NotRunningError):
-            for live in live_now(appliance):
-                yield from live.requests()
-
-
-def _difference_lines(difference: Difference) -> Iterator[str]:
-    request = difference.request
-    who = f"{request.host} {request.caller_id}".strip()
-    yield f"{difference.word}: {who}: {request.category} {request.resource}"
-    yield f"  seen in {counted(difference.count, 'record')}"
-    yield f"  old: {difference.old.reason}"
-    yield f"  new: {difference.new.reason}"
-
-
-def _difference_fields(difference: Difference) -> dict[str, object]:
-    return {
-        **difference.request.fields(),
-        "count": difference.count,
-        "old": _decision_fields(difference.old),
-        "new": _decision_fields(difference.new),
-    }
 
 
 def _judge(

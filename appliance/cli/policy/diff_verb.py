@@ -1,0 +1,177 @@
+"""`rosrv policy diff`: compare the texts of two policies, or their decisions on recorded requests."""
+
+import contextlib
+import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.channel.admin import PolicyRevisions, PolicyRevisionWanted
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.output import say_diff, say_json
+from appliance.cli.policy.policy_input import (
+    Enrolled,
+    Robot,
+    known_of,
+    live_now,
+    read_text,
+    requests_of_audit_log,
+    requests_of_file,
+    usage_error,
+)
+from appliance.cli.policy.policy_verbs import decision_fields
+from appliance.policy.diff import Difference, diff
+from appliance.policy.model import Request
+from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+from rosmop.tool.terminal import counted, refused, say
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The text of a file, or of a kept revision, and its name for people."""
+
+    name: str
+    text: str
+
+
+@speaks
+def compare(
+    appliance: Appliance,
+    old: Annotated[
+        str | None,
+        typer.Argument(metavar="A", help="A file, or a revision's number", show_default=False),
+    ] = None,
+    new: Annotated[
+        str | None,
+        typer.Argument(metavar="B", help="A file, or a revision's number", show_default=False),
+    ] = None,
+    *,
+    decisions: Annotated[
+        bool,
+        typer.Option("--decisions", help="List recorded requests that B decides differently from A"),
+    ] = False,
+    requests: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="--decisions: NDJSON of requests instead of the audit log: host, caller_id, category, resource",
+        ),
+    ] = None,
+    robot: Robot = None,
+    enrolled: Enrolled = None,
+) -> None:
+    """Show the changes between two policies as a unified diff. Exit status: 0 no difference, 1 differences.
+
+    With one file, compare the policy in force with it. With one revision, compare it with the policy in force. Without
+    arguments, show the changes of the revision in force. For two files, this release still assumes --decisions.
+
+    Example: rosrv policy diff next.ini
+    """
+    before, after = _sources(appliance, old, new)
+    if not decisions and requests is None and _are_files(old, new):
+        # the meaning of two files in 0.2.0
+        typer.echo("rosrv: two files will be compared by their text: use --decisions", err=True)
+        decisions = True
+    if decisions or requests is not None:
+        policies = _compiled(before, robot, enrolled), _compiled(after, robot, enrolled)
+        differ = _say_decisions(appliance, *policies, requests)
+    elif robot or enrolled:
+        raise usage_error("--robot and --enrolled need --decisions")
+    else:
+        differ = _say_texts(appliance, before, after)
+    raise typer.Exit(1 if differ else 0)
+
+
+def _are_files(*words: str | None) -> bool:
+    return all(word is not None and not word.isdecimal() for word in words)
+
+
+def _sources(appliance: Appliance, old: str | None, new: str | None) -> tuple[_Source, _Source]:
+    if old is not None and new is not None:
+        return _source(appliance, old), _source(appliance, new)
+    rows = appliance.ask_or_exit(PolicyRevisions()).revisions
+    now = next(row.revision for row in rows if row.in_force)
+    if old is not None:
+        in_force, given = _revision(appliance, now, " (in force)"), _source(appliance, old)
+        return (given, in_force) if old.isdecimal() else (in_force, given)
+    previous = max((row.revision for row in rows if row.revision < now), default=None)
+    if previous is None:
+        raise usage_error(f"there is no kept revision before {now}: give a file to compare with")
+    return _revision(appliance, previous), _revision(appliance, now, " (in force)")
+
+
+def _source(appliance: Appliance, word: str) -> _Source:
+    """Return the revision of a number, or the text of a file (`./7` if its name is a number)."""
+    return _revision(appliance, int(word)) if word.isdecimal() else _Source(word, read_text(Path(word)))
+
+
+def _revision(appliance: Appliance, number: int, note: str = "") -> _Source:
+    text = appliance.ask_or_exit(PolicyRevisionWanted(number)).text
+    return _Source(f"revision {number}{note}", text)
+
+
+def _say_texts(appliance: Appliance, old: _Source, new: _Source) -> bool:
+    """Print the difference of the texts; return whether there is one."""
+    was, now = old.text.splitlines(), new.text.splitlines()
+    lines = list(difflib.unified_diff(was, now, old.name, new.name, lineterm=""))
+    if appliance.as_json:
+        say_json({"old": old.name, "new": new.name, "lines": lines})
+    else:
+        say_diff(lines)
+    return bool(lines)
+
+
+def _compiled(source: _Source, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
+    known = known_of(robot, enrolled)
+    try:
+        return compile_policy(source.text, file=source.name, hosts=known.hosts, robot=known.robot)
+    except PolicyError as error:
+        raise refused(error.findings) from error
+
+
+def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Path | None) -> bool:
+    """Print the requests that are decided differently; return whether there are any."""
+    differences = diff(old, new, _requests(requests, appliance))
+    for difference in differences:
+        if appliance.as_json:
+            say_json(_difference_fields(difference))
+        else:
+            for line in _difference_lines(difference):
+                say(line, "yellow" if difference.granted else "red")
+    if not appliance.as_json:
+        say(f"{counted(len(differences), 'request')} would be decided differently")
+    return bool(differences)
+
+
+def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
+    if file is not None:
+        yield from requests_of_file(file)
+    else:
+        yield from requests_of_audit_log(appliance)
+        with contextlib.suppress(NotRunningError):
+            for live in live_now(appliance):
+                yield from live.requests()
+
+
+def _difference_lines(difference: Difference) -> Iterator[str]:
+    request = difference.request
+    who = f"{request.host} {request.caller_id}".strip()
+    yield f"{difference.word}: {who}: {request.category} {request.resource}"
+    yield f"  seen in {counted(difference.count, 'record')}"
+    yield f"  old: {difference.old.reason}"
+    yield f"  new: {difference.new.reason}"
+
+
+def _difference_fields(difference: Difference) -> dict[str, object]:
+    return {
+        **difference.request.fields(),
+        "count": difference.count,
+        "old": decision_fields(difference.old),
+        "new": decision_fields(difference.new),
+    }

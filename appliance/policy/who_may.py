@@ -1,0 +1,96 @@
+"""List the hosts that have the rights for an action: each network that the policy names, and all other hosts."""
+
+import ipaddress
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from appliance.policy.host_sets import Network
+from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.policy import Policy
+from appliance.policy.rights import decide, decide_right, rights_of
+
+
+@dataclass(frozen=True, slots=True)
+class HostAnswer:
+    """The decision for all hosts of a network; None: for the hosts that no network of the policy contains.
+
+    `names` are the names of the network: `robot`, `host:NAME`. `through` are the words of the deciding rule that
+    include the hosts. `near`: only a further right is missing, such as the one on the command.
+    """
+
+    network: Network | None
+    names: tuple[str, ...]
+    decision: Decision
+    through: tuple[str, ...]
+    near: bool
+
+    @property
+    def hosts(self) -> str:
+        """Return the address, the network, or `every other host`."""
+        if self.network is None:
+            return "every other host"
+        return str(
+            self.network.network_address
+            if self.network.prefixlen == self.network.max_prefixlen
+            else self.network
+        )
+
+
+def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
+    """Yield the answer for each network in order of addresses, then for all other hosts.
+
+    Without the name of a `node`, the right to a node's name is not decided.
+    """
+    networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
+    inside = [(network, _only_in(policy, network, networks)) for network in networks]
+    found: list[tuple[Network | None, Address | None]] = [*inside, (None, _outside(policy, networks))]
+    for network, address in found:
+        if address is not None:
+            yield _answer(policy, network, Request(address, node, category, resource))
+
+
+def _answer(policy: Policy, network: Network | None, request: Request) -> HostAnswer:
+    rights = [
+        right
+        for right in rights_of(request)
+        if right.request.category is not Category.NODE or right.request.resource
+    ]
+    decision, own = decide(policy, rights), decide_right(policy, rights[0])
+    rule = next((one for one in policy.rules(request.category) if one.rule == own.rule), None)
+    through = rule.granted_through(policy.atoms_of(request.host)) if rule is not None else ()
+    near = own.allowed and not own.would_deny and (not decision.allowed or decision.would_deny)
+    return HostAnswer(network, _names(policy, network), decision, through, near)
+
+
+def _names(policy: Policy, network: Network | None) -> tuple[str, ...]:
+    names = [f"host:{name}" for name, at in policy.enrolled.items() if network == ipaddress.ip_network(at)]
+    return tuple((["robot"] if network in policy.robot else []) + sorted(names))
+
+
+def _only_in(policy: Policy, network: Network, networks: list[Network]) -> Address | None:
+    """Return an address that no smaller network of the policy contains, or None if they cover the network."""
+    starts = [network.network_address, *_ends([one for one in networks if _within(one, network)])]
+    return next((one for one in starts if one in network and policy.named_as(one) == network), None)
+
+
+def _within(inner: Network, outer: Network) -> bool:
+    return inner.version == outer.version and inner != outer and inner.network_address in outer
+
+
+def _outside(policy: Policy, networks: list[Network]) -> Address | None:
+    """Return an address that the policy does not name, or None if it names all."""
+    starts: list[Address] = [
+        ipaddress.IPv4Address(0),
+        *_ends([one for one in networks if one.version == 4]),
+        ipaddress.IPv6Address(0),
+        *_ends([one for one in networks if one.version == 6]),
+    ]
+    return next((one for one in starts if not policy.names(one)), None)
+
+
+def _ends(networks: list[Network]) -> Iterator[Address]:
+    """Yield the address after each network; after the last address of all there is none."""
+    for network in networks:
+        last = network.broadcast_address
+        if int(last) + 1 < 1 << network.max_prefixlen:
+            yield last + 1
