@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from appliance import __version__
+from appliance.base.user_errors import UserError
 from appliance.cli.lazy import Group, Verb, application
 from rosmop.tool.options import SUMMARIES
 
@@ -54,8 +55,9 @@ VERBS: dict[str, Verb | Group] = {
             "grant": Verb("policy.grant_verb:grant"),
             "check": Verb("policy.policy_verbs:check"),
             "explain": Verb("policy.policy_verbs:explain_request"),
+            "who-may": Verb("policy.who_may_verb:list_who_may"),
             "test": Verb("policy.policy_verbs:test"),
-            "diff": Verb("policy.policy_verbs:compare"),
+            "diff": Verb("policy.diff_verb:compare"),
         },
     ),
     "monitor": Group(
@@ -95,6 +97,7 @@ VERBS: dict[str, Verb | Group] = {
             "list": Verb("graph_verbs:list_topics"),
             "echo": Verb("topic_verbs:echo"),
             "info": Verb("topic_verbs:info"),
+            "publishers": Verb("topic_verbs:publishers"),
         },
     ),
     "node": Group("Show nodes of the running robot.", {"list": Verb("graph_verbs:list_nodes")}),
@@ -155,9 +158,6 @@ app = application(
     VERBS, callback=_global_options, name="rosrv", help="A network-security appliance for ROS 1 robots."
 )
 
-_USER_ERRORS = frozenset({"ConfigError", "StartError", "NetworkError"})
-"""Names of the errors whose text is shown to users. With names, the errors' modules need not be imported."""
-
 
 def main() -> None:
     """Run the command; print errors as text, never as a traceback."""
@@ -166,10 +166,7 @@ def main() -> None:
     try:
         app()
     except Exception as error:  # noqa: BLE001  the last resort: print the error and its place
-        if any(
-            cls.__name__ in _USER_ERRORS and cls.__module__.startswith("appliance.")
-            for cls in type(error).__mro__
-        ):
+        if isinstance(error, UserError):
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)
         if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:

@@ -4,7 +4,7 @@ Text from the network (names, log entries) is printed without control characters
 """
 
 import datetime
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,3 +41,9 @@ def write_told(path: Path, data: bytes) -> None:
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
     """Write an object to standard output as one line of JSON."""
     terminal.say_json(in_full(fields))
+
+
+def say_diff(lines: Iterable[str]) -> None:
+    """Print the lines of a unified diff: additions green, removals red, positions cyan."""
+    for line in lines:
+        terminal.say(line, {"+": "green", "-": "red", "@": "cyan"}.get(line[:1], ""))

@@ -15,7 +15,7 @@ import typer
 
 from appliance.channel.admin import HostPorts, StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.network import close_ports as protection
 from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.namespaces import Namespace, NetworkError
@@ -45,7 +45,7 @@ The check tries TCP. Run it on a machine other than the appliance, which is allo
 """
 
 
-@speaks
+@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")])
 def protect(
     running: Appliance,
     *,
@@ -82,7 +82,6 @@ def protect(
     seconds: Annotated[
         float, typer.Option(min=0.05, max=60, help="Check: seconds to wait for each port.")
     ] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")] = False,
 ) -> None:
     """Print, apply, check or remove the rules; `HELP` replaces this text."""
     if sum((apply, check is not None, remove)) > 1:
@@ -91,11 +90,11 @@ def protect(
         services = protection.parse_services(open_services or ())
         chosen = protection.parse_ports(ports) if ports is not None else protection.local_port_range()
         if check is not None:
-            _check(_CheckTarget(check, name, chosen, services, seconds), running, as_json)
+            _check(_CheckTarget(check, name, chosen, services, seconds), running)
         elif remove:
-            _remove(as_json)
+            _remove(running.as_json)
         else:
-            _make(appliance or [_own(running)], chosen, services, apply, as_json)
+            _make(appliance or [_own(running)], chosen, services, apply, running.as_json)
     except (ValueError, NetworkError) as error:
         _fail(str(error))
 
@@ -161,7 +160,7 @@ class _CheckTarget:
         return [port for port in range(self.ports.first, self.ports.last + 1) if port not in stay_open]
 
 
-def _check(checked: _CheckTarget, running: Appliance, as_json: bool) -> None:
+def _check(checked: _CheckTarget, running: Appliance) -> None:
     results = [scan(address, checked.wanted(), checked.seconds) for address in addresses_of(checked.host)]
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
@@ -174,7 +173,7 @@ def _check(checked: _CheckTarget, running: Appliance, as_json: bool) -> None:
         "state": state,
         "addresses": addresses,
     }
-    _say(as_json, report, "".join(_sentence(result, checked.ports) for result in results))
+    _say(running.as_json, report, "".join(_sentence(result, checked.ports) for result in results))
     if running.said:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address

@@ -23,7 +23,7 @@ from appliance.channel.answers.status import (
     Status,
 )
 from appliance.channel.status_summary import process_names
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import moment, say_json
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
@@ -35,10 +35,8 @@ _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
-@speaks
-def status(
-    appliance: Appliance, as_json: Annotated[bool, typer.Option("--json", help="One JSON object")] = False
-) -> None:
+@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object")])
+def status(appliance: Appliance) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 
     Exit status: 0 in service, 1 needs attention, 2 not running.
@@ -47,7 +45,7 @@ def status(
     """
     body = appliance.ask_or_exit(StatusWanted())
     troubles = list(troubles_of(body))
-    if as_json:
+    if appliance.as_json:
         say_json({**in_full(body), "troubles": troubles})
     else:
         show(body, troubles)

@@ -7,10 +7,10 @@ from typing import Any
 from appliance.channel.messages import PartNames, SpecificationsStated
 from appliance.specifications.checking import parts
 from rosmop.check.sources import compiled_from
+from rosmop.fast.build import part_of
 from rosmop.fast.serialization import encoded_part
-from rosmop.fast.wasm_build import part_of
+from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
-from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 

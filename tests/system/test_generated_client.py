@@ -7,7 +7,6 @@ contract's examples; hosts are enrolled, and one of them sends requests through 
 import base64
 import contextlib
 import json
-import re
 import subprocess
 import sys
 import xmlrpc.client
@@ -33,8 +32,8 @@ from tests.support.tunnels import need_strongswan
 LOCK = Path(__file__).with_name("generated-client.lock")
 UV = Path(sys.executable).with_name("uv")
 # settings of the page for the generator: parsing answers that are not JSON
-PAGE = (Path(__file__).parents[2] / "docs/reference/rest.md").read_text()
-OVERRIDES = re.findall(r"^```yaml\n(content_type_overrides:.*?)^```", PAGE, re.MULTILINE | re.DOTALL)[0]
+ROOT = Path(__file__).parents[2]
+CONFIGURATION = ROOT / "examples/openapi/openapi-python-client.yaml"
 CONFIG = f"""\
 api: 0.0.0.0:{API}
 api_networks: [10.88.0.0/24]
@@ -232,10 +231,9 @@ class Client:
 def generate(generator: Path, contract: Any, folder: Path) -> None:
     """Generate the client completely, except for bodies that are not JSON."""
     (folder / "openapi.json").write_text(json.dumps(contract))
-    (folder / "overrides.yaml").write_text(OVERRIDES)
     made = subprocess.run(
         [generator / "openapi-python-client", "generate", "--path", "openapi.json", "--output-path", "client",
-         "--meta", "none", "--config", "overrides.yaml"],
+         "--meta", "none", "--config", CONFIGURATION],
         cwd=folder, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert made.returncode == 0, made.stdout + made.stderr

@@ -174,7 +174,7 @@ class _EndedError(NotRunningError):
 
 
 def _parameters(wanted: Filter) -> dict[str, Any]:
-    fields = {name: getattr(wanted, name) for name in Filter.__struct_fields__}
+    fields = msgspec.structs.asdict(wanted)
     fields["looks"] = "0" if fields.pop("without_looks") else None
     params = {name: value for name, value in fields.items() if value not in (None, ())}
     for name in ("since", "until"):

@@ -1,8 +1,8 @@
 """Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb takes an `Appliance` as its first parameter; the decorator `speaks` adds the options `--state`, `--api` and
-`--api-ca`. The socket and REST give the same answers. The command line overrides the environment; within the
-environment, REST overrides the socket.
+A verb takes an `Appliance` as its first parameter; the decorator `speaks` adds the options `--state`, `--api`,
+`--api-ca` and `--json`. The socket and REST give the same answers. The command line overrides the environment; within
+the environment, REST overrides the socket.
 """
 
 import functools
@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Concatenate, ParamSpec
+from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
 
 import msgspec
 import typer
@@ -117,26 +117,39 @@ class Appliance:
 
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-    """Replace a verb's first parameter, an `Appliance`, by the options that choose one; add --json if missing."""
-    own = inspect.signature(verb, eval_str=True)
-    its_json = next(filter(lambda name: name.startswith("as_json"), own.parameters), None)
-
-    @functools.wraps(verb)
-    def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
-        context, state, api, authority = (kwargs.pop(place.name) for place in _PLACES)
-        as_json = kwargs[its_json] if its_json else kwargs.pop(_JSON.name)
-        appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
-        verb(replace(appliance, as_json=as_json), *args, **kwargs)  # type: ignore[arg-type]  # as above
-
-    parameters = [*list(own.parameters.values())[1:], *([] if its_json else [_JSON]), *_PLACES]
-    asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
-    asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
-        "return": None
-    }
-    return asked
+    """Replace a verb's first parameter, an `Appliance`, by --json and the options that choose an appliance."""
+    return speaks_with(Json)(verb)
 
 
-_JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)
+def speaks_with(
+    json: Any,
+) -> Callable[[Callable[Concatenate[Appliance, _P], None]], Callable[_P, None]]:
+    """Like `speaks`, with this annotation of --json."""
+
+    def speaking(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
+        own = inspect.signature(verb, eval_str=True)
+
+        @functools.wraps(verb)
+        def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
+            context, state, api, authority = (kwargs.pop(place.name) for place in _PLACES)
+            as_json = kwargs.pop("as_json")
+            appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
+            verb(replace(appliance, as_json=as_json), *args, **kwargs)  # type: ignore[arg-type]  # as above
+
+        # typer reads the options of a verb from its signature and annotations only.
+        its_json = inspect.Parameter(
+            "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=json
+        )
+        parameters = [*list(own.parameters.values())[1:], its_json, *_PLACES]
+        asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
+        asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
+            "return": None
+        }
+        return asked
+
+    return speaking
+
+
 _PLACES = [
     inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
     for name, default, annotation in (
@@ -151,7 +164,7 @@ _PLACES = [
 def _chosen(context: typer.Context, state: Path, api: str | None, authority: Path | None) -> Appliance:
     """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
-    said = {name: getattr(source, "name", "") for name, source in sources.items()}
+    said = {name: "" if source is None else source.name for name, source in sources.items()}
     typed = {name for name, source in said.items() if source == "COMMANDLINE"}
     if {"state", "api"} <= typed:
         raise usage_error("--state and --api exclude each other: give one")

@@ -18,7 +18,6 @@ from appliance.ipsec.requests import make_key, signing_request
 
 _ENDPOINT = re.compile(r"[A-Za-z0-9][A-Za-z0-9.:-]{0,252}")
 _LONGEST_REQUEST = 16 << 10
-_SHOWN = ("name", "address", "appliance", "master", "serial", "expires")
 
 
 def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> KitOptions:
@@ -70,8 +69,18 @@ def write_kit(
             err=True,
         )
     if as_json:
-        where = {"endpoint": wishes.endpoint, "endpoint_reason": reason}
-        say_json({key: getattr(body, key) for key in _SHOWN} | where | {"kit": str(output.path)})
+        shown = {
+            "name": body.name,
+            "address": body.address,
+            "appliance": body.appliance,
+            "master": body.master,
+            "serial": body.serial,
+            "expires": body.expires,
+            "endpoint": wishes.endpoint,
+            "endpoint_reason": reason,
+            "kit": str(output.path),
+        }
+        say_json(shown)
         return
     output.say(f"{body.name} is enrolled as {body.address}, until {moment(body.expires)}")
     kit = "standard output" if output.is_standard else str(output.path)
@@ -90,9 +99,15 @@ def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None
     output.write(made.script.encode(), "the token is lost: create another one")
     if as_json:
         shown = {
-            key: getattr(made, key) for key in ("name", "address", "token", "endpoint", "endpoint_reason")
+            "name": made.name,
+            "address": made.address,
+            "token": made.token,
+            "endpoint": made.endpoint,
+            "endpoint_reason": made.endpoint_reason,
+            "token_expires": made.expires,
+            "script": str(output.path),
         }
-        say_json(shown | {"token_expires": made.expires, "script": str(output.path)})
+        say_json(shown)
         return
     output.say(made.token)
     if made.endpoint_reason:

@@ -38,7 +38,7 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
     """Make an XML-RPC call of ROS and return its value. Raises `ProbeError`, `OSError`."""
     try:
         with xmlrpc.client.ServerProxy(uri, _Transport()) as server:
-            answer = getattr(server, method)(*arguments)
+            answer = getattr(server, method)(*arguments)  # how the library calls a method by its name
     except xmlrpc.client.Fault as fault:
         raise ProbeError(fault.faultString) from fault
     except (xmlrpc.client.Error, http.client.HTTPException, expat.ExpatError, ValueError) as error:

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
 from appliance.cli.selftest.selftest_findings import SelftestFinding, fail
 from appliance.configuration.config_sources import ConfigError, resolve
@@ -24,13 +24,12 @@ from rosmop.tool.terminal import counted, printable
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 
 
-@speaks
+@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object for each check")])
 def selftest(
     appliance: Appliance,
     config: Annotated[
         Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object for each check")] = False,
 ) -> None:
     """Check whether this machine can run the appliance, and whether a running appliance works.
 
@@ -48,7 +47,7 @@ def selftest(
     for found in _all(appliance, config):
         failed += found.outcome == "fail"
         warned += found.outcome == "warn"
-        if as_json:
+        if appliance.as_json:
             say_json(asdict(found))
             sys.stdout.flush()
         else:
@@ -58,7 +57,7 @@ def selftest(
                     f"\n-> {printable(found.advice)}", style="bold" if found.outcome == "fail" else "dim"
                 )
             table.add_row(Text(found.outcome, style=_STYLES[found.outcome]), found.check, text)
-    if not as_json:
+    if not appliance.as_json:
         say_table(table)
         end = f"{failed} failed, {counted(warned, 'warning')}" if failed else counted(warned, "warning")
         Console(highlight=False).print(Text(end, style="bold red" if failed else "green"))

@@ -72,6 +72,10 @@ LOOKING = [
     ("monitor", "show", "1"), ("monitor", "show", "777"), ("monitor", "rvstate"),
     ("topic", "list"), ("node", "list"),
     ("policy", "show"), ("policy", "show", "1", "--json"), ("policy", "show", "777"),
+    ("policy", "who-may", "command", "getPid"), ("policy", "who-may", "command", "getPid", "--json"),
+    ("policy", "explain", "--host", "127.0.0.1", "--command", "getPid"),
+    ("policy", "diff", "1", "1", "--json"), ("policy", "diff", "777"), ("policy", "diff", "1", "777", "--json"),
+    ("topic", "publishers", "/nowhere", "--at", "2026-01-01"),
     ("topic", "info", "/nowhere"), ("topic", "echo", "/nowhere"), ("topic", "echo", "/nowhere", "--json"),
     ("host", "list"), ("host", "revoke", "nobody"), ("host", "reload"),
     ("record", "list"), ("record", "list", "--json"), ("record", "show", "a" * 20), ("record", "now"),
@@ -186,8 +190,8 @@ def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_pat
     open_policy = tmp_path / "open.ini"
     open_policy.write_text(OPEN_POLICY)
     for verb in (
-        ("policy", "diff", str(appliance.policy_file), str(open_policy)),
-        ("policy", "diff", str(appliance.policy_file), str(open_policy), "--json"),
+        ("policy", "diff", str(appliance.policy_file), str(open_policy), "--decisions"),
+        ("policy", "diff", str(appliance.policy_file), str(open_policy), "--decisions", "--json"),
         ("policy", "learn"),
     ):
         over_socket, over_rest = (comparable(run(appliance, way, *verb)) for way in ("state", "api"))

@@ -870,7 +870,7 @@ def test_host_that_no_rule_names(field: Field) -> None:
     wider = field.home / "wider.ini"
     wider.write_text("[Publishers]\n/shared/x = 10.77.0.99\n[Nodes]\ndefault = *\n")
     differs = field.appliance.rosrv(
-        "policy", "diff", str(field.appliance.policy_file), str(wider), check=False
+        "policy", "diff", str(field.appliance.policy_file), str(wider), "--decisions", check=False
     ).stdout
     assert any("/shared/x" in line and "10.77.0.99" in line for line in differs.splitlines()), differs
     face = outer(field, "/voice")
