@@ -418,8 +418,9 @@ class MonitorSet:
     def replaced_topics(self, before: "MonitorSet | None") -> frozenset[str]:
         """Return `topics_of` the monitors, of either set, that do not continue unchanged after `succeed`."""
         earlier = before.monitors if before is not None else ()
-        kept = {monitor.name for monitor in earlier}.intersection(self.names) - set(self.began)
-        return self.topics_of(one for one in (*earlier, *self.monitors) if one.name not in kept)
+        present = {monitor.name for monitor in self._monitors}  # `names` also has those in shadow mode
+        kept = {monitor.name for monitor in earlier}.intersection(present) - set(self.began)
+        return self.topics_of(one for one in (*earlier, *self._monitors) if one.name not in kept)
 
     # Changes
 
