@@ -27,6 +27,7 @@ and for a relay with monitors, whose specifications are in `SPECIFICATIONS`:
     taken began=guard held= | refused ~text             the relay's answer
     event drop monitor=guard count=0 before=bad         an action of a monitor
     counts guard drops=1                                the counters of a monitor
+    second held | second ends                           events are counted until the second ends
 """
 
 import shlex

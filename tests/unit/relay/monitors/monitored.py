@@ -2,6 +2,7 @@
 
 import struct
 from typing import Any, ClassVar
+from unittest.mock import patch
 
 from appliance.channel.messages import (
     MonitorEvent,
@@ -190,6 +191,16 @@ class MonitoredDialogue(Dialogue):
         counted = [row for one in self.world.told if isinstance(one, MonitorsCounted) for row in one.rows]
         row = next(row for row in reversed(counted) if row.name == name)
         assert agrees(row, words), row
+
+    def _second(self, word: str) -> None:
+        interceptor = self.world.engine.interceptor
+        if word == "held":
+            self._tick = patch.object(interceptor, "tick")
+            self._tick.start()
+        else:
+            assert word == "ends"
+            self._tick.stop()
+            interceptor.tick()
 
     def _kinds(self, *words: str) -> None:
         reports = [one for one in self.world.told if isinstance(one, MonitorsReported)]
