@@ -35,6 +35,7 @@ from examples.landshark.stage import (
     Actor,
     Attack,
     DemoError,
+    Record,
     Stage,
 )
 
@@ -63,7 +64,6 @@ _NODE_PACKAGES = (
     "rosmaster", "rospy", "genpy", "rosnode", "rosservice", "rostopic",
     "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs",
 )  # fmt: skip
-Record = dict[str, Any]
 
 
 class Show:
@@ -141,14 +141,13 @@ class Show:
 
     def explain_grants(self) -> None:
         """Print four decisions from the audit log that allowed the mission."""
-        granted = self.stage.audit("--allow", "--limit", "10000")
         for caller, topic in GRANTED:
-            for record in granted:
-                if (record.get("caller_id"), record.get("resource")) == (caller, topic):
-                    self.decided("allowed", f"{record.get('category')} {topic} by {caller}", rule_of(record))
-                    break
-            else:
+            named = ("--allow", "--caller", caller, "--topic", topic, "--limit", "1")
+            record = self.stage.recorded(lambda found: next(iter(found), None), *named)
+            if record is None:
                 self.results.append(Result(f"audit record: {caller} {topic}", good=False, remark="missing"))
+            else:
+                self.decided("allowed", f"{record.get('category')} {topic} by {caller}", rule_of(record))
 
     def expect_allowed(self, attempt: Attack) -> None:
         """Report an attempt that the policy allows."""
@@ -178,16 +177,21 @@ class Show:
 
         The log counts a repeated denial instead of recording it again.
         """
-        found = self.stage.audit("--deny", "--host", ATTACKER, "--limit", "1000")  # newest first
-        denials = [one for one in found if one["event"] != "denials folded"]
-        before, self.last_sequence = self.last_sequence, max((one["sequence"] for one in denials), default=-1)
-        matching = [
-            one
-            for one in denials
-            if (one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried)
-            or (one.get("reason") and one["reason"] in attack.answer)
-        ]
-        return next((one for one in matching if one.get("rule")), matching[0] if matching else None)
+        before = self.last_sequence
+
+        def find(found: list[Record]) -> Record | None:
+            """Choose from denials, newest first; prefer a record with a rule."""
+            denials = [one for one in found if one["event"] != "denials folded"]
+            self.last_sequence = max((one["sequence"] for one in denials), default=before)
+            matching = [
+                one
+                for one in denials
+                if (one["sequence"] > before and one.get("resource") and one["resource"] in attack.tried)
+                or (one.get("reason") and one["reason"] in attack.answer)
+            ]
+            return next((one for one in matching if one.get("rule")), matching[0] if matching else None)
+
+        return self.stage.recorded(find, "--deny", "--host", ATTACKER, "--limit", "1000")
 
     def aftermath(self, operator: Actor, before: dict[str, Any]) -> None:
         """Check that every node is alive, the robot still drives, and only the operator fired."""

@@ -94,11 +94,14 @@ class Mistakes:
 
     def _recorded(self, event: str, monitor: str, what: str) -> None:
         """Find and print the audit record of a monitor's action."""
-        found = self._stage.audit("--event", event, "--limit", "100")
-        mine = [one for one in found if one["detail"]["monitor"] == monitor]
-        why = mine[-1]["reason"] if mine else "missing"  # the first record, which is not folded
+        record = self._stage.recorded(
+            # the oldest record, which is not folded
+            lambda found: next((one for one in reversed(found) if one["detail"]["monitor"] == monitor), None),
+            "--event", event, "--limit", "100",
+        )  # fmt: skip
+        why = record["reason"] if record else "missing"
         self._narrator.say(f"audit record: {why}")
-        self._narrator.results.append(Result(f"audit record: {what}", bool(mine), why))
+        self._narrator.results.append(Result(f"audit record: {what}", record is not None, why))
 
     def _result(self, what: str, good: bool, remark: str) -> None:
         self._narrator.results.append(Result(what, good, remark))

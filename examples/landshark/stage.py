@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -36,9 +36,11 @@ CONSOLE = ("127.0.0.1", 8443)  # on the appliance's host
 START_SECONDS = 60.0  # the limit for the start of an appliance or a node
 ATTACK_SECONDS = 60.0
 _NO_COMPILER = 3  # exit status of scripts/build-roscpp
+RECORD_SECONDS = 20.0  # the log writes a record within 50 ms, unless the disk is slow
 COMMAND_SECONDS = 120.0  # long enough for a drive through the yard, and the starts before it
 
 Event = dict[str, Any]
+Record = dict[str, Any]
 
 
 class DemoError(RuntimeError):
@@ -283,6 +285,16 @@ class Stage:
         if done.returncode:
             raise DemoError(f"the audit log cannot be read: {done.stderr.strip()}")
         return [json.loads(line) for line in done.stdout.splitlines() if line.strip()]
+
+    def recorded(self, find: Callable[[list[Record]], Record | None], *flags: str) -> Record | None:
+        """Return the record that `find` selects from an audit search; None after `RECORD_SECONDS`.
+
+        The log may write a record shortly after the answer to its call.
+        """
+        end = time.monotonic() + RECORD_SECONDS
+        while (found := find(self.audit(*flags))) is None and time.monotonic() < end:
+            pass  # a search is a process, which takes a moment
+        return found
 
     def close(self) -> None:
         """End all programs, the appliance last, and remove their files."""
