@@ -30,14 +30,14 @@ def charge(scope: FunctionScope, node: tree.SyntaxNode) -> None:
 def weight(node: tree.SyntaxNode) -> int:
     """Return the charge of an iteration or call: one instruction, plus one for each statement in the body."""
     total = 1
-    waiting: list[object] = [getattr(node, name) for name in node.__dataclass_fields__]
+    waiting: list[object] = tree.fields_of(node)
     while waiting:
         current = waiting.pop()
         if isinstance(current, tuple):
             waiting += current
         elif isinstance(current, tree.Statement | tree.SwitchCase):
             total += not isinstance(current, tree.Block)
-            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+            waiting += tree.fields_of(current)
     return total
 
 

@@ -58,5 +58,5 @@ def _names(root: object) -> Iterator[str]:
             if len(node) == 2 and all(isinstance(part, str) for part in node):
                 yield "/".join(node)
             waiting += node
-        elif is_dataclass(node):
-            waiting += [getattr(node, field.name) for field in fields(node)]
+        elif isinstance(node, tree.SyntaxNode):
+            waiting += tree.fields_of(node)

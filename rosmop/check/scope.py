@@ -349,4 +349,4 @@ def names_in(node: object) -> Iterator[str]:
         elif isinstance(current, tree.SyntaxNode) and (
             current is node or not isinstance(current, tree.Statement)
         ):
-            waiting += [getattr(current, name) for name in reversed(current.__dataclass_fields__)]
+            waiting += reversed(tree.fields_of(current))

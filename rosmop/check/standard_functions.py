@@ -335,9 +335,9 @@ CONSTANTS: Mapping[tuple[str, ...], tuple[value_types.Type, bool | int | float]]
         ("M_LOG2E",): (value_types.DOUBLE, 1.4426950408889634),
         ("M_LOG10E",): (value_types.DOUBLE, 0.4342944819032518),
         **{
-            (f"{name}_{end}",): (kind if kind.bits >= 32 else value_types.INT, getattr(kind, value))
+            (f"{name}_{end}",): (kind if kind.bits >= 32 else value_types.INT, limit)
             for name, kind in _LIMITED.items()
-            for end, value in (("MIN", "least"), ("MAX", "most"))
+            for end, limit in (("MIN", kind.least), ("MAX", kind.most))
             if kind.signed or end == "MAX"
         },
         ("FLT_MIN",): (value_types.FLOAT, 1.1754943508222875e-38),

@@ -1,7 +1,6 @@
 """Build sets: certify the properties, serialize a set, and translate its modules to machine code."""
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import fields
 from typing import NamedTuple
 
 from rosmop.certify.properties import DEFECT, certificates_of
@@ -72,5 +71,8 @@ def fast_path_of(compiled: Compiled) -> WasmFastPath:
 
 
 def _translated(module: WasmModule) -> CompiledModule:
-    parts = {part.name: getattr(module, part.name) for part in fields(CompiledModule)}
-    return CompiledModule(**parts | {"code": translated(module.code, module.memory)})
+    return CompiledModule(
+        code=translated(module.code, module.memory), memory=module.memory, frames=module.frames,
+        effects=module.effects, feeds=module.feeds, cells=module.cells, throttles=module.throttles,
+        lines=module.lines, said=module.said,
+    )  # fmt: skip

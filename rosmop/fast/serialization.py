@@ -3,41 +3,26 @@
 Reading is strict: only valid sets are accepted. Only message definitions in use are included.
 """
 
-import inspect
 from typing import Any, get_type_hints
 
 import msgspec
 
 from rosmop.fast.abi import CompiledModule, SetPart
 from rosmop.form.compiled import Compiled
-from rosmop.logics.bounded import BoundedProperty
-from rosmop.logics.cfg import GrammarProperty
-from rosmop.logics.interface import CompiledProperty, FiniteProperty
-from rosmop.logics.past_monitors import ClockedPastProperty, PastProperty
-from rosmop.logics.pattern import TimedPattern
-from rosmop.logics.ptcaret import CaretProperty
-from rosmop.logics.srs import RewritingProperty
-from rosmop.logics.tfsm import TimedStateMachine
+from rosmop.logics.catalogue import LOGICS
+from rosmop.logics.interface import CompiledProperty
 from rosmop.types.messages import MessageTypes
 from roswire.definitions import Definitions
 from roswire.message_text import MessageDefinition, ServiceDefinition
 
-_PROPERTIES = {
-    kind.__name__: kind
-    for kind in (
-        FiniteProperty, TimedStateMachine, TimedPattern, ClockedPastProperty, PastProperty, BoundedProperty,
-        GrammarProperty, RewritingProperty, CaretProperty,
-    )
-}  # fmt: skip
+
+def _parts(kind: Any) -> Any:
+    """Return the types of the arguments of a property's constructor, as a type."""
+    hints = get_type_hints(kind.__init__)
+    return tuple[tuple(hint for name, hint in hints.items() if name != "return")]  # type: ignore[misc]  # made here
 
 
-def _parts(kind: type) -> Any:
-    """Return the types of a property's constructor arguments, in order."""
-    hints = get_type_hints(vars(kind)["__init__"])
-    return tuple[tuple(hints[name] for name in list(inspect.signature(kind).parameters))]  # type: ignore[misc]  # made here
-
-
-_MADE_OF = {name: _parts(kind) for name, kind in _PROPERTIES.items()}
+_MADE_OF = {kind: _parts(kind) for logic in LOGICS.values() for kind in logic.properties}
 
 
 class _Used(msgspec.Struct):
@@ -49,16 +34,20 @@ class _Used(msgspec.Struct):
 
 def _plain(value: Any) -> Any:
     if isinstance(value, CompiledProperty):
-        return [type(value).__name__, value.made_of]
+        kinds = LOGICS[value.logic].properties
+        if type(value) not in kinds:
+            raise TypeError(f"the row of `{value.logic}` in `LOGICS` has no {type(value).__name__}")
+        return [value.logic, kinds.index(type(value)), value.made_of]
     raise NotImplementedError(type(value).__name__)
 
 
 def _made(kind: type, value: Any) -> Any:
     if kind is CompiledProperty:
-        name, parts = msgspec.convert(value, tuple[str, Any])
-        if name not in _PROPERTIES:
-            raise ValueError(f"there is no property {name[:40]!a}")
-        return _PROPERTIES[name](*msgspec.convert(parts, _MADE_OF[name]))
+        logic, number, parts = msgspec.convert(value, tuple[str, int, Any])
+        if logic not in LOGICS or not 0 <= number < len(LOGICS[logic].properties):
+            raise ValueError(f"there is no property {number} of {logic[:40]!a}")
+        made = LOGICS[logic].properties[number]
+        return made(*msgspec.convert(parts, _MADE_OF[made]))
     if kind is MessageTypes:
         used = msgspec.convert(value, _Used)
         return MessageTypes(Definitions(used.messages, used.services))

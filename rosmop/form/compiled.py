@@ -146,8 +146,7 @@ class Compiled:
         """Return `part` without the data of other specifications, so that the result does not depend on them."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
-        found = [node for function in functions.values() for node in nodes.walk(function)]
-        sites = sorted({node.site for node in found if hasattr(node, "site")} - {-1})
+        sites = sorted(nodes.sites_of(tuple(functions.values())))
         numbers = {-1: -1} | {site: number for number, site in enumerate(sites)}
         return replace(
             part,

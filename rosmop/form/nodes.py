@@ -655,7 +655,7 @@ class Component(FormNode, frozen=True):
     noted: tuple[str, ...] = ()
 
 
-def walk(root: object) -> Iterator[object]:
+def walk(root: object) -> Iterator[msgspec.Struct]:
     """Yield a part of the form and everything in it."""
     waiting = [root]
     while waiting:
@@ -664,7 +664,17 @@ def walk(root: object) -> Iterator[object]:
             waiting += node
         elif isinstance(node, msgspec.Struct):
             yield node
-            waiting += [getattr(node, name) for name in node.__struct_fields__]
+            waiting += msgspec.structs.astuple(node)
+
+
+_SITE = "site"
+"""The name of the field that is the number of a node's site, in every kind of node that has one."""
+
+
+def sites_of(root: object) -> set[int]:
+    """Return the numbers of the sites in a part of the form."""
+    found = (msgspec.structs.asdict(node).get(_SITE, -1) for node in walk(root))
+    return {site for site in found if site != -1}
 
 
 def moved(root: Any, sites: Mapping[int, int]) -> Any:
@@ -673,8 +683,8 @@ def moved(root: Any, sites: Mapping[int, int]) -> Any:
         return tuple(moved(part, sites) for part in root)
     if not isinstance(root, FormNode):
         return root
-    parts = ((name, getattr(root, name)) for name in root.__struct_fields__)
-    return type(root)(*(sites[part] if name == "site" else moved(part, sites) for name, part in parts))
+    parts = msgspec.structs.asdict(root).items()
+    return type(root)(*(sites[part] if name == _SITE else moved(part, sites) for name, part in parts))
 
 
 def acts(root: Expression) -> bool:

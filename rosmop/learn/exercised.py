@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
@@ -203,8 +204,6 @@ class _Watch(CompiledProperty):
 class _Run:
     """A run that reports its earlier state."""
 
-    keeps = ()
-
     def __init__(self, watch: _Watch, run: Run, state: str) -> None:
         self._watch = watch
         self._run = run
@@ -236,6 +235,13 @@ class _Run:
         self._watch.taken[self._state, TIMEOUT] += 1
         self._state = categories[1] if len(categories) > 1 else self._state
         return categories
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return nothing: replay on recordings saves no state."""
+        return ()
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore nothing."""
 
 
 def _target(state: StateText, event: str) -> str:

@@ -50,27 +50,26 @@ def _topic(name: str, rows: list[Candidate], known: LearntFacts) -> str:
     fields = ", ".join(f"{path}:{short}" for path, short in names.items())
     lines = [f"// {topic} ({kind}): {on(rows[0].support)}.", f"{name}() {{"]
     scalars = [row for row in checks if not row.folded]
-    pieces = {
-        part: _once(piece for row in scalars for piece in _filled(row, getattr(row, part), names))
-        for part in ("state", "first", "then")
-    }
+    declared = _once(piece for row in scalars for piece in _filled(row, row.state, names))
+    first = _once(piece for row in scalars for piece in _filled(row, row.first, names))
+    then = _once(piece for row in scalars for piece in _filled(row, row.then, names))
     own = f"{known.short[topic]}_"
     timed = any("elapsed" in row.condition for row in checks)
     begun = any("begun" in text for row in checks for text in (row.condition, *row.first))
     clock = timed or any("now" in text for row in checks for text in (row.condition, *row.first))
-    state = [*pieces["state"], *["double {t}before = 0.0;"] * timed, *["bool {t}begun = false;"] * begun]
+    state = [*declared, *["double {t}before = 0.0;"] * timed, *["bool {t}begun = false;"] * begun]
     lines += [f"    {line.replace('{t}', own)}" for line in state] + [""] * bool(state)
     lines += _wrapped(f"    event message({parameters}) {topic} {kind}")
     lines += _wrapped(f"            '{{{fields}}}' {{")
     body = ["double now = ros::Time::now().toSec();"] * clock
     if timed:
         body.append(f"double elapsed = std::max(now - {{t}}before, {number(period)});")
-    body += pieces["first"]
+    body += first
     for row in scalars:
         body += _check(row, names)
     for _, group in groupby((row for row in checks if row.folded), key=lambda row: row.path):
         body += _loop(list(group), names)
-    body += [*pieces["then"], *["{t}before = now;"] * timed, *["{t}begun = true;"] * begun]
+    body += [*then, *["{t}before = now;"] * timed, *["{t}begun = true;"] * begun]
     lines += [f"        {line.replace('{t}', own)}" for line in body] + ["    }"]
     for row in rows:
         if row.formula:

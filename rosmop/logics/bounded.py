@@ -27,7 +27,7 @@ from collections import deque
 from collections.abc import Mapping
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from rosmop.logics.formula import Formula
 from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
@@ -50,7 +50,6 @@ class FormulaCell:
     """
 
     __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
-    keeps = ("kind", "missing", "operands", "tells", "users", "value")
 
     def __init__(self, journal: "Journal") -> None:
         self.journal = journal
@@ -63,13 +62,15 @@ class FormulaCell:
     def touch(self) -> None:
         """Save the content in the journal before a change, unless it is already saved."""
         if self not in self.journal:
-            self.journal[self] = (
-                [*self.users], self.tells, self.value, self.kind, self.operands, self.missing,
-            )  # fmt: skip
+            self.journal[self] = self.saved()
 
-    def restore(self, noted: tuple[Any, ...]) -> None:
-        """Restore the saved content."""
-        self.users, self.tells, self.value, self.kind, self.operands, self.missing = noted
+    def saved(self) -> tuple[Any, ...]:
+        """Return the content."""
+        return self.kind, self.missing, self.operands, self.tells, [*self.users], self.value
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the content."""
+        self.kind, self.missing, self.operands, self.tells, self.users, self.value = saved
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
         """Compute the value from these operands."""
@@ -137,19 +138,23 @@ def _together(kind: str, operands: tuple[Value, ...]) -> bool:
 class _Row:
     """An event that an operator keeps: its time, the operands' values, and the cell if the value was requested."""
 
-    keeps: ClassVar = ("place", "time", "left", "right", "cell")
-
     place: int
     time: int
     left: Value | None
     right: Value | None
     cell: FormulaCell | None
 
+    def saved(self) -> tuple[Any, ...]:
+        """Return the content."""
+        return self.place, self.time, self.left, self.right, self.cell
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the content."""
+        self.place, self.time, self.left, self.right, self.cell = saved
+
 
 class _Operator(ABC):
     """An operator in a run. For each event, `ask` comes before `take`; `pass_by` comes between events."""
-
-    keeps: ClassVar[tuple[str, ...]] = ("rows",)
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         self.run, self.number = run, number
@@ -181,6 +186,14 @@ class _Operator(ABC):
     def deadline(self) -> int | None:
         """Return the time of the first bound on which a value depends."""
         return None
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the values that change."""
+        return (self.rows,)
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore these values."""
+        (self.rows,) = saved
 
 
 class _Until(_Operator):
@@ -247,8 +260,6 @@ class _OpenUntil(_Rows):
     value concerns only the pending rows for which it was the first or last of its kind. These rows are found by their
     times, so the cost of a step depends only on the number of rows that it decides.
     """
-
-    keeps = ("rows", "passed", "pending", "holds", "hopes", "fails", "doubts", "waits")
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -372,6 +383,17 @@ class _OpenUntil(_Rows):
             del self.pending[following]
         return self.pending[following][0] + self.high if following < len(self.pending) else None
 
+    def saved(self) -> tuple[Any, ...]:
+        return (
+            self.rows, self.passed, self.pending, self.holds, self.hopes, self.fails, self.doubts, self.waits,
+        )  # fmt: skip
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        (
+            self.rows, self.passed, self.pending, self.holds, self.hopes, self.fails, self.doubts, self.waits,
+        ) = saved  # fmt: skip
+        self.heard = []
+
 
 def _first(kinds: _Marks, mark: _Mark) -> _Mark | None:
     """Return the first of these marks that is not before `mark`."""
@@ -400,8 +422,6 @@ class _OpenSince(_Rows):
 
     `least` is its state after the newest row if all open values fail, `most` its state if all open values hold.
     """
-
-    keeps = ("rows", "window", "least", "most")
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -434,11 +454,15 @@ class _OpenSince(_Rows):
                 break
             self.window.step(left, right, self.drop().time)
 
+    def saved(self) -> tuple[Any, ...]:
+        return self.rows, self.window, self.least, self.most
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        self.rows, self.window, self.least, self.most = saved
+
 
 class _OpenPreviously(_Operator):
     """The operator `previously` of a value that may be open."""
-
-    keeps = ("rows", "before", "time")
 
     before: Value = False
     time = -FOREVER
@@ -451,11 +475,15 @@ class _OpenPreviously(_Operator):
         self.before, self.time = self.run.value(self.left), now
         _use(self.before, self)
 
+    def saved(self) -> tuple[Any, ...]:
+        return self.rows, self.before, self.time
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        self.rows, self.before, self.time = saved
+
 
 class _Next(_Operator):
     """The operator `next`. `before` has the rows of the previous event, `rows` the rows of the current event."""
-
-    keeps = ("rows", "before")
 
     def __init__(self, run: "BoundedRun", number: int, instruction: PastInstruction) -> None:
         super().__init__(run, number, instruction)
@@ -480,6 +508,12 @@ class _Next(_Operator):
     @property
     def deadline(self) -> int | None:
         return next((row.time + self.high for row in self.before if _wanted(row)), None)
+
+    def saved(self) -> tuple[Any, ...]:
+        return self.rows, self.before
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        self.rows, self.before = saved
 
 
 class BoundedProperty(CompiledProperty):
@@ -567,8 +601,6 @@ _FORWARD = (_Until, _OpenUntil, _Next)
 class BoundedRun:
     """A run of a formula about the future."""
 
-    keeps = ("_at_once", "place", "_now", "_told", "_about", "operators")
-
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
         self._at_once = compiled.folded.start()
@@ -641,10 +673,7 @@ class BoundedRun:
         """Return a copy of the place, of the values that look back, and of the operators' rows."""
         self.journal.clear()
         operators = [
-            {
-                name: copy(value) if isinstance(value, _CONTAINERS) else value
-                for name, value in vars(operator).items()
-            }
+            tuple(copy(value) if isinstance(value, _CONTAINERS) else value for value in operator.saved())
             for operator in self.operators.values()
         ]
         return self.place, list(map(copy, self._at_once)), operators
@@ -653,10 +682,18 @@ class BoundedRun:
         """Restore the marked state, but keep the time."""
         self.place, self._at_once, operators = mark
         for operator, before in zip(self.operators.values(), operators, strict=True):
-            operator.__dict__ = before
+            operator.restore(before)
         for cell, noted in self.journal.items():
             cell.restore(noted)
         self.journal.clear()
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the values that change, except those of the operators."""
+        return self._at_once, self.place, self._now, self._told, self._about
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore these values."""
+        self._at_once, self.place, self._now, self._told, self._about = saved
 
     def value(self, number: int) -> Value:
         """Return the value of an instruction at the current event, or a cell while the value is open."""

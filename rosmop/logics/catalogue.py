@@ -4,31 +4,40 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from rosmop.form.findings import Diagnostic, Position
-from rosmop.logics.cfg import compile_cfg
+from rosmop.logics.bounded import BoundedProperty
+from rosmop.logics.cfg import GrammarProperty, compile_cfg
 from rosmop.logics.ere import compile_ere
 from rosmop.logics.fsm import compile_fsm
-from rosmop.logics.interface import CompiledProperty, FormulaError, Logic, Source
+from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Logic, Source
 from rosmop.logics.lexer import suggestion
 from rosmop.logics.ltl import compile_ltl
 from rosmop.logics.mtl import compile_mtl
-from rosmop.logics.pattern import compile_pattern
-from rosmop.logics.ptcaret import compile_ptcaret
+from rosmop.logics.past_monitors import ClockedPastProperty, PastProperty
+from rosmop.logics.pattern import TimedPattern, compile_pattern
+from rosmop.logics.ptcaret import CaretProperty, compile_ptcaret
 from rosmop.logics.ptltl import compile_ptltl
-from rosmop.logics.srs import compile_srs
-from rosmop.logics.tfsm import compile_tfsm
+from rosmop.logics.srs import RewritingProperty, compile_srs
+from rosmop.logics.tfsm import TimedStateMachine, compile_tfsm
 
 LOGICS: Mapping[str, Logic] = MappingProxyType(
     {
         "fsm": Logic(compile_fsm, has_states=True),
-        "tfsm": Logic(compile_tfsm, has_states=True),
+        "tfsm": Logic(compile_tfsm, (TimedStateMachine,), has_states=True),
         "ere": Logic(compile_ere, failure="fail"),
         "ltl": Logic(compile_ltl, suppresses=True, failure="violation"),
-        "ptltl": Logic(compile_ptltl, suppresses=True, failure="violation"),
-        "cfg": Logic(compile_cfg, failure="fail"),
-        "mtl": Logic(compile_mtl, suppresses=True, failure="violation"),
-        "pattern": Logic(compile_pattern, suppresses=True, failure="violation"),
-        "srs": Logic(compile_srs),
-        "ptcaret": Logic(compile_ptcaret, implicit_events=("begin", "end")),
+        "ptltl": Logic(compile_ptltl, (FiniteProperty, PastProperty), suppresses=True, failure="violation"),
+        "cfg": Logic(compile_cfg, (FiniteProperty, GrammarProperty), failure="fail"),
+        "mtl": Logic(
+            compile_mtl,
+            (FiniteProperty, ClockedPastProperty, PastProperty, BoundedProperty),
+            suppresses=True,
+            failure="violation",
+        ),
+        "pattern": Logic(
+            compile_pattern, (FiniteProperty, TimedPattern), suppresses=True, failure="violation"
+        ),
+        "srs": Logic(compile_srs, (RewritingProperty,)),
+        "ptcaret": Logic(compile_ptcaret, (CaretProperty,), implicit_events=("begin", "end")),
     }
 )
 

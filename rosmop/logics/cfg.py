@@ -7,6 +7,8 @@ no continuation can be in it.
 If the recogniser has few states, as for a regular language, the grammar becomes a table.
 """
 
+from typing import Any
+
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore
 from rosmop.logics.cfg_grammar import Grammar, prepare, read_grammar
 from rosmop.logics.ere import with_fail
@@ -17,7 +19,6 @@ from rosmop.logics.interface import (
     Run,
     Source,
     UntimedRun,
-    twin,
 )
 from rosmop.logics.parsing import EarleyRecogniser, EarleySet
 
@@ -46,8 +47,6 @@ class GrammarRun(UntimedRun):
     """A run: the current frame, or None after a failure."""
 
     __slots__ = ("_step", "frame")
-    keeps = ("frame",)
-    __copy__ = twin
 
     def __init__(self, recogniser: EarleyRecogniser) -> None:
         self._step = recogniser.step
@@ -63,6 +62,14 @@ class GrammarRun(UntimedRun):
             return FAIL
         self.frame, accepted = after
         return MATCH if accepted else UNDECIDED
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the frame."""
+        return (self.frame,)
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the frame."""
+        (self.frame,) = saved
 
 
 def compile_cfg(source: Source) -> CompiledProperty:

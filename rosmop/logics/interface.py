@@ -46,8 +46,7 @@ class RunFaultError(Exception):
 class Run(Protocol):
     """One run of a property over a trace; the head of this module has the contract.
 
-    A copy (`copy.copy`) is an independent run; a run without `__copy__` cannot be copied. `keeps` names the attributes
-    that change (`state_of_runs.py`).
+    A copy (`copy.copy`) is an independent run, except that of a `BoundedRun`.
     """
 
     @property
@@ -64,6 +63,12 @@ class Run(Protocol):
     def expire(self) -> Categories:
         """Let the deadline pass, and return the resulting categories. Call this only while ``deadline`` is not None."""
 
+    def saved(self) -> tuple[Any, ...]:
+        """Return the values that change (`state_of_runs.py`)."""
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore such values in a fresh run."""
+
 
 class FormulaRun(Run, Protocol):
     """A run of a property that `suppresses`, whose steps can be undone."""
@@ -73,14 +78,6 @@ class FormulaRun(Run, Protocol):
 
     def take_back(self, mark: Any) -> None:
         """Undo the steps since the mark, but keep the time. Each mark can be used once."""
-
-
-def twin(run: Any) -> Any:
-    """Return a copy of a run whose attributes never change in place; for use by `__copy__`."""
-    made = object.__new__(type(run))
-    for name in run.__slots__:
-        setattr(made, name, getattr(run, name))
-    return made
 
 
 @dataclass(frozen=True)
@@ -193,8 +190,6 @@ class FiniteRun(UntimedRun):
     """A run over the tables of an automaton."""
 
     __slots__ = ("_automaton", "state")
-    keeps = ("state",)
-    __copy__ = twin
 
     def __init__(self, automaton: Automaton) -> None:
         self._automaton = automaton
@@ -217,6 +212,14 @@ class FiniteRun(UntimedRun):
     def take_back(self, mark: int) -> None:
         """Restore the marked state."""
         self.state = mark
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the state."""
+        return (self.state,)
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the state."""
+        (self.state,) = saved
 
 
 Move = tuple[int, bool]
@@ -256,8 +259,6 @@ class ClockedRun:
     """A run of a `ClockedProperty`: the state, the start of its clock, and the time."""
 
     __slots__ = ("_tables", "now", "since", "state")
-    keeps = ("state", "since", "now")
-    __copy__ = twin
 
     def __init__(self, tables: ClockedProperty, time_ns: int) -> None:
         self._tables = tables
@@ -309,6 +310,14 @@ class ClockedRun:
         """Restore the marked state and clock, but keep the time."""
         self.state, self.since = mark
 
+    def saved(self) -> tuple[Any, ...]:
+        """Return the state, the start of its clock, and the time."""
+        return self.state, self.since, self.now
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the state, the start of its clock, and the time."""
+        self.state, self.since, self.now = saved
+
     def _move(self, move: Move) -> None:
         self.state, restarts = move
         if restarts:
@@ -323,6 +332,8 @@ class Logic:
     """A logic: its compiler, and its properties that other parts of the language need."""
 
     compile: Compiler
+    properties: tuple[type[CompiledProperty], ...] = (FiniteProperty,)
+    """The classes of the compiled properties. The arguments of their constructors can be serialised."""
     suppresses: bool = False
     """Whether a dropped message does not count. Other logics count each event whose action passes the message."""
     failure: str | None = None

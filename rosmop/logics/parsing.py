@@ -20,6 +20,7 @@ A frame is viable if it has an item, because every symbol of the grammar can be 
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
@@ -62,12 +63,19 @@ class EarleySet:
     """An Earley set. ``depth`` counts the frames below that wait."""
 
     __slots__ = ("conts", "depth", "shape")
-    keeps = __slots__
 
     def __init__(self, shape: EarleyShape, conts: "Conts", depth: int) -> None:
         self.shape = shape
         self.conts = conts
         self.depth = depth
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the parts of the set."""
+        return self.conts, self.depth, self.shape
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the parts of the set."""
+        self.conts, self.depth, self.shape = saved
 
     def resolve(self, references: Sequence[int]) -> "Conts":
         """Return the continuations that references of this frame's shape refer to."""

@@ -32,7 +32,6 @@ from rosmop.logics.interface import (
     Run,
     Source,
     UntimedRun,
-    twin,
 )
 
 VERDICTS = ("violation", "validation")
@@ -375,7 +374,6 @@ class SinceWindow:
     """
 
     __slots__ = ("_high", "_intervals", "_low")
-    keeps = ("_high", "_intervals", "_low")
 
     def __init__(self, low: int, high: int | None) -> None:
         self._low = low
@@ -405,6 +403,14 @@ class SinceWindow:
         twin._intervals = self._intervals.copy()
         return twin
 
+    def saved(self) -> tuple[Any, ...]:
+        """Return the bounds and the intervals."""
+        return self._high, self._intervals, self._low
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the bounds and the intervals."""
+        self._high, self._intervals, self._low = saved
+
     def __len__(self) -> int:
         return len(self._intervals)
 
@@ -413,7 +419,6 @@ class PastRun(UntimedRun):
     """A run of a past formula: its values, and the time."""
 
     __slots__ = ("_residues", "now", "values")
-    keeps = ("now", "values")
 
     def __init__(self, folded: FoldedProgram, time_ns: int) -> None:
         self._residues = folded.residues
@@ -421,8 +426,8 @@ class PastRun(UntimedRun):
         self.now = time_ns
 
     def __copy__(self) -> "PastRun":
-        made: PastRun = twin(self)
-        made.values = self.mark()
+        made = PastRun.__new__(PastRun)
+        made._residues, made.now, made.values = self._residues, self.now, self.mark()
         return made
 
     def step(self, event: int, time_ns: int) -> Categories:
@@ -441,6 +446,14 @@ class PastRun(UntimedRun):
     def take_back(self, mark: list[Any]) -> None:
         """Restore the marked values, but keep the time."""
         self.values = mark
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the time and the values."""
+        return self.now, self.values
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the time and the values."""
+        self.now, self.values = saved
 
 
 class PastProperty(CompiledProperty):

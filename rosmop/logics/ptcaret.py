@@ -19,9 +19,10 @@ limit is a fault of the specification. (Rosu, Chen and Ball, 2008.)
 """
 
 from itertools import zip_longest
+from typing import Any
 
 from rosmop.logics.formula import Formula, Level, Syntax, boolean_levels, nodes, read_formula
-from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun, twin
+from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun
 from rosmop.logics.past_monitors import TOLD, VERDICTS, FoldedProgram, PastProgram, fold
 from rosmop.logics.ptltl import SYNTAX as PTLTL
 
@@ -85,7 +86,6 @@ class CaretRun(UntimedRun):
     """A run: its values, and for each open call the values about the abstract past from before the call."""
 
     __slots__ = ("_compiled", "_stack", "_values")
-    keeps = ("_stack", "_values")
 
     def __init__(self, compiled: CaretProperty) -> None:
         self._compiled = compiled
@@ -93,7 +93,7 @@ class CaretRun(UntimedRun):
         self._stack: list[tuple[bool, ...]] = []
 
     def __copy__(self) -> "CaretRun":
-        made: CaretRun = twin(self)
+        made = CaretRun(self._compiled)
         made._values, made._stack = self._values.copy(), self._stack.copy()
         return made
 
@@ -111,6 +111,14 @@ class CaretRun(UntimedRun):
             for place, before in zip_longest(abstract, stack.pop() if stack else (), fillvalue=False):
                 values[place] = before
         return TOLD[holds]
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the values of the open calls, and the present values."""
+        return self._stack, self._values
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the values."""
+        self._stack, self._values = saved
 
 
 def plain(formula: Formula) -> Formula:

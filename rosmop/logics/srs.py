@@ -10,8 +10,9 @@ A run limits the length of its string and the work for one event; exceeding a li
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun, twin
+from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, UntimedRun
 from rosmop.logics.lexer import FormulaToken, TokenReader
 
 CATEGORIES: Categories = ("fail", "succeed")
@@ -63,8 +64,6 @@ class RewritingRun(UntimedRun):
     """A run: its string, or its final verdict. Between two events, no rule applies to the string."""
 
     __slots__ = ("_property", "string", "verdict")
-    keeps = ("string", "verdict")
-    __copy__ = twin
 
     def __init__(self, compiled: RewritingProperty) -> None:
         self._property = compiled
@@ -76,6 +75,14 @@ class RewritingRun(UntimedRun):
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
+
+    def saved(self) -> tuple[Any, ...]:
+        """Return the string and the verdict."""
+        return self.string, self.verdict
+
+    def restore(self, saved: tuple[Any, ...]) -> None:
+        """Restore the string and the verdict."""
+        self.string, self.verdict = saved
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
         """Return the rewritten string, and its verdict.

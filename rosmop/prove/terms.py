@@ -194,14 +194,12 @@ class FormResult:
 
 
 _SMALL = 1 << 10
-_COSTLY = frozenset(
-    getattr(z3, f"Z3_OP_{name}")
-    for name in (
-        "FPA_ADD", "FPA_SUB", "FPA_MUL", "FPA_DIV", "FPA_SQRT", "FPA_ROUND_TO_INTEGRAL", "FPA_TO_FP",
-        "FPA_TO_FP_UNSIGNED", "FPA_TO_UBV", "FPA_TO_SBV", "FPA_TO_IEEE_BV", "BMUL", "BSDIV", "BUDIV", "BSREM", "BUREM",
-        "BSDIV_I", "BUDIV_I", "BSREM_I", "BUREM_I",
-    )
-)  # fmt: skip
+_COSTLY = frozenset((
+    z3.Z3_OP_FPA_ADD, z3.Z3_OP_FPA_SUB, z3.Z3_OP_FPA_MUL, z3.Z3_OP_FPA_DIV, z3.Z3_OP_FPA_SQRT,
+    z3.Z3_OP_FPA_ROUND_TO_INTEGRAL, z3.Z3_OP_FPA_TO_FP, z3.Z3_OP_FPA_TO_FP_UNSIGNED, z3.Z3_OP_FPA_TO_UBV,
+    z3.Z3_OP_FPA_TO_SBV, z3.Z3_OP_FPA_TO_IEEE_BV, z3.Z3_OP_BMUL, z3.Z3_OP_BSDIV, z3.Z3_OP_BUDIV, z3.Z3_OP_BSREM,
+    z3.Z3_OP_BUREM, z3.Z3_OP_BSDIV_I, z3.Z3_OP_BUDIV_I, z3.Z3_OP_BSREM_I, z3.Z3_OP_BUREM_I,
+))  # fmt: skip
 
 
 def abstracted(terms: Sequence[Term]) -> list[Term]:

@@ -19,6 +19,7 @@ import msgspec
 
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
+from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.monitor import CellNames, MonitorInstance
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
 from rosmop.run.state_of_slices import PartSnapshot, SliceSnapshot, restore_slices
@@ -162,7 +163,7 @@ def shape(monitor: MonitorInstance, variables: Mapping[str, Any]) -> bytes:
     """Return a state without times, to compare it with the initial one."""
     monitor.move_to_python()
     runs = [
-        kept(running.run)[0][:1] if hasattr(running.run, "state") else kept(running.run)
+        kept(running.run)[0][:1] if isinstance(running.run, FiniteRun | ClockedRun) else kept(running.run)
         for running in monitor.properties
     ]
     live = monitor.slices.live if monitor.slices is not None else 0

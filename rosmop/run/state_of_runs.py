@@ -1,6 +1,6 @@
 """Runs of properties as plain data that outlives a process, and back.
 
-A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays of MessagePack. A
+A run returns the values that change (`saved`). They become numbers, strings and arrays of MessagePack. A
 container is `[tag, item, …]`. An object with several references is `["o", number]`; the table entry with that number
 has its fields. Reading creates only objects of the classes below.
 """
@@ -34,7 +34,7 @@ class StateTooLargeError(Exception):
 def kept(run: Any) -> list[Any]:
     """Return the state of a `Run` as plain data. Raises `StateTooLargeError`."""
     if isinstance(run, FiniteRun | ClockedRun):
-        return [[getattr(run, name) for name in run.keeps], []]
+        return [[*run.saved()], []]
     return _Writer(run).written()
 
 
@@ -63,9 +63,10 @@ class _Writer:
         )
 
     def written(self) -> list[Any]:
+        run = self._run
         fields = [
-            self._operators_of(self._run) if name == "operators" else self._value(getattr(self._run, name))
-            for name in self._run.keeps
+            *map(self._value, run.saved()),
+            *([self._operators_of(run)] if isinstance(run, BoundedRun) else []),
         ]
         parts: list[Any] = []
         for part in self._parts:  # the list grows while parts refer to other parts
@@ -75,15 +76,12 @@ class _Writer:
         return [fields, parts]
 
     def _operators_of(self, run: Any) -> list[Any]:
-        return [
-            [number, *(self._value(getattr(operator, name)) for name in operator.keeps)]
-            for number, operator in run.operators.items()
-        ]
+        return [[number, *map(self._value, operator.saved())] for number, operator in run.operators.items()]
 
     def _part(self, part: Any) -> list[Any]:
         if isinstance(part, EarleyShape):
             return ["shape", *map(self._value, (part.items, part.done, part.width))]
-        return [_NAMES[type(part)], *(self._value(getattr(part, name)) for name in part.keeps)]
+        return [_NAMES[type(part)], *map(self._value, part.saved())]
 
     def _value(self, value: Any) -> Any:
         if value is None or isinstance(value, bool | float | str):
@@ -118,21 +116,21 @@ class _Reader:
         self._parts = [self._made(entry) for entry in self._entries]
         for part, (name, *fields) in zip(self._parts, self._entries, strict=True):
             if name != "shape":
-                self._fill(part, part.keeps, fields)
+                self._fill(part, fields)
         run = self._run
         if isinstance(run, FiniteRun | ClockedRun):
-            self._fill(run, run.keeps, self._fields)
+            self._fill(run, self._fields)
             self._check(run)
         elif isinstance(run, BoundedRun):
-            self._fill_run(run.keeps[:-1], self._fields[:-1])
+            self._fill_run(self._fields[:-1])
             self._fill_operators(run, self._fields[-1])
         else:
-            self._fill_run(run.keeps, self._fields)
+            self._fill_run(self._fields)
 
-    def _check(self, run: Any) -> None:
+    def _check(self, run: FiniteRun | ClockedRun) -> None:
         compiled: Any = self._compiled
         states = len(compiled.automaton) if isinstance(run, FiniteRun) else len(compiled.moves)
-        if not all(isinstance(getattr(run, name), int) for name in run.keeps) or not 0 <= run.state < states:
+        if not all(isinstance(value, int) for value in run.saved()) or not 0 <= run.state < states:
             raise ValueError("the property has no such state")
 
     def _made(self, entry: list[Any]) -> Any:
@@ -150,19 +148,18 @@ class _Reader:
         if [number for number, *_ in entries] != [*run.operators]:
             raise ValueError("the operators of the property differ")
         for number, *fields in entries:
-            self._fill(run.operators[number], run.operators[number].keeps, fields)
+            self._fill(run.operators[number], fields)
 
-    def _fill_run(self, names: tuple[str, ...], fields: list[Any]) -> None:
-        """Fill the run itself; each attribute keeps the type of its first value (a grammar's frame may be gone)."""
-        kinds = [type(getattr(self._run, name)) for name in names]
-        self._fill(self._run, names, fields)
-        for name, kind in zip(names, kinds, strict=True):
-            if not isinstance(getattr(self._run, name), kind if kind is not EarleySet else EarleySet | None):
-                raise ValueError(f"a property has no such {name}")
+    def _fill_run(self, fields: list[Any]) -> None:
+        """Fill the run itself; each value has the type of the first one (a grammar's frame may be gone)."""
+        before = self._run.saved()
+        self._fill(self._run, fields)
+        for first, value in zip(before, self._run.saved(), strict=True):
+            if not isinstance(value, type(first)) and not (value is None and isinstance(first, EarleySet)):
+                raise ValueError("a property has no such state")
 
-    def _fill(self, target: Any, names: tuple[str, ...], fields: list[Any]) -> None:
-        for name, field in zip(names, fields, strict=True):
-            setattr(target, name, self._value(field))
+    def _fill(self, target: Any, fields: list[Any]) -> None:
+        target.restore(tuple(map(self._value, fields)))
 
     def _value(self, value: Any) -> Any:
         if not isinstance(value, list):

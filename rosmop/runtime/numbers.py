@@ -235,7 +235,7 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
 
 def _of_floats(name: str, count: int) -> Callable[..., float]:
     """Return a function of the C library on floats, with the bits that a compiled C++ monitor would get."""
-    function = getattr(ctypes.CDLL("libm.so.6"), f"{name}f")
+    function = ctypes.CDLL("libm.so.6")[f"{name}f"]
     function.argtypes, function.restype = [ctypes.c_float] * count, ctypes.c_float
 
     def call(*values: float) -> float:  # this wrapper hides the other attributes of the library's object

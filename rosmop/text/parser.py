@@ -7,7 +7,7 @@ import re
 from functools import lru_cache
 
 from lark import Lark, Token, Tree
-from lark.exceptions import UnexpectedInput, UnexpectedToken
+from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
 
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
@@ -88,10 +88,9 @@ def start_of(file: str, text: str, offset: int) -> Position:
 
 
 def _accepted(error: UnexpectedInput) -> set[str]:
-    interactive = getattr(error, "interactive_parser", None)
-    if interactive is not None:
-        return set(interactive.accepts())
-    return set(getattr(error, "allowed", None) or ())
+    if isinstance(error, UnexpectedToken):
+        return set(error.accepts)
+    return set(error.allowed or ()) if isinstance(error, UnexpectedCharacters) else set()
 
 
 def _check_depth(parsed: Tree[Token], file: str) -> None:

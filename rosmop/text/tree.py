@@ -6,6 +6,7 @@ is the tuple of its parts (`std::string` is `("std", "string")`).
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 from rosmop.form.findings import Position
 
@@ -17,6 +18,11 @@ class SyntaxNode:
     position: Position = field(compare=False)
 
 
+def fields_of(node: SyntaxNode) -> list[Any]:
+    """Return the values of all fields of a node, in order."""
+    return [getattr(node, name) for name in node.__dataclass_fields__]
+
+
 def walk(root: object) -> Iterator[SyntaxNode]:
     """Yield a node and all nodes in it."""
     waiting = [root]
@@ -26,7 +32,7 @@ def walk(root: object) -> Iterator[SyntaxNode]:
             waiting += current
         elif isinstance(current, SyntaxNode):
             yield current
-            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+            waiting += fields_of(current)
 
 
 # Types

@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from types import TracebackType
 
-from rosbags.interfaces import Connection
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
 from rosbags.rosbag1 import ReaderError, Writer
 from rosbags.rosbag1.writer import WriterError
 
@@ -150,10 +150,8 @@ class OutputBag:
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         """Write a message of a recorded publisher."""
-        caller = getattr(connection.ext, "callerid", None)
-        latching = getattr(connection.ext, "latching", None)
         sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
-        self._write((*sent, caller, latching), time_ns, data)
+        self._write((*sent, *_sender(connection)), time_ns, data)
 
     def publish(self, outcome: Outcome) -> None:
         """Write the messages that monitors published."""
@@ -172,6 +170,12 @@ class OutputBag:
         self._writer.write(self._connections[header], time_ns, data)
 
 
+def _sender(connection: Connection) -> ConnectionExtRosbag1:
+    """Return the caller id of a recorded publisher, and whether it latches."""
+    assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  `BoundedReader` reads no other bags
+    return connection.ext
+
+
 def replay(
     monitors: MonitorSet,
     reader: BoundedReader,
@@ -187,7 +191,7 @@ def replay(
     refusals = {
         connection.id: _refusal(monitors, connection)
         for connection in reader.connections
-        if _fits(connection, topics) and getattr(connection.ext, "callerid", None) != _OWN
+        if _fits(connection, topics) and _sender(connection).callerid != _OWN
     }
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None

@@ -67,13 +67,12 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         raise typer.Exit(status)
 
     commands: dict[str, Callable[..., None]] = {}
-    for command, example in (
-        (check, "monitors/*.rv"),
-        (run, "monitors/safe_triggering.rv --bag drive.bag"),
-        (learn, "--bag monday.bag --bag tuesday.bag --out learnt.rv"),
-        (coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
+    for name, command, example in (
+        ("check", check, "monitors/*.rv"),
+        ("run", run, "monitors/safe_triggering.rv --bag drive.bag"),
+        ("learn", learn, "--bag monday.bag --bag tuesday.bag --out learnt.rv"),
+        ("coverage", coverage, "monitors/*.rv --bag drive.bag --fail-under 80"),
     ):
-        name = command.__name__
         more = [inspect.cleandoc(command.__doc__)] if command.__doc__ else []
         command.__doc__ = "\n\n".join([*more, f"Example: {program.name} {name} {example}"])
         commands[name] = command

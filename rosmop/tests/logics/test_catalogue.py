@@ -75,6 +75,7 @@ def test_every_property_can_be_rebuilt_from_data(
             if "__init__" in vars(kind):
                 patched.setattr(kind, "__init__", noting(kind.__init__))
         one = compiled(logic, formula, events)
+    assert type(one) in LOGICS[logic].properties, "the row of the logic"
     hints = [hint for name, hint in get_type_hints(type(one).__init__).items() if name != "return"]
     read = [
         msgspec.msgpack.decode(msgspec.msgpack.encode(argument), type=hint)
