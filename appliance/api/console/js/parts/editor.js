@@ -12,8 +12,8 @@ import { policyLanguage, rvLanguage } from "./languages.js";
 const SOURCE = "/console/static/vendor/codemirror.js";
 
 /**
- * The proposals at the end of `before`, and the number of its characters that they replace.
- * @typedef {(before: string, after: string, asked: boolean) => Promise<{length: number, proposals: {word: string, kind: string}[]} | null>} Complete
+ * The proposals at the end of `before`, the number of its characters that they replace, and the form of words that they are for.
+ * @typedef {(before: string, after: string, asked: boolean) => Promise<{length: number, proposals: {word: string, kind: string}[], word: RegExp} | null>} Complete
  */
 
 /**
@@ -98,12 +98,13 @@ function build(/** @type {any} */ mirror, /** @type {ShadowRoot} */ root, /** @t
 /**
  * Complete while typing, or on Ctrl Space. No proposal is selected at first: Enter ends the line, and only a proposal
  * that was chosen with the arrows changes the text. Escape closes the list; without a list it leaves the editor, also
- * while proposals are awaited.
+ * while proposals are awaited. A longer word narrows the list at once: a list that is fetched again would lose the choice
+ * and the keys of that time.
  */
 function completion(/** @type {any} */ mirror, /** @type {Complete} */ complete) {
   const source = async (/** @type {any} */ { pos, state, explicit }) => {
     const found = await complete(state.sliceDoc(0, pos), state.sliceDoc(pos), explicit);
-    return found && { from: pos - found.length, options: found.proposals.map(({ word, kind }) => ({ label: word, detail: kind })) };
+    return found && { from: pos - found.length, options: found.proposals.map(({ word, kind }) => ({ label: word, detail: kind })), validFor: found.word };
   };
   const escape = (/** @type {any} */ view) => {
     const listed = mirror.currentCompletions(view.state).length > 0;

@@ -19,29 +19,33 @@ const SECTIONS = /** @type {Record<string, {keys?: string[], names?: "nodes" | "
 });
 const OPTIONS = /** @type {Record<string, string[]>} */ ({ takeover: ["same-host", "granted"], tell: ["rule", "full", "id"], "audit-only": ["all"] });
 const WRITABLE = /^[\w/.:~-]+$/; // a name that a policy can contain
+// The word at the cursor: a section, a key, or a value. While it is such a word, its proposals stay the same.
+const HEAD = /^\[[^\]]*$/;
+const KEY = /^[^\s=#;[][^=#;]*$/;
+const VALUE = /^[^\s,=#;]+$/;
 const FRESH = 10_000; // milliseconds for which the fetched names are used
 
 /** @typedef {{word: string, kind: string}} Proposal */
 /** @typedef {{nodes: string[], topics: string[], services: string[], hosts: string[]}} Live */
 
 /**
- * Return the proposals at the end of `before`, and the number of its last characters that they replace. Without a word
- * to complete, there are proposals only if they were asked for.
+ * Return the proposals at the end of `before`, the number of its last characters that they replace, and the form of
+ * words that they are for. Without a word to complete, there are proposals only if they were asked for.
  * @param {string} before @param {string} after @param {boolean} asked
- * @returns {Promise<{length: number, proposals: Proposal[]} | null>}
+ * @returns {Promise<{length: number, proposals: Proposal[], word: RegExp} | null>}
  */
 export async function complete(before, after, asked) {
   const line = before.slice(before.lastIndexOf("\n") + 1);
   if (/[#;]/.test(line)) return null;
   const head = /^\s*(\[[^\]]*)$/.exec(line);
-  if (head) return { length: head[1].length, proposals: Object.keys(SECTIONS).map((name) => ({ word: `[${name}]`, kind: "section" })) };
+  if (head) return { length: head[1].length, word: HEAD, proposals: Object.keys(SECTIONS).map((name) => ({ word: `[${name}]`, kind: "section" })) };
   const section = sectionOf(before);
   const known = SECTIONS[section];
   const at = line.indexOf("=");
   const word = /** @type {RegExpExecArray} */ (at < 0 ? /\S.*$|$/.exec(line) : /[^\s,=]*$/.exec(line))[0];
   if (!known || (!word && !asked)) return null;
   const proposals = at < 0 ? await keysOf(known) : await valuesOf(section, known, line.slice(0, at).trim(), before + after);
-  return { length: word.length, proposals: proposals.filter((one) => one.word !== word) };
+  return { length: word.length, word: at < 0 ? KEY : VALUE, proposals };
 }
 
 async function keysOf(/** @type {{keys?: string[], names?: "nodes" | "topics" | "services"}} */ { keys = [], names }) {
