@@ -42,12 +42,23 @@ Extension = tuple[str, tuple[tuple[str, str | tuple[str, ...]], ...]]
 
 
 @dataclass(frozen=True)
+class HeaderMatch:
+    """The matches of an IP header, and of the interfaces."""
+
+    protocol: str | None = None
+    in_interface: str | None = None
+    out_interface: str | None = None
+    source: str | None = None
+    destination: str | None = None
+
+
+@dataclass(frozen=True)
 class RenderedRule:
     """A rule in the terms of xtables, as in `iptables -A CHAIN …`."""
 
     chain: str
     family: Family
-    attributes: tuple[tuple[str, str], ...]  # protocol, in_interface, …
+    header: HeaderMatch
     matches: tuple[Extension, ...]
     target: Extension
 
@@ -148,20 +159,19 @@ def _tables_in_use(family: Family) -> list[str]:
 def render_rule(rule: PacketRule) -> list[RenderedRule]:
     """Return the rule for each of its families."""
     return [
-        RenderedRule(rule.chain.value, family, _attributes(rule), _matches(rule, family), _target(rule))
+        RenderedRule(rule.chain.value, family, _header(rule), _matches(rule, family), _target(rule))
         for family in rule.families()
     ]
 
 
-def _attributes(rule: PacketRule) -> tuple[tuple[str, str], ...]:
-    given = {
-        "protocol": _protocol(rule),
-        "in_interface": _interface(rule.arrives_on),
-        "out_interface": _interface(rule.leaves_on),
-        "src": rule.source,
-        "dst": rule.destination,
-    }
-    return tuple((name, value) for name, value in given.items() if value is not None)
+def _header(rule: PacketRule) -> HeaderMatch:
+    return HeaderMatch(
+        _protocol(rule),
+        _interface(rule.arrives_on),
+        _interface(rule.leaves_on),
+        rule.source,
+        rule.destination,
+    )
 
 
 def _protocol(rule: PacketRule) -> str | None:
@@ -186,8 +196,9 @@ def _matches(rule: PacketRule, family: Family) -> tuple[Extension, ...]:
     if rule.clear_text:
         direction = "out" if rule.chain is Chain.OUT else "in"
         matches.append(("policy", (("dir", direction), ("pol", "none"))))
-    if rule.local_destination:
-        matches.append(("addrtype", (("dst-type", "LOCAL"),)))
+    ends = (("dst-type", rule.local_destination), ("src-type", rule.local_source))
+    if local := tuple((name, "LOCAL") for name, is_matched in ends if is_matched):
+        matches.append(("addrtype", local))
     matches += _tracked(rule)
     if rule.distant:
         name, below = ("hl", "hl-lt") if family == 6 else ("ttl", "ttl-lt")
@@ -318,12 +329,21 @@ class _Table:
         return count
 
     def _jump(self, chain: Chain) -> Any:
-        return self._build(RenderedRule("", self._family, (), (), (chain.value, ())))
+        return self._build(RenderedRule("", self._family, HeaderMatch(), (), (chain.value, ())))
 
     def _build(self, rendered: RenderedRule) -> Any:
         rule = self._library.Rule6() if rendered.family == 6 else self._library.Rule()
-        for attribute, text in rendered.attributes:
-            setattr(rule, attribute, text)
+        header = rendered.header
+        if header.protocol is not None:
+            rule.protocol = header.protocol
+        if header.in_interface is not None:
+            rule.in_interface = header.in_interface
+        if header.out_interface is not None:
+            rule.out_interface = header.out_interface
+        if header.source is not None:
+            rule.src = header.source
+        if header.destination is not None:
+            rule.dst = header.destination
         for make, (name, parameters) in (
             *((rule.create_match, match) for match in rendered.matches),
             (rule.create_target, rendered.target),

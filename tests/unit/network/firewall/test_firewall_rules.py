@@ -1,9 +1,11 @@
 """Tests of the list of rules, without a kernel."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 
+from appliance.network.firewall import iptables, nft
 from appliance.network.firewall.backend import RuleCounter
 from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.firewall_rules import (
@@ -284,3 +286,31 @@ def test_an_invalid_forwarder_is_an_error(wrong: tuple[int, str, int]) -> None:
     """An invalid user, address or port is an error."""
     with pytest.raises(ValueError, match=r"is not a|port"):
         ForwarderAccess(*wrong)
+
+
+OUT = PacketRule(chain=Chain.OUT, purpose="p", verdict=PacketVerdict.DROP)
+LEAVING = PacketRule(chain=Chain.LEAVING, purpose="p", verdict=PacketVerdict.DROP)
+NAT = PacketRule(chain=Chain.NAT, purpose="p", verdict=PacketVerdict.DNAT, to="10.0.0.1")
+CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
+    "family": (OUT, 6), "arrives_on": (OUT, Interface("lo")), "leaves_on": (OUT, Interface("lo", other=True)),
+    "source": (OUT, "10.0.0.0/8"), "destination": (OUT, "10.0.0.0/8"), "tcp_ports": (OUT, PortRange.one(7)),
+    "udp_ports": (OUT, PortRange.one(7)), "from_ports": (OUT, PortRange.one(7)), "opening": (OUT, True),
+    "accepting": (OUT, True), "uid": (OUT, 7), "clear_text": (OUT, True),
+    "above": (replace(OUT, answered=True), RateLimit(7, 7)), "local_destination": (OUT, True),
+    "local_source": (OUT, True), "forwarded": (LEAVING, True), "distant": (OUT, True), "new_connection": (OUT, True),
+    "unknown": (OUT, True), "answered": (OUT, True), "translated": (OUT, True), "to": (NAT, "10.0.0.2"),
+}  # fmt: skip
+"""A value of each condition, and a rule that may have it."""
+
+
+@pytest.mark.parametrize("name", [one.name for one in fields(PacketRule)])
+def test_both_back_ends_translate_each_condition(name: str) -> None:
+    """No back end ignores a condition, which would match more packets; iptables rejects rules in other chains."""
+    if name in ("purpose", "verdict", "chain"):
+        return
+    rule, value = CONDITIONS[name]
+    changed = replace(rule, **{name: value})
+    assert nft.render_rule(changed) != nft.render_rule(rule)
+    if rule.chain is Chain.OUT:
+        assert iptables.render_rule(changed) != iptables.render_rule(rule)
+    assert name == "family" or changed.describe() != rule.describe()

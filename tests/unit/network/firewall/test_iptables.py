@@ -9,7 +9,7 @@ from appliance.network.firewall.firewall_rules import (
     RateLimit,
     inner_port,
 )
-from appliance.network.firewall.iptables import RenderedRule, render_rule
+from appliance.network.firewall.iptables import HeaderMatch, RenderedRule, render_rule
 
 SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 
@@ -17,12 +17,12 @@ SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 def test_the_owner_rule_in_words_of_xtables() -> None:
     """The owner match has the SYN flag and the port, once for each family."""
     _, owner, others = inner_port("ROSMaster port", 11312, "control", 61011)
-    attributes = (("protocol", "tcp"), ("out_interface", "lo"))
+    header = HeaderMatch(protocol="tcp", out_interface="lo")
     assert render_rule(owner) == [
         RenderedRule(
             "ROSRV-OUT",
             family,
-            attributes,
+            header,
             (
                 ("tcp", (("dport", "11312"), SYN)),
                 ("owner", (("uid-owner", "61011"),)),
@@ -55,7 +55,7 @@ def test_a_rate_limit_is_a_hashlimit_that_ports_share() -> None:
     assert second["tcp"] == (("dport", "5:9"),)
     assert second["conntrack"] == (("ctstatus", "ASSURED"), ("ctdir", "ORIGINAL"))
     assert second["connmark"] == (("mark", "0x0/0x40000000"),)
-    assert ("in_interface", "!lo") in render_rule(rules[0])[0].attributes
+    assert render_rule(rules[0])[0].header.in_interface == "!lo"
 
 
 def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
@@ -66,7 +66,7 @@ def test_ipsec_is_matched_by_policy_in_both_directions() -> None:
         )
         (rendered,) = render_rule(rule)
         assert rendered.family == 6
-        assert rendered.attributes == (("src", "fd77::1"),)
+        assert rendered.header == HeaderMatch(source="fd77::1")
         assert rendered.matches[0] == ("policy", (("dir", direction), ("pol", "none")))
 
 
@@ -74,5 +74,5 @@ def test_ports_of_udp_are_matched_as_udp() -> None:
     """The protocol and the match are those of UDP."""
     rule = PacketRule(chain=Chain.IN, purpose="p", verdict=PacketVerdict.DROP, udp_ports=PortRange(500, 501))
     rendered = render_rule(rule)[0]
-    assert ("protocol", "udp") in rendered.attributes
+    assert rendered.header.protocol == "udp"
     assert rendered.matches[0] == ("udp", (("dport", "500:501"),))
