@@ -7,7 +7,9 @@ from appliance.audit.query import Filter
 from appliance.audit.record_format import LogEntry, rfc3339
 
 _NODES = ("node lost", "node returned", "replaced", "takeover")
-_LOG = ("appliance started", "appliance stopped", "records lost", "log begun")
+_REGISTRATIONS = ("registered", "unregistered")
+_LOG = ("appliance started", "appliance stopped", "log begun")
+_COUNTED = "repetitions folded"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +41,10 @@ def publishers_at(
 
     `export` yields the records that match a filter; `first` is the first record of the log, None if it is empty.
     """
-    registrations = (
-        Filter(event=event, category="publication", resource=topic)
-        for event in ("registered", "unregistered")
-    )
+    registrations = (Filter(event=event, category="publication", resource=topic) for event in _REGISTRATIONS)
     others = (Filter(event=event, until=at + 1) for event in (*_NODES, *_LOG))
-    entries = [entry for wanted in (*registrations, *others) for entry in export(wanted)]
+    gaps = (Filter(event=event) for event in ("records lost", _COUNTED))
+    entries = [entry for wanted in (*registrations, *others, *gaps) for entry in export(wanted)]
     entries.sort(key=lambda entry: entry.sequence)
     past = [entry for entry in entries if entry.record.time <= at]
     known = _registered(past)
@@ -54,7 +54,12 @@ def publishers_at(
     reaches = first is not None and first.record.time <= at
     ended = _ended_later((entry for entry in entries if entry.record.time > at), seen) if reaches else ()
     found = sorted([*known, *ended], key=lambda one: (one.node, one.host))
-    return PastPublishers(tuple(found), tuple(_unknown(past, first, at)))
+    unknown = [*_unknown(past, first, at)]
+    if any(_counts(entry, topic, at) for entry in entries):
+        unknown.append(
+            "registrations before this time were only counted: rosrv audit search --event 'repetitions folded'"
+        )
+    return PastPublishers(tuple(found), tuple(unknown))
 
 
 def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
@@ -84,12 +89,29 @@ def _registered(past: Iterable[LogEntry]) -> list[PastPublisher]:
 def _ended_later(
     later: Iterable[LogEntry], seen: set[tuple[str | None, str | None]]
 ) -> Iterator[PastPublisher]:
-    """Yield the nodes whose registration ended later, and of which the log does not have the beginning."""
+    """Yield the nodes whose registration ended later, and of which the log does not have the beginning.
+
+    After a loss of records, the beginning may be among the lost ones.
+    """
     for entry in later:
-        key = entry.record.host, entry.record.caller_id
-        if key not in seen and entry.record.event == "unregistered":
-            yield PastPublisher(key[1] or "", key[0] or "", None, None)
-        seen.add(key)
+        if entry.record.event == "records lost":
+            return
+        if entry.record.event in _REGISTRATIONS:
+            key = entry.record.host, entry.record.caller_id
+            if key not in seen and entry.record.event == "unregistered":
+                yield PastPublisher(key[1] or "", key[0] or "", None, None)
+            seen.add(key)
+
+
+def _counts(entry: LogEntry, topic: str, at: int) -> bool:
+    """Whether a summary counts repeated registrations of the topic, or changes of nodes, at or before this time."""
+    detail, resource = entry.record.detail, entry.record.resource
+    return (
+        entry.record.event == _COUNTED
+        and detail.get("of") in (*_REGISTRATIONS, *_NODES)
+        and detail.get("first_time", 0) <= at
+        and (resource is None or (resource == topic and entry.record.category == "publication"))
+    )
 
 
 def _unknown(past: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[str]:
@@ -98,8 +120,8 @@ def _unknown(past: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[
         yield f"{begins}: registrations before are not known"
     elif first.record.event != "log begun":
         yield (
-            f"records before {rfc3339(first.record.time)} were removed: nodes that registered earlier, and are still"
-            " registered, are missing"
+            f"records before {rfc3339(first.record.time)} were removed: nodes that registered earlier, and have not"
+            " unregistered since, are missing"
         )
     elif first.record.detail.get("earlier_log_missing"):
         yield f"an earlier log is missing: registrations before {rfc3339(first.record.time)} are not known"
