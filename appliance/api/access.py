@@ -7,6 +7,7 @@ Invariants:
    wait between checks, so guessing cannot keep the process busy.
 3. A valid token is remembered only as a hash under a random key of this process, never in clear text. A change of the
    list of tokens clears this memory.
+4. The use of a token is reported at once, and then at most once in `USE_SECONDS`.
 """
 
 import asyncio
@@ -15,7 +16,7 @@ import hmac
 import secrets
 import time
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import cast
 
@@ -28,6 +29,7 @@ from appliance.quotas.pool import QuotaClass
 from appliance.signing.request_signing import reading_hash, reading_id
 from appliance.store.access_tokens import is_secret, parse_token
 
+USE_SECONDS = 60.0
 _KNOWN_SECONDS = 900.0
 _MOST_KNOWN = 1024
 
@@ -50,9 +52,14 @@ class Bearer:
 
 
 class TokenAuthenticator:
-    """Checks tokens; of each peer, at most `failures_per_minute` wrong tokens are checked."""
+    """Checks tokens; of each peer, at most `failures_per_minute` wrong tokens are checked.
 
-    def __init__(self, failures_per_minute: int) -> None:
+    `used(id)` is called when a token was presented.
+    """
+
+    def __init__(self, failures_per_minute: int, used: Callable[[str], None]) -> None:
+        self._used = used
+        self._reported: dict[str, float] = {}  # by token: the time of the last report
         self._tokens: dict[str, TokenKept] = {}
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
@@ -72,10 +79,12 @@ class TokenAuthenticator:
         """Accept only these tokens from now on."""
         self._tokens = {token.id: token for token in tokens}
         self._recognised.clear()
+        self._reported.clear()
 
     def still_good(self, bearer: Bearer) -> bool:
         """Whether a previously valid token may still be used."""
-        return bearer.id in self._tokens and time.time() < bearer.expires
+        kept = self._tokens.get(bearer.id)
+        return kept is not None and time.time() < kept.expires  # a rotation may have brought its end forward
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429)."""
@@ -92,6 +101,7 @@ class TokenAuthenticator:
         ):
             if time.time() < kept.expires:
                 self._remember(peer_key(host))
+                self._report_use(kept.id)
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
             raise self._refusal("the token has expired: ask for a new one (rosrv token add)")
         failures = self._unknown if kept is None else self._wrong
@@ -117,6 +127,12 @@ class TokenAuthenticator:
         self._shown.move_to_end(peer)
         if len(self._shown) > _MOST_KNOWN:
             self._shown.popitem(last=False)
+
+    def _report_use(self, token: str) -> None:
+        now = time.monotonic()
+        if now - self._reported.get(token, -USE_SECONDS) >= USE_SECONDS:
+            self._reported[token] = now
+            self._used(token)
 
     def _refusal(self, detail: str) -> ProblemError:
         return ProblemError(

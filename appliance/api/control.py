@@ -30,6 +30,7 @@ from appliance.channel.messages.api import (
     RestServed,
     TokenKept,
     TokensStated,
+    TokenUsed,
 )
 from appliance.channel.rest_operation import ANSWER_SECONDS
 
@@ -147,6 +148,11 @@ class ControlLink:
             if gone is not None:
                 gone.remove_done_callback(withdraw)
         return answer
+
+    def token_used(self, token: str) -> None:
+        """Report the use of a token to control; without control, a later use is reported."""
+        with contextlib.suppress(ChannelFullError):
+            self._link.send(TokenUsed(token))
 
     def tell(self, call: RestCalled) -> None:
         """Send a call to control to be recorded."""

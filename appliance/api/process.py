@@ -71,7 +71,7 @@ class _Api:
     def __init__(self, settings: Settings, lifeline_fd: int) -> None:
         self._settings = settings
         self._lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
-        self._doorkeeper = TokenAuthenticator(settings.api_limits.failures_per_minute)
+        self._doorkeeper = TokenAuthenticator(settings.api_limits.failures_per_minute, self._token_used)
         self._control = ControlLink(self._doorkeeper.state, self._await_control)
         self._journal = Journal(self._control.tell)
         self._stopping = asyncio.Event()
@@ -167,6 +167,9 @@ class _Api:
         if not self._control.connected:
             _log.error("control was not connected for a long time: the api is restarted")
             self._stopping.set()
+
+    def _token_used(self, token: str) -> None:
+        self._control.token_used(token)
 
     def _report(self, message: messages.Message) -> None:
         try:

@@ -87,6 +87,8 @@ EVENTS: dict[str, str] = {
     "order refused": "RVMaster rejected an order over REST: no valid token, role or proof; `detail.verb` is the order.",
     "token added": "An access token for REST was made; `detail` has its name, role, id and expiry.",
     "token revoked": "An access token for REST was revoked before its expiry.",
+    "token rotated": "An access token for REST replaced the earlier ones of its name; `detail` has its name, role, id"
+    " and expiry, the ids of the `earlier` ones, and their end in `earlier_until`.",
     "process started": "A process of the appliance started.",
     "process died": "A process of the appliance ended unexpectedly.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
@@ -138,8 +140,8 @@ SEVERITIES: dict[str, Severity] = {
             "evidence exported", "forwarding resumed", "host awaited", "host awaited no longer", "host enrolled",
             "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
-            "token added", "token revoked", "topic looked into", "tunnel down", "tunnel moved", "tunnel up",
-            "probe passed",
+            "token added", "token revoked", "token rotated", "topic looked into",
+            "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",

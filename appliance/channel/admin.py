@@ -453,6 +453,18 @@ class TokenAdd(AdminRequest[token_answers.NewToken], frozen=True, tag="token add
     seconds: float
 
 
+class TokenRotate(AdminRequest[token_answers.RotatedToken], frozen=True, tag="token rotate"):
+    """Replace the valid tokens of a name by a new one of the same role; its text is in the answer and nowhere else.
+
+    The new token ends after `seconds` (None: as long after its start as the earlier one), the earlier ones after
+    `grace` seconds, but not later than before.
+    """
+
+    name: str
+    seconds: float | None = None
+    grace: float = 0.0
+
+
 @rest("admin", "GET", "/v1/tokens", name="tokens")
 class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list"):
     """All access tokens that were made, without their secrets; for admins."""
@@ -651,7 +663,9 @@ if TYPE_CHECKING:
     AnyRequest = AdminRequest[Any]
 else:
     RestRequest = Union[tuple(rows())]  # noqa: UP007  there are as many as there are
-    AnyRequest = Union[(TokenAdd, *(request for request in rows() if request is not ChallengeWanted))]
+    AnyRequest = Union[
+        (TokenAdd, TokenRotate, *(request for request in rows() if request is not ChallengeWanted))
+    ]
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:

@@ -133,8 +133,13 @@ VERBS: dict[str, Verb | Group] = {
     "restore": Verb("backup:restore"),
     "purge": Verb("backup:purge"),
     "token": Group(
-        "Create, list and revoke access tokens for REST.",
-        {"add": Verb("token:add"), "list": Verb("token:list_tokens"), "revoke": Verb("token:revoke")},
+        "Create, rotate, list and revoke access tokens for REST.",
+        {
+            "add": Verb("token:add"),
+            "rotate": Verb("token:rotate"),
+            "list": Verb("token:list_tokens"),
+            "revoke": Verb("token:revoke"),
+        },
     ),
 }
 

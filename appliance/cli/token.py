@@ -1,17 +1,21 @@
-"""`rosrv token add|list|revoke`: access tokens for REST and their roles."""
+"""`rosrv token add|rotate|list|revoke`: access tokens for REST and their roles."""
 
 import datetime
 from typing import Annotated
 
 import typer
 
-from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
-from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
+from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
 from rosmop.tool.terminal import say
+
+_Name = Annotated[
+    str, typer.Argument(help="Name of the token", show_default=False, autocompletion=completion.tokens)
+]
 
 
 @speaks
@@ -34,7 +38,50 @@ def add(
     Example: rosrv token add alice --role operator --expires 30d
     """
     seconds = span_given("--expires", expires, "30m, 12h, 90d or 52w")
-    body = appliance.answer_or_exit(TokenAdd(name, role, seconds))
+    _say_new(appliance.answer_or_exit(TokenAdd(name, role, seconds)))
+
+
+@speaks
+def rotate(
+    appliance: Appliance,
+    name: _Name,
+    *,
+    lifetime: Annotated[
+        str | None,
+        typer.Option(
+            "--for",
+            metavar="TIME",
+            help="Time until the new token expires: 12h, 90d, 52w (default: as for the earlier token)",
+        ),
+    ] = None,
+    grace: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Keep the earlier token valid for this time, such as 10m (default: it ends now)",
+        ),
+    ] = None,
+) -> None:
+    """Replace a token by a new one with the same name and role. It is printed once and stored nowhere.
+
+    With --grace, the earlier token stays valid for that time, so that its holder can change to the new one.
+
+    Example: rosrv token rotate dashboard --grace 10m
+    """
+    forms = "30m, 12h, 90d or 52w"
+    order = TokenRotate(
+        name,
+        None if lifetime is None else span_given("--for", lifetime, forms),
+        0.0 if grace is None else span_given("--grace", grace, "30s, 10m, 12h or 7d"),
+    )
+    body = appliance.answer_or_exit(order)
+    _say_new(body)
+    for row in body.earlier:
+        end = "has ended" if row.revoked is not None else f"is valid until {moment(row.expires)}"
+        typer.echo(f"rosrv: the earlier token {row.id} {end}.", err=True)
+
+
+def _say_new(body: NewToken) -> None:
     say(body.token)
     typer.echo(
         f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. It is not shown again.",
@@ -44,12 +91,13 @@ def add(
 
 @speaks
 def list_tokens(appliance: Appliance) -> None:
-    """List all tokens, without their secrets.
+    """List all tokens, without their secrets, with the time of their last use (to within a minute).
 
     Example: rosrv token list
     """
     now = datetime.datetime.now(datetime.UTC).timestamp()
-    for row in appliance.ask_or_exit(TokenList()).tokens:
+    body = appliance.ask_or_exit(TokenList())
+    for row in body.tokens:
         if appliance.as_json:
             say_json(row)
             continue
@@ -57,16 +105,23 @@ def list_tokens(appliance: Appliance) -> None:
             end = f"revoked {moment(row.revoked)}"
         else:
             end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
-        say(f"{row.name:<24} {row.role:<12} {row.id}  created {moment(row.created)}  {end}")
+        used = _use(row, body.uses_since)
+        say(f"{row.name:<24} {row.role:<12} {row.id}  created {moment(row.created)}  {end}  {used}")
+
+
+def _use(row: Token, since: float | None) -> str:
+    """Return when a token was last used; uses before `since` are unknown."""
+    if row.last_used is not None:
+        return f"last used {moment(row.last_used)}"
+    if since is None:
+        return "last use unknown"
+    return "never used" if row.created >= since else f"not used since {moment(since)}"
 
 
 @speaks
 def revoke(
     appliance: Appliance,
-    name: Annotated[
-        str,
-        typer.Argument(help="Name of the token", show_default=False, autocompletion=completion.tokens),
-    ],
+    name: _Name,
 ) -> None:
     """Revoke a token now. Exit status 1 if no token has this name.
 

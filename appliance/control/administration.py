@@ -52,7 +52,10 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
 }
 # Requests that are rejected if the store cannot be written. A revocation is not in the list: it takes effect at once,
 # and its answer reports if it was not stored. The recorder checks its own disk space.
-KEPT = (admin.CHANGES | {admin.TokenAdd, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}) - {
+KEPT = (
+    admin.CHANGES
+    | {admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}
+) - {
     admin.HostRevoke, admin.TokenRevoke, admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove
 }  # fmt: skip
 

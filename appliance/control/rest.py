@@ -40,6 +40,7 @@ from appliance.channel.messages.api import (
     RestCalled,
     RestServed,
     TokensStated,
+    TokenUsed,
 )
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import RequestAuthenticator, UnprovenError
@@ -108,6 +109,8 @@ class RestLink:
                     self._withdrawn[number] = True
             case RestCalled():
                 self._record(message)
+            case TokenUsed(token):
+                self._tokens.used(token)
             case RestServed(pin):
                 self._served(pin)
             case _:

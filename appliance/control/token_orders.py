@@ -1,8 +1,10 @@
-"""Make, list and revoke the access tokens of REST.
+"""Make, rotate, list and revoke the access tokens of REST.
 
 The api gets data to recognise tokens, but never their secrets. Every creation and revocation of a token is recorded.
+The api also reports uses of tokens; a compromised api can report wrong ones.
 """
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import cast
@@ -17,6 +19,8 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 FIRST_NAME = "first"
 _UNTOLD = "first token untold"  # this setting exists while the first token has not been shown
+_USES_SINCE = "token uses since"
+_LEAST_SECONDS = 30.0  # between two stored uses of a token; an api that works reports one a minute
 DEFAULT_SECONDS = 90 * 86_400.0
 LONGEST_SECONDS = 3650 * 86_400.0
 _MOST = 1000
@@ -33,12 +37,19 @@ class TokenOrders:
         self._store = store
         self._trail = trail
         self._rows = {row.id: row for row in store.tokens()}
-        self._untold = bool(store.settings().get(_UNTOLD))
+        settings = store.settings()
+        self._untold = bool(settings.get(_UNTOLD))
+        self._uses = store.token_uses()
+        self._stored: dict[str, float] = {}  # by token: when its last use was stored (monotonic)
+        self._uses_since = float(settings.get(_USES_SINCE) or time.time())
+        if _USES_SINCE not in settings:
+            store.save_setting(_USES_SINCE, str(self._uses_since))
+        self._rotating: set[str] = set()  # names
         self._changed = changed
 
     async def listed(self, _request: admin.TokenList) -> answers.Tokens:
         """Return all tokens, including ended ones, oldest first."""
-        return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
+        return answers.Tokens([self._shown(row) for row in self._rows.values()], self._uses_since)
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens. The api checks `expires`."""
@@ -62,13 +73,25 @@ class TokenOrders:
         row = self._rows.get(token_id)
         return row if row is not None and row.usable(time.time()) else None
 
+    def used(self, token_id: str) -> None:
+        """Note that a token is used now. The time is stored unless the disk is full."""
+        if token_id not in self._rows:
+            return
+        self._uses[token_id], now = time.time(), time.monotonic()
+        if now - self._stored.get(token_id, -_LEAST_SECONDS) < _LEAST_SECONDS:
+            return
+        with contextlib.suppress(StoreError):  # the next use is stored
+            self._store.database.require_room()
+            self._store.save_token_use(token_id, self._uses[token_id])
+            self._stored[token_id] = now
+
     async def first(self) -> str | None:
         """Make a first token, if no token exists or if the first token was never shown. Return its text, or None."""
         if self._rows and not self._untold:
             return None
         self._untold = True
         self._store.save_setting(_UNTOLD, "yes")
-        if self._named(FIRST_NAME, time.time()) is not None:
+        if self._named(FIRST_NAME, time.time()):
             await self.revoke(admin.TokenRevoke(FIRST_NAME))
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
@@ -78,68 +101,131 @@ class TokenOrders:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
 
-    async def add(self, request: admin.TokenAdd) -> answers.NewToken:
-        """Make a token. Only this answer contains its text. Raises `TokenRefusedError` and `StoreError`."""
-        name, seconds, now = request.name, request.seconds, time.time()
-        if not 0 < seconds <= LONGEST_SECONDS:
-            raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
-        if self._named(name, now) is not None:
+    async def add(self, request: admin.TokenAdd, who: str = "") -> answers.NewToken:
+        """Make a token by order of `who`; empty: at the first start. Only this answer contains its text.
+
+        Raises `TokenRefusedError` and `StoreError`.
+        """
+        name, now = request.name, time.time()
+        _require_lifetime(request.seconds)
+        if self._named(name, now):
             raise TokenRefusedError(
                 f"there is a token {name!r} already: revoke it first, or choose another name"
             )
         self._require_room(now)
         try:
-            row, text = make_token(name, request.role, now=now, seconds=seconds)
+            row, text = make_token(name, request.role, now=now, seconds=request.seconds)
         except BadTokenNameError as error:
             raise TokenRefusedError(str(error)) from error
         self._keep(row)
         self._trail.happened(
             "token added",
-            f"token {row.name} ({row.role}) was made",
-            token=row.name,
+            f"token {name} ({row.role}) was made",
+            token=name,
             id=row.id,
             role=row.role,
             expires=row.expires,
+            who=who or None,
         )
         try:
             await self._store.settled()
         except StoreError:  # the token's text was not shown, so end the token to free its name
-            self._end(row)
+            self._end(row, who)
             raise
         return answers.NewToken(*_fields(row), token=text)
 
-    async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
-        """End a token now. Raises `TokenRefusedError` and `StoreError`."""
-        name, now = request.name, time.time()
-        row = self._named(name, now)
-        if row is None:
-            known = (
-                ", ".join(sorted(token.name for token in self._rows.values() if token.usable(now))) or "none"
-            )
-            raise TokenRefusedError(f"there is no token {name[:80]!r} that is valid; there are: {known}")
-        revoked = self._end(row)
-        await self._store.settled()
-        return answers.Token(*_fields(revoked))
+    async def rotate(self, request: admin.TokenRotate, who: str = "") -> answers.RotatedToken:
+        """Replace the valid tokens of a name by a new one of the same role. Only this answer contains its text.
 
-    def _end(self, row: TokenRow) -> TokenRow:
+        The new token and the ends of the earlier ones are stored at once. If they cannot be stored, the earlier ones
+        stay valid. Raises `TokenRefusedError` and `StoreError`.
+        """
+        name, now = request.name, time.time()
+        earlier = self._require_named(name, now)
+        last = max(earlier, key=lambda row: row.expires)
+        seconds = last.expires - last.created if request.seconds is None else request.seconds
+        _require_lifetime(seconds)
+        if not 0 <= request.grace <= LONGEST_SECONDS:
+            raise TokenRefusedError("the grace time is not a time: write 10m, 12h or 7d")
+        if name in self._rotating:
+            raise TokenRefusedError(f"another order rotates the token {name!r} now: rosrv token list")
+        self._require_room(now)
+        row, text = make_token(name, last.role, now=now, seconds=seconds)
+        until = now + request.grace
+        ended = [
+            one._replace(expires=min(one.expires, until)) if request.grace else one._replace(revoked=now)
+            for one in earlier
+        ]
+        self._keep(*ended, row)
+        self._trail.happened(
+            "token rotated",
+            f"token {name} ({row.role}) was rotated",
+            token=name,
+            id=row.id,
+            role=row.role,
+            expires=row.expires,
+            earlier=[one.id for one in ended],
+            earlier_until=until,
+            who=who or None,
+        )
+        self._rotating.add(name)
+        try:
+            await self._store.settled()
+        except StoreError:
+            if self._rows[row.id] is row:  # not revoked meanwhile
+                self._keep(*earlier)
+                self._end(row, who, "was not rotated; the earlier ones stay valid")
+            raise
+        finally:
+            self._rotating.discard(name)
+        return answers.RotatedToken(*_fields(row), token=text, earlier=[self._shown(one) for one in ended])
+
+    async def revoke(self, request: admin.TokenRevoke, who: str = "") -> answers.Token:
+        """End all valid tokens of a name now. Raises `TokenRefusedError` and `StoreError`."""
+        ended = [self._end(row, who) for row in self._require_named(request.name, time.time())]
+        await self._store.settled()
+        return self._shown(ended[-1])
+
+    def _end(self, row: TokenRow, who: str, reason: str = "was revoked") -> TokenRow:
         revoked = row._replace(revoked=time.time())
         self._keep(revoked)
         self._trail.happened(
-            "token revoked", f"token {row.name} ({row.role}) was revoked", token=row.name, id=row.id
+            "token revoked",
+            f"token {row.name} ({row.role}) {reason}",
+            token=row.name,
+            id=row.id,
+            who=who or None,
         )
         return revoked
 
-    def _named(self, name: str, now: float) -> TokenRow | None:
-        return next((row for row in self._rows.values() if row.name == name and row.usable(now)), None)
+    def _named(self, name: str, now: float) -> list[TokenRow]:
+        """Return the valid tokens of a name: several while earlier ones have their grace time."""
+        return [row for row in self._rows.values() if row.name == name and row.usable(now)]
+
+    def _require_named(self, name: str, now: float) -> list[TokenRow]:
+        found = self._named(name, now)
+        if not found:
+            names = {row.name for row in self._rows.values() if row.usable(now)}
+            known = ", ".join(sorted(names)) or "none"
+            raise TokenRefusedError(f"there is no token {name[:80]!r} that is valid; there are: {known}")
+        return found
 
     def _require_room(self, now: float) -> None:
         if sum(row.usable(now) for row in self._rows.values()) >= _MOST:
             raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
 
-    def _keep(self, row: TokenRow) -> None:
-        self._rows[row.id] = row
-        self._store.save_token(row)
+    def _keep(self, *rows: TokenRow) -> None:
+        self._rows |= {row.id: row for row in rows}
+        self._store.save_tokens(*rows)
         self._changed()
+
+    def _shown(self, row: TokenRow) -> answers.Token:
+        return answers.Token(*_fields(row), self._uses.get(row.id))
+
+
+def _require_lifetime(seconds: float) -> None:
+    if not 0 < seconds <= LONGEST_SECONDS:
+        raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
 
 
 def _fields(row: TokenRow) -> tuple[str, str, answers.TokenRole, float, float, float | None]:

@@ -46,6 +46,7 @@ CREATE TABLE IF NOT EXISTS token (
 CREATE TABLE IF NOT EXISTS token_keys (
     id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 """
 
@@ -262,17 +263,28 @@ class StateStore:
 
     # --- tokens ---
 
-    def save_token(self, row: TokenRow) -> None:
-        """Store a token, or its revocation."""
-        self.database.put("token", *row[:-1])
-        if row.keys is not None:
-            self.database.put("token_keys", row.id, *row.keys)
+    def save_tokens(self, *rows: TokenRow) -> None:
+        """Store tokens, or their new ends. After a crash, either all of these rows are stored or none."""
+        with self.database.together():
+            for row in rows:
+                if row.keys is not None:
+                    self.database.put("token_keys", row.id, *row.keys)
+            for row in rows:  # consecutive rows of a table are one statement
+                self.database.put("token", *row[:-1])
 
     def tokens(self) -> list[TokenRow]:
         """Return all tokens that were ever made, the oldest first."""
         kept = {token: TokenKeys(*keys) for token, *keys in self.database.query("SELECT * FROM token_keys")}
         rows = self.database.query("SELECT * FROM token ORDER BY created")
         return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
+
+    def save_token_use(self, token: str, used: float) -> None:
+        """Store when a token was last used."""
+        self.database.put("token_use", token, used)
+
+    def token_uses(self) -> dict[str, float]:
+        """Return the last use of each token that was ever used, by id."""
+        return dict(self.database.query("SELECT id, used FROM token_use"))
 
     # --- settings ---
 

@@ -28,18 +28,31 @@ class Token(msgspec.Struct, frozen=True):
     created: Moment
     expires: Moment
     revoked: Moment | None
+    last_used: Annotated[
+        Moment | None, doc("when it was last presented, to within a minute; null: not since `uses_since`")
+    ] = None
 
 
 class Tokens(msgspec.Struct, frozen=True):
     """All tokens that were made, the oldest first."""
 
     tokens: list[Token]
+    uses_since: Annotated[
+        Moment | None,
+        doc("uses are known since this time: the first start of a version that stores them; null: unknown"),
+    ] = None
 
 
 class NewToken(Token, frozen=True, kw_only=True):
     """A new token with its text, which is shown only here."""
 
     token: str
+
+
+class RotatedToken(NewToken, frozen=True, kw_only=True):
+    """A new token that replaces the `earlier` ones of its name; they are revoked, or expire after the grace time."""
+
+    earlier: list[Token]
 
 
 class Challenge(msgspec.Struct, frozen=True):

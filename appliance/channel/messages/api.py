@@ -72,6 +72,12 @@ class TokensStated(Message):
     tokens: list[TokenKept]
 
 
+class TokenUsed(Message):
+    """The api reports that a token was presented, at most once a minute for each token."""
+
+    token: str
+
+
 class RestCalled(Message):
     """The api reports REST calls for the audit log. `who` is the token's name, empty for an invalid token.
 
@@ -96,4 +102,6 @@ class RestServed(Message):
     pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
 
 
-ApiLink = RequestMade | RequestWithdrawn | RequestAnswered | TokensStated | RestCalled | RestServed
+ApiLink = (
+    RequestMade | RequestWithdrawn | RequestAnswered | TokensStated | TokenUsed | RestCalled | RestServed
+)

@@ -66,12 +66,16 @@ _KIT = (
     "a kit is made on the appliance's machine, without --api; over REST take --token, with which no private key"
     " travels"
 )
+_MACHINE_ONLY = (
+    "tokens are made on the appliance's machine only, without --api: a compromised api gains no lasting"
+    " access"
+)
 _ONLY_THERE: dict[type, str] = {
     admin.HostAdd: _KIT,
     admin.HostRenew: _KIT,
     admin.HostEndpoint: _KIT,
-    admin.TokenAdd: "tokens are made on the appliance's machine only, without --api: a compromised api"
-    " gains no lasting access",
+    admin.TokenAdd: _MACHINE_ONLY,
+    admin.TokenRotate: _MACHINE_ONLY,
 }
 _UNASKED = "this cannot be asked over REST; run it with --state"
 

@@ -25,5 +25,12 @@ def app() -> FastAPI:
 
     control, journal = ControlLink(lambda _tokens: None, lambda: None), Journal(lambda _call: None)
     return build_app(
-        Services(Settings(), control, TokenAuthenticator(1), journal, asyncio.Event(), SampleHistory(nothing))
+        Services(
+            Settings(),
+            control,
+            TokenAuthenticator(1, lambda _token: None),
+            journal,
+            asyncio.Event(),
+            SampleHistory(nothing),
+        )
     )

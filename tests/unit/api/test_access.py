@@ -29,7 +29,7 @@ def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.
 def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
     """Name, role and expiry come back; the case of the scheme is ignored."""
     row, text = make_token("alice", "operator", now=time.time(), seconds=60)
-    door = TokenAuthenticator(10)
+    door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     for scheme in ("Bearer", "bearer"):
         bearer = recognise(door, f"{scheme} {text}")
@@ -43,7 +43,7 @@ def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
 def test_an_expired_token_is_refused() -> None:
     """A token is refused after its expiry, even if it was recognised before."""
     row, text = make_token("a", "viewer", now=time.time() - 100, seconds=50)
-    door = TokenAuthenticator(10)
+    door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     assert recognise(door, f"Bearer {text}") == 401
 
@@ -59,7 +59,7 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
     real = access_tokens.hash_secret
     monkeypatch.setattr(access_tokens, "hash_secret", counted)
-    door = TokenAuthenticator(10)
+    door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     for _ in range(3):
         assert recognise(door, f"Bearer {text}").name == "a"
@@ -76,7 +76,7 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
         return b"never"
 
     monkeypatch.setattr(access_tokens, "hash_secret", counted)
-    door = TokenAuthenticator(5)
+    door = TokenAuthenticator(5, lambda _token: None)
     door.state([kept(row)])
     wrong = f"Bearer rosrv_{row.id}_" + "A" * 43
     assert [recognise(door, wrong) for _ in range(8)] == [401] * 5 + [429] * 3
@@ -89,8 +89,45 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
 def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
     """A host that tries random tokens is slowed down; a valid token from the same address still works."""
     row, text = make_token("a", "viewer", now=time.time(), seconds=60)
-    door = TokenAuthenticator(5)
+    door = TokenAuthenticator(5, lambda _token: None)
     door.state([kept(row)])
     statuses = [recognise(door, f"Bearer nonsense{number}") for number in range(8)]
     assert statuses == [401] * 5 + [429] * 3
     assert recognise(door, f"Bearer {text}").name == "a"
+
+
+def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong, unknown or expired token is no use; a new list of tokens is followed by a new report."""
+    row, text = make_token("a", "viewer", now=time.time(), seconds=60)
+    ended, late = make_token("b", "viewer", now=time.time() - 100, seconds=50)
+    used: list[str] = []
+    door = TokenAuthenticator(10, used.append)
+    door.state([kept(row), kept(ended)])
+    for header in (
+        None,
+        f"Bearer {late}",
+        f"Bearer {text[:-1]}!",
+        f"Bearer {make_token('c', 'viewer', now=0, seconds=1)[1]}",
+    ):
+        recognise(door, header)
+    assert used == []
+    steady = time.monotonic()
+    for passed, reports in ((0.0, 1), (59.0, 1), (61.0, 2), (62.0, 2)):
+        monkeypatch.setattr(time, "monotonic", lambda at=steady + passed: at)
+        assert recognise(door, f"Bearer {text}").name == "a"
+        assert used == [row.id] * reports
+    door.state([kept(row)])
+    recognise(door, f"Bearer {text}")
+    assert used == [row.id] * 3
+
+
+def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
+    """A rotation brings the end of a token forward; a bearer that was recognised before does not outlive it."""
+    row, text = make_token("a", "viewer", now=time.time(), seconds=60)
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row)])
+    bearer = recognise(door, f"Bearer {text}")
+    door.state([kept(row._replace(expires=time.time() + 30))])
+    assert door.still_good(bearer)
+    door.state([kept(row._replace(expires=time.time() - 1))])
+    assert not door.still_good(bearer)

@@ -22,6 +22,7 @@ from appliance.channel.messages.api import (
     RestCalled,
     TokenKept,
     TokensStated,
+    TokenUsed,
 )
 from tests.support.answers import example
 from tests.support.heard import Heard
@@ -181,3 +182,11 @@ async def test_a_call_that_cannot_be_encoded_does_not_block_others(
     assert tokens == [token]
     link.tell(call(3))
     assert [one.path for one in await there.until(3)][-1] == "/3"
+
+
+async def test_a_use_of_a_token_reaches_control(link: ControlLink, control: Callable[[], Control]) -> None:
+    """Without control, the use is not reported, and the request goes on."""
+    link.token_used("0123456789ab")
+    there = control()
+    link.token_used("ba9876543210")
+    assert await there.until(1) == [TokenUsed("ba9876543210")]

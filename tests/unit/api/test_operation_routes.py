@@ -164,7 +164,11 @@ class Listening(ControlLink):
 def api() -> tuple[RequestGate, Listening, dict[str, str]]:
     """Return the api with a token of each role."""
     made = {role: make_token("alice", role, now=time.time(), seconds=6000) for role in ROLES}
-    door, control, journal = TokenAuthenticator(10), Listening(), Journal(lambda _call: None)
+    door, control, journal = (
+        TokenAuthenticator(10, lambda _token: None),
+        Listening(),
+        Journal(lambda _call: None),
+    )
     door.state([
         TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
         for row, _token in made.values()
@@ -321,7 +325,7 @@ BY_HAND = {
 
 def routes() -> dict[str, set[str]]:
     """Return the least roles of each method and path, without the console's."""
-    app = application(Listening(), TokenAuthenticator(10), Journal(lambda _call: None))
+    app = application(Listening(), TokenAuthenticator(10, lambda _token: None), Journal(lambda _call: None))
     return {
         f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
             role for role in roles_of(route.dependant) if role

@@ -24,6 +24,7 @@ from appliance.channel.messages.api import (
     RestServed,
     TokenKept,
     TokensStated,
+    TokenUsed,
 )
 from appliance.control.rest import RestLink
 from appliance.store.access_tokens import TokenRow, make_token
@@ -56,6 +57,7 @@ class Everything:
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
         self.ends: list[Channel] = []  # closed after the run
+        self.uses: list[str] = []
         self.only_slow = False  # whether only requests other than the status wait for `go`
         self.go = asyncio.Event()
         self.go.set()
@@ -80,6 +82,10 @@ class Everything:
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return one of them."""
         return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
+
+    def used(self, token_id: str) -> None:
+        """Add a use of a token."""
+        self.uses.append(token_id)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
         """Add a record."""
@@ -312,3 +318,11 @@ async def test_calls_are_recorded_with_their_outcome(world: Everything, api: Api
     assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")
     assert (refused["decision"], refused["who"], refused["count"]) == ("deny", None, 3)
     assert len(refused["resource"]) <= 300
+
+
+async def test_uses_of_tokens_are_not_recorded(world: Everything, api: Api) -> None:
+    """The part that has the tokens gets them; the audit log does not."""
+    api.channel.send(TokenUsed(VIEWER.id))
+    api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
+    await api.until(2)
+    assert (world.uses, world.recorded) == ([VIEWER.id], [])

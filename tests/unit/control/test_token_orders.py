@@ -1,13 +1,22 @@
 """Tests of `appliance.control.token_orders`: the first token reaches its owner, whichever process dies first."""
 
+import asyncio
+import os
+import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.channel.admin import TokenAdd
-from appliance.control.token_orders import TokenOrders
+from appliance.audit.query import Filter
+from appliance.audit.search import search
+from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
+from appliance.channel.answers.token_answers import RotatedToken
+from appliance.control.token_orders import TokenOrders, TokenRefusedError
+from appliance.signing.request_signing import keys_of
 from appliance.store.access_tokens import is_secret, parse_token
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
@@ -25,6 +34,11 @@ class Lives:
         self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
         self.store: StateStore | None = None
 
+    def records(self, event: str) -> list[dict[str, Any]]:
+        """Return the details of all records of an event, oldest first."""
+        found = search(self.home / "audit.db", Filter(event=event), newest_first=False)
+        return [entry.record.detail for entry in found.entries]
+
     def next(self) -> TokenOrders:
         """Start control after the previous one died."""
         if self.store is not None:
@@ -41,6 +55,11 @@ def lives(tmp_path: Path) -> Iterator[Lives]:
     assert lives.store is not None
     lives.store.close()
     lives.log.close()
+
+
+def set_clock(monkeypatch: pytest.MonkeyPatch, reading: float, clock: str = "time") -> None:
+    """Let a clock show this time."""
+    monkeypatch.setattr(time, clock, lambda: reading)
 
 
 def opens(tokens: TokenOrders, text: str | None) -> bool:
@@ -104,3 +123,231 @@ async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: 
             await tokens.add(TokenAdd("alice", "admin", 60))
     assert tokens.usable() == []
     assert (await tokens.add(TokenAdd("alice", "admin", 60))).token
+
+
+async def test_a_rotated_token_keeps_its_name_and_role(lives: Lives) -> None:
+    """The earlier token ends at once; the new one has its lifetime, and its own keys for signed requests."""
+    tokens = lives.next()
+    old = await tokens.add(TokenAdd("alice", "operator", 3600))
+    new = await tokens.rotate(TokenRotate("alice"), "operator")
+    assert (new.name, new.role) == ("alice", "operator")
+    assert new.expires - new.created == pytest.approx(old.expires - old.created)
+    assert not opens(tokens, old.token)
+    assert opens(tokens, new.token)
+    assert [one.reading for one in tokens.usable()] == [keys_of(new.token).reading]
+    row = tokens.usable_row(new.id)
+    assert row is not None
+    assert row.keys == keys_of(new.token)
+    assert tokens.usable_row(old.id) is None
+    assert [(one.id, one.revoked is not None) for one in new.earlier] == [(old.id, True)]
+    await lives.trail.durable()
+    [record] = lives.records("token rotated")
+    assert (record["id"], record["earlier"], record["who"]) == (new.id, [old.id], "operator")
+    assert not opens(lives.next(), old.token), "the end survives a restart"
+
+
+async def test_earlier_tokens_are_valid_for_the_grace_time(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both tokens are valid until then, over a restart; a second rotation brings no end later."""
+    tokens = lives.next()
+    old = await tokens.add(TokenAdd("alice", "viewer", 3600))
+    new = await tokens.rotate(TokenRotate("alice", 7200, grace=600))
+    newest = await tokens.rotate(TokenRotate("alice", grace=6000))
+    assert newest.expires - newest.created == pytest.approx(7200), "as long as the last one"
+    now = time.time()
+    for seconds, valid in ((500, [old, new, newest]), (700, [new, newest]), (6500, [newest])):
+        set_clock(monkeypatch, now + seconds)
+        later = lives.next()
+        assert [one.id for one in later.usable()] == [one.id for one in valid]
+        monkeypatch.undo()
+
+
+async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None:
+    """A token in its grace time has no rights after its name was revoked."""
+    tokens = lives.next()
+    await tokens.add(TokenAdd("alice", "admin", 3600))
+    await tokens.rotate(TokenRotate("alice", grace=600))
+    await tokens.revoke(TokenRevoke("alice"), "bob")
+    assert tokens.usable() == []
+    await lives.trail.durable()
+    assert [one["who"] for one in lives.records("token revoked")] == ["bob", "bob"]
+
+
+async def test_only_a_valid_token_can_be_rotated(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unknown, a revoked and an expired name are rejected; the message lists the valid ones."""
+    tokens = lives.next()
+    for name, seconds in (("alice", 3600), ("bob", 3600), ("carol", 1)):
+        await tokens.add(TokenAdd(name, "viewer", seconds))
+    await tokens.revoke(TokenRevoke("bob"))
+    set_clock(monkeypatch, time.time() + 60)
+    for name in ("bob", "carol", "dave", "x" * 500):
+        with pytest.raises(TokenRefusedError, match=r"that is valid; there are: alice$"):
+            await tokens.rotate(TokenRotate(name))
+    assert len((await tokens.listed(TokenList())).tokens) == 3
+
+
+@pytest.mark.parametrize(
+    "order", [TokenRotate("alice", -1), TokenRotate("alice", 1e12), TokenRotate("alice", grace=-1)]
+)
+async def test_impossible_times_of_a_rotation_change_nothing(lives: Lives, order: TokenRotate) -> None:
+    """The earlier token stays valid."""
+    tokens = lives.next()
+    old = await tokens.add(TokenAdd("alice", "viewer", 3600))
+    with pytest.raises(TokenRefusedError):
+        await tokens.rotate(order)
+    assert [one.id for one in tokens.usable()] == [old.id]
+
+
+async def test_of_two_rotations_at_once_one_is_rejected(lives: Lives) -> None:
+    """The text that one of them printed is valid."""
+    tokens = lives.next()
+    await tokens.add(TokenAdd("alice", "viewer", 3600))
+    done = await asyncio.gather(
+        *(tokens.rotate(TokenRotate("alice")) for _ in range(2)), return_exceptions=True
+    )
+    assert [type(one) for one in done] == [RotatedToken, TokenRefusedError]
+    assert opens(tokens, done[0].token)  # type: ignore[union-attr]  # checked above
+
+
+async def test_a_rotation_that_cannot_be_stored_leaves_the_earlier_token(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The new token, whose text was not shown, has no rights, now and after a restart."""
+    tokens = lives.next()
+    old = await tokens.add(TokenAdd("alice", "viewer", 3600))
+    assert lives.store is not None
+
+    async def full() -> None:
+        raise StoreError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(lives.store, "settled", full)
+        with pytest.raises(StoreError, match="full"):
+            await tokens.rotate(TokenRotate("alice"))
+    assert [one.id for one in tokens.usable()] == [old.id]
+    assert [one.id for one in lives.next().usable()] == [old.id]
+
+
+async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A revocation while a rotation is being stored is final."""
+    tokens = lives.next()
+    await tokens.add(TokenAdd("alice", "viewer", 3600))
+    assert lives.store is not None
+
+    async def revoked_meanwhile() -> None:
+        monkeypatch.undo()
+        await tokens.revoke(TokenRevoke("alice"))
+        raise StoreError("the disk is full")
+
+    monkeypatch.setattr(lives.store, "settled", revoked_meanwhile)
+    with pytest.raises(StoreError, match="full"):
+        await tokens.rotate(TokenRotate("alice"))
+    assert tokens.usable() == []
+
+
+async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
+    """Wherever the state file was cut off, exactly one of the two tokens is valid at the next start."""
+    tokens = lives.next()
+    old = await tokens.add(TokenAdd("alice", "viewer", 3600))
+    assert lives.store is not None
+    await lives.store.settled()
+    child = os.fork()
+    if not child:
+        try:
+            asyncio.run(_rotate_and_die(lives))
+        finally:
+            os._exit(1)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+    lives.store.close()
+    ahead = lives.home / "state.ahead"
+    whole, seen = ahead.read_bytes(), set()
+    state = {path: path.read_bytes() for path in lives.home.glob("state.db*")}
+    for length in range(len(whole) + 1):
+        for path in lives.home.glob("state.db*"):
+            path.unlink()
+        for path, data in state.items():
+            path.write_bytes(data)
+        ahead.write_bytes(whole[:length])
+        store = StateStore(lives.home, failed=pytest.fail)
+        usable = [row.id for row in store.tokens() if row.usable(time.time())]
+        store.close()
+        assert len(usable) == 1
+        seen.add(usable[0] == old.id)
+    assert seen == {True, False}
+    lives.next()
+
+
+async def _rotate_and_die(lives: Lives) -> None:
+    """Rotate in a new control that is killed before its writer writes."""
+    store = StateStore(lives.home, failed=pytest.fail)
+    store.database._commit = lambda statements: None  # type: ignore[method-assign]  # the writer never gets to it
+
+    async def killed() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    store.settled = killed  # type: ignore[method-assign]  # killed instead of answering
+    trail = AuditTrail(lives.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    lives.log.record = lambda record: record.id  # type: ignore[method-assign]  # its thread is in the parent
+    await TokenOrders(store, trail, lambda: None).rotate(TokenRotate("alice"))
+
+
+async def uses(tokens: TokenOrders) -> dict[str, float | None]:
+    """Return the last use of each token, by name."""
+    return {one.name: one.last_used for one in (await tokens.listed(TokenList())).tokens}
+
+
+async def test_the_last_use_survives_a_restart(lives: Lives) -> None:
+    """A token that was never used has no last use; the id of no token is ignored."""
+    tokens = lives.next()
+    alice = await tokens.add(TokenAdd("alice", "viewer", 60))
+    await tokens.add(TokenAdd("bob", "viewer", 60))
+    tokens.used(alice.id)
+    tokens.used("0123456789ab")
+    known = await uses(tokens)
+    assert (known["alice"] or 0) == pytest.approx(time.time(), abs=5)
+    assert known["bob"] is None
+    listed = await tokens.listed(TokenList())
+    again = lives.next()
+    assert await uses(again) == known
+    assert (await again.listed(TokenList())).uses_since == listed.uses_since
+
+
+async def test_uses_are_stored_at_most_once_in_half_a_minute(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The list shows the newest use all the same, also after the clock was set back."""
+    tokens = lives.next()
+    alice = await tokens.add(TokenAdd("alice", "viewer", 600))
+    assert lives.store is not None
+    stored: list[float] = []
+    monkeypatch.setattr(lives.store, "save_token_use", lambda _token, used: stored.append(used))
+    wall, steady = time.time(), time.monotonic()
+    for ahead, passed in ((0, 0.0), (10, 10.0), (-3600, 31.0), (-3590, 41.0), (-3530, 62.0)):
+        set_clock(monkeypatch, wall + ahead)
+        set_clock(monkeypatch, steady + passed, "monotonic")
+        tokens.used(alice.id)
+        assert await uses(tokens) == {"alice": wall + ahead}
+    assert stored == [wall, wall - 3600, wall - 3530]
+
+
+async def test_a_full_disk_keeps_no_use_and_harms_no_request(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is queued for the full disk; the next use after that is stored."""
+    tokens = lives.next()
+    alice = await tokens.add(TokenAdd("alice", "viewer", 600))
+    assert lives.store is not None
+
+    def full() -> None:
+        raise StoreError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(lives.store.database, "require_room", full)
+        tokens.used(alice.id)
+        assert (await uses(tokens))["alice"] is not None
+        assert lives.store.token_uses() == {}
+    tokens.used(alice.id)
+    assert lives.store.token_uses().keys() == {alice.id}
