@@ -9,6 +9,7 @@ from starlette.responses import JSONResponse, Response
 import appliance
 from appliance.api import (
     audit,
+    audit_summary,
     console,
     enrol,
     evidence_routes,
@@ -62,6 +63,7 @@ def build_app(services: Services) -> FastAPI:
         enrol,
         monitor_routes,
         recording_routes,
+        audit_summary,  # before /v1/audit/{record_id}
         audit,
         evidence_routes,
         metrics_route,

@@ -26,6 +26,7 @@ VERBS: dict[str, Verb | Group] = {
         {
             "why": Verb("policy.grant_verb:why"),
             "search": Verb("audit.audit_verbs:search"),
+            "summary": Verb("audit.summary_verb:summarise"),
             "tail": Verb("audit.audit_verbs:tail"),
             "show": Verb("audit.audit_verbs:show"),
             "verify": Verb("audit.audit_verbs:verify"),

@@ -56,12 +56,8 @@ def _filter(
         str | None, typer.Option("--who", help="Name of the token of a REST request, or operator; a glob")
     ] = None,
 ) -> Filter:
-    now = time.time_ns()
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
-    begin = None if since is None else parse_timestamp(since, now)
-    end = None if until is None else parse_timestamp(until, now)
-    if begin is not None and end is not None and begin > end:
-        raise TimestampError(f"--since {since} is later than --until {until}")
+    begin, end = times_given(since, until)
     found = Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
         since=begin,
@@ -79,6 +75,16 @@ def _filter(
     for warning in unrecorded(found):
         note(printable(warning))
     return found
+
+
+def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
+    """Return the times of --since and --until. Raises `TimestampError`."""
+    now = time.time_ns()
+    begin = None if since is None else parse_timestamp(since, now)
+    end = None if until is None else parse_timestamp(until, now)
+    if begin is not None and end is not None and begin > end:
+        raise TimestampError(f"--since {since} is later than --until {until}")
+    return begin, end
 
 
 def filtered(

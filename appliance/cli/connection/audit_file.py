@@ -8,6 +8,7 @@ from pathlib import Path
 from appliance.audit.chain_findings import Verification
 from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
+from appliance.audit.denial_summary import DenialSummary, summary_of_log
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.record_format import LogEntry
@@ -38,6 +39,10 @@ class FileLog:
     def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
         """Return at most `limit` records from `cursor` on."""
         return search(self._path, wanted, cursor, limit, newest_first=newest_first)
+
+    def denials(self, wanted: Filter, limit: int) -> DenialSummary:
+        """Return the denials that match, by host."""
+        return summary_of_log(self._path, wanted, limit)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
         """Return one record with its neighbours; None if the log has no such record."""

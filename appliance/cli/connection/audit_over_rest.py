@@ -11,6 +11,7 @@ import msgspec
 
 from appliance.audit.chain_findings import Verification
 from appliance.audit.copies import SignedCheckpoint
+from appliance.audit.denial_summary import DenialSummary
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import LogEntry, entry_of, rfc3339
 from appliance.audit.search import RecordInContext, SearchPage
@@ -48,6 +49,12 @@ class RestLog:
                 cursor = page["cursor"]
             if cursor is None or len(entries) >= limit:
                 return SearchPage(entries, cursor)
+
+    def denials(self, wanted: Filter, limit: int) -> DenialSummary:
+        """Return the denials that match, by host."""
+        parameters = {**_parameters(wanted), "limit": limit}
+        with self._refusals():
+            return msgspec.convert(self._get("/summary", parameters), DenialSummary)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
         """Return one record with its neighbours; None if the log has no such record."""

@@ -309,7 +309,8 @@ BY_HAND = {
     "viewer": {
         "GET /metrics", "GET /v1/metrics", "GET /v1/history", "GET /v1/live", "GET /v1/whoami", "GET /v1/evidence",
         "GET /v1/audit", "GET /v1/audit/checkpoints", "GET /v1/audit/export", "GET /v1/audit/stream",
-        "GET /v1/audit/{record_id}", "GET /v1/audit/{record_id}/grant", "GET /v1/audit/{record_id}/why",
+        "GET /v1/audit/summary", "GET /v1/audit/{record_id}", "GET /v1/audit/{record_id}/grant",
+        "GET /v1/audit/{record_id}/why",
         "GET /v1/hosts/{name}", "GET /v1/monitors/{name}", "GET /v1/monitors/{name}/history",
         "GET /v1/monitors/{name}/picture", "GET /v1/policy", "GET /v1/policy/explain", "POST /v1/policy/explain",
         "POST /v1/policy/test", "GET /v1/recordings/{recording_id}/timeline",

@@ -1,0 +1,42 @@
+"""`/v1/audit/summary`: the denials by host. A summary may read much of the log, so one is made at a time."""
+
+import asyncio
+from typing import Annotated
+
+from fastapi import Query
+
+from appliance.api.moments import given
+from appliance.api.problems import ProblemError
+from appliance.api.route_roles import VIEWER
+from appliance.api.routing import Routes
+from appliance.api.services import Services
+from appliance.api.streams import turn
+from appliance.audit.denial_summary import LARGEST_SUMMARY, DenialSummary, summary_of_log
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.query import Filter
+
+
+def routes(services: Services) -> Routes:
+    """Return the route."""
+    router = Routes(prefix="/v1/audit", tags=["audit"])
+    one = asyncio.Semaphore(1)
+
+    @router.get("/summary", dependencies=[VIEWER])
+    async def summarise_audit(
+        since: Annotated[
+            str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")
+        ] = None,
+        until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
+        limit: Annotated[int, Query(ge=1, le=LARGEST_SUMMARY, description="largest number of hosts")] = 20,
+    ) -> DenialSummary:
+        """The denials of each host: number, first and last time, most frequent rules or reasons, callers."""
+        begin, end = (None if time is None else given(time) for time in (since, until))
+        async with turn(one, "summaries of the audit log"):
+            try:
+                return await asyncio.to_thread(
+                    summary_of_log, services.audit_log, Filter(since=begin, until=end), limit
+                )
+            except LogUnreadableError as error:
+                raise ProblemError(503, "log-unreadable", str(error)) from error
+
+    return router

@@ -1,0 +1,85 @@
+"""`rosrv audit summary`: the denials by host."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+import typer
+
+from appliance.audit.denial_summary import LARGEST_SUMMARY, DenialSummary, HostDenials
+from appliance.audit.query import Filter
+from appliance.audit.record_format import printable
+from appliance.cli.audit.audit_errors import Errors
+from appliance.cli.audit.filter import times_given
+from appliance.cli.audit.record_table import write
+from appliance.cli.connection.target import Appliance, speaks_with
+from appliance.cli.durations import Since, Until
+from appliance.cli.output import say_json
+from rosmop.tool.terminal import counted
+
+_SECONDS = 19  # characters of a time
+_LONGEST_REASON = 160
+
+
+@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object")])
+def summarise(
+    appliance: Appliance,
+    since: Since = None,
+    until: Until = None,
+    *,
+    limit: Annotated[
+        int, typer.Option("--limit", min=1, max=LARGEST_SUMMARY, help="Largest number of hosts")
+    ] = 20,
+) -> None:
+    """Show the denials of each host: number, first and last time, callers, the three most frequent rules or reasons.
+
+    Hosts with the most denials come first. Repetitions that the log only counts are included with their number.
+    Times are UTC.
+
+    Example: rosrv audit summary --since 1h
+    """
+    with Errors():
+        begin, end = times_given(since, until)
+        found = appliance.audit().denials(Filter(since=begin, until=end), limit)
+        if appliance.as_json:
+            say_json(found)
+            return
+        for line in _lines(found):
+            write(printable(line))
+
+
+def _lines(found: DenialSummary) -> Iterator[str]:
+    if not found.hosts:
+        yield "no denials"
+    width = max((len(row.host) for row in found.hosts), default=0)
+    for row in found.hosts:
+        yield f"{row.host:<{width}}  {counted(row.count, 'denial')}, {_span(row)}{_callers(row)}"
+        for reason in row.reasons:
+            yield f"{reason.count:>8}  {_cut(reason.name)}"
+    if found.more_hosts:
+        yield (
+            f"and {counted(found.more_hosts, 'more host')} with {counted(found.more_denials, 'denial')}: --limit"
+            f" {min(LARGEST_SUMMARY, len(found.hosts) + found.more_hosts)}"
+        )
+    if found.counted_since is not None:
+        earlier = found.counted_since.partition(".")[0] + "Z"
+        yield f"earlier records were not counted, as there are too many: --until {earlier}"
+
+
+def _span(row: HostDenials) -> str:
+    first, last = _second(row.first), _second(row.last)
+    return first if first == last else f"{first} to {last}"
+
+
+def _second(time: str) -> str:
+    return time.replace("T", " ")[:_SECONDS]
+
+
+def _callers(row: HostDenials) -> str:
+    if not row.callers:
+        return ""
+    more = f" and {row.more_callers} more" if row.more_callers else ""
+    return f", by {', '.join(caller.name for caller in row.callers)}{more}"
+
+
+def _cut(reason: str) -> str:
+    return reason if len(reason) <= _LONGEST_REASON else f"{reason[:_LONGEST_REASON]}…"
