@@ -1,7 +1,9 @@
 """List the hosts that have the rights for an action: each network that the policy names, and all other hosts."""
 
+import functools
 import ipaddress
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from appliance.policy.host_sets import Network
@@ -42,7 +44,10 @@ def who_may(policy: Policy, category: Category, resource: str, node: str = "") -
     Without the name of a `node`, the right to a node's name is not decided.
     """
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
-    inside = [(network, _only_in(policy, network, networks)) for network in networks]
+    inside = [
+        (network, _only_in(policy, network, networks[place:]))
+        for place, network in enumerate(networks, start=1)
+    ]
     found: list[tuple[Network | None, Address | None]] = [*inside, (None, _outside(policy, networks))]
     for network, address in found:
         if address is not None:
@@ -67,14 +72,18 @@ def _names(policy: Policy, network: Network | None) -> tuple[str, ...]:
     return tuple((["robot"] if network in policy.robot else []) + sorted(names))
 
 
-def _only_in(policy: Policy, network: Network, networks: list[Network]) -> Address | None:
-    """Return an address that no smaller network of the policy contains, or None if they cover the network."""
-    starts = [network.network_address, *_ends([one for one in networks if _within(one, network)])]
+def _only_in(policy: Policy, network: Network, later: list[Network]) -> Address | None:
+    """Return an address that no smaller network of the policy contains, or None if they cover the network.
+
+    In the order of addresses, the smaller networks follow the network.
+    """
+    smaller = itertools.takewhile(functools.partial(_within, network), later)
+    starts = itertools.chain([network.network_address], _ends(smaller))
     return next((one for one in starts if one in network and policy.named_as(one) == network), None)
 
 
-def _within(inner: Network, outer: Network) -> bool:
-    return inner.version == outer.version and inner != outer and inner.network_address in outer
+def _within(outer: Network, inner: Network) -> bool:
+    return inner.version == outer.version and inner.network_address in outer
 
 
 def _outside(policy: Policy, networks: list[Network]) -> Address | None:
@@ -88,7 +97,7 @@ def _outside(policy: Policy, networks: list[Network]) -> Address | None:
     return next((one for one in starts if not policy.names(one)), None)
 
 
-def _ends(networks: list[Network]) -> Iterator[Address]:
+def _ends(networks: Iterable[Network]) -> Iterator[Address]:
     """Yield the address after each network; after the last address of all there is none."""
     for network in networks:
         last = network.broadcast_address
