@@ -18,6 +18,7 @@ from appliance.cli.policy.policy_input import (
     Robot,
     known_of,
     live_now,
+    policy_in_force,
     read_text,
     requests_of_audit_log,
     requests_of_file,
@@ -25,6 +26,7 @@ from appliance.cli.policy.policy_input import (
 )
 from appliance.cli.policy.policy_verbs import decision_fields
 from appliance.policy.diff import Difference, diff
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -79,7 +81,8 @@ def compare(
         typer.echo("rosrv: two files will be compared by their text: use --decisions", err=True)
         decisions = True
     if decisions or requests is not None:
-        policies = _compiled(before, robot, enrolled), _compiled(after, robot, enrolled)
+        known = _known(appliance, old, new, robot, enrolled)
+        policies = _compiled(before, known), _compiled(after, known)
         differ = _say_decisions(appliance, *policies, requests)
     elif robot or enrolled:
         raise usage_error("--robot and --enrolled need --decisions")
@@ -127,8 +130,20 @@ def _say_texts(appliance: Appliance, old: _Source, new: _Source) -> bool:
     return bool(lines)
 
 
-def _compiled(source: _Source, robot: list[str] | None, enrolled: list[str] | None) -> Policy:
-    known = known_of(robot, enrolled)
+def _known(
+    appliance: Appliance,
+    old: str | None,
+    new: str | None,
+    robot: list[str] | None,
+    enrolled: list[str] | None,
+) -> PolicyContext:
+    """Return the hosts of the options, and for a revision of the appliance also those that the appliance knows."""
+    return (
+        known_of(robot, enrolled) if _are_files(old, new) else policy_in_force(appliance, robot, enrolled)[2]
+    )
+
+
+def _compiled(source: _Source, known: PolicyContext) -> Policy:
     try:
         return compile_policy(source.text, file=source.name, hosts=known.hosts, robot=known.robot)
     except PolicyError as error:
