@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -82,11 +82,9 @@ def policy_in_force(
 
     Exits with status 2 if no appliance answers.
     """
-    body: PolicyInForce
-    if appliance.place is None:
-        body = appliance.ask_or_exit(PolicyWanted())
-    else:
-        body = msgspec.convert(_over_rest(appliance), PolicyInForce)
+    body: PolicyInForce = (
+        appliance.ask_or_exit(PolicyWanted()) if appliance.place is None else _over_rest(appliance)
+    )
     known = PolicyContext(
         {name: canonical_address(ipaddress.ip_address(address)) for name, address in body.hosts.items()},
         [ipaddress.ip_network(place) for place in body.robot],
@@ -94,11 +92,14 @@ def policy_in_force(
     return body.text, body.file, known_of(robot, enrolled, known)
 
 
-def _over_rest(appliance: Appliance) -> dict[str, Any]:
+def _over_rest(appliance: Appliance) -> PolicyInForce:
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
-        return appliance.rest.call("GET", "/v1/policy")
+        return msgspec.convert(appliance.rest.call("GET", "/v1/policy"), PolicyInForce)
+    except msgspec.ValidationError as error:
+        text = f"{appliance.place}: this appliance's version gives a different answer: {error}"
+        raise usage_error(text) from error
     except (NotRunningError, RestProblemError) as error:
         raise usage_error(str(error)) from error
 
