@@ -71,6 +71,85 @@ def test_the_self_test_is_not_an_attempt(opened: Callable[..., Reader]) -> None:
     assert page.evaluate(attempts, denials) == ["/cmd_vel"]
 
 
+def test_a_host_that_uses_names_of_another_host_is_shown_as_that(opened: Callable[..., Reader]) -> None:
+    """Its attempts are one red item with its address, and lead to the nodes whose names it used."""
+    page = opened().go("graph")
+    drawn = """async ({ graph, denials }) => {
+      const { modelOf } = await import("/console/static/js/graph/model.js");
+      const { items, lines } = modelOf(graph, denials, { services: false, quiet: true, denied: true });
+      const found = [...items.values()].filter((one) => one.kind !== "topic");
+      const ends = [...lines.values()].map((one) => [one.from, one.to]);
+      return { items: found.map((one) => [one.key, one.name, one.sub]), lines: ends };
+    }"""
+    nodes = [
+        {"name": name, "host": host, "state": "live", "publishes": [], "subscribes": [], "offers": []}
+        for name, host in (("/arm", "10.0.0.1"), ("/eye", "10.0.0.2"), ("/ear", "10.0.0.9"))
+    ]
+    denied = {
+        "host": "10.0.0.9",
+        "category": "publish",
+        "decision": "deny",
+        "rule": None,
+        "equality": {"times": 3},
+    }
+    denials = [
+        {**denied, "caller_id": caller, "resource": resource}
+        for caller, resource in (("/arm", "/new"), ("/eye", "/new"), ("/ear", "/new"), ("/other", "/new"))
+    ]
+    found = page.evaluate(
+        drawn, {"graph": {"nodes": nodes, "topics": [], "services": []}, "denials": denials}
+    )
+    assert found["items"] == [
+        ["n/arm", "/arm", "10.0.0.1"],
+        ["n/eye", "/eye", "10.0.0.2"],
+        ["n/ear", "/ear", "10.0.0.9"],
+        ["x@10.0.0.9", "10.0.0.9", "uses names of 2 hosts"],
+        ["t/new", "/new", "denied publish"],
+        ["x/other@10.0.0.9", "/other", "10.0.0.9 · 3 denials"],
+    ]
+    assert found["lines"] == [
+        ["x@10.0.0.9", "n/arm"],
+        ["x@10.0.0.9", "n/eye"],
+        ["n/ear", "t/new"],
+        ["x/other@10.0.0.9", "t/new"],
+    ]
+
+
+def test_a_long_chain_fills_the_frame(opened: Callable[..., Reader]) -> None:
+    """A chain of forty nodes is folded into bands, and items without lines fill rows: little of the frame is empty."""
+    page = opened(width=1600, height=1000).go("graph")
+    shape = """async ({ chain, alone }) => {
+      const { afresh, extent, loadLayout } = await import("/console/static/js/graph/arrange.js");
+      await loadLayout();
+      const numbers = (count) => [...Array(Math.max(0, count)).keys()];
+      const line = (at) => ({ key: `${at}`, from: `n${at}`, to: `n${at + 1}`, kind: "flow" });
+      const items = new Map(numbers(chain + alone).map((at) => [`n${at}`, { key: `n${at}`, kind: "node" }]));
+      const lines = new Map(numbers(chain - 1).map((at) => [`${at}`, line(at)]));
+      const { w, h } = extent(afresh(items, lines, { narrow: false, w: 1300, h: 760 }).values());
+      return Math.min(1300 / w, 760 / h);
+    }"""
+    assert page.evaluate(shape, {"chain": 40, "alone": 0}) > 0.3  # 0.13 in one row
+    assert page.evaluate(shape, {"chain": 0, "alone": 50}) > 0.7  # 0.23 in one column
+    assert page.evaluate(shape, {"chain": 6, "alone": 40}) > 0.6
+
+
+def test_names_lose_their_first_namespaces_first(opened: Callable[..., Reader]) -> None:
+    """A name that does not fit loses whole namespaces, which the second line then has, and never its first letters."""
+    page = opened().go("graph")
+    shown = """async (cases) => {
+      const { label } = await import("/console/static/js/graph/drawing.js");
+      return cases.map(([name, most]) => label(name, most));
+    }"""
+    cases = {
+        ("/arm/planner", 12): "/arm/planner",
+        ("/left/arm/planner", 12): "arm/planner",
+        ("/left/arm/planner", 8): "planner",
+        ("/navigation_planner", 12): "navigation_…",
+        ("/arm … safety", 20): "/arm … safety",
+    }
+    assert page.evaluate(shown, [list(case) for case in cases]) == list(cases.values())
+
+
 def test_a_thousand_topics(opened: Callable[..., Reader], attempt: Callable[..., Any], node_api: str) -> None:
     """A hundred nodes and a thousand topics are drawn as some dozens of groups; one is opened, one topic is found;
     the table has all of them; and the page answers all the while.

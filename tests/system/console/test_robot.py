@@ -19,7 +19,7 @@ _ALL_IN_FRAME = """() => {
     frame.left <= box.left && box.right <= frame.right && frame.top <= box.top && box.bottom <= frame.bottom);
 }"""
 
-# For each line of a denied attempt: the boxes that hide a part of it, except those at its ends.
+# For each line of a denied attempt: the boxes that hide a part of it; at its ends it touches their edges.
 _BEHIND = """() => {
   const boxes = [...document.querySelectorAll(".box")].map((one) => [one.dataset.key, one.querySelector(".shape")]);
   return [...document.querySelectorAll("g.attempt path.line")].map((line) => {
@@ -28,7 +28,7 @@ _BEHIND = """() => {
       const at = line.getPointAtLength((line.getTotalLength() * step) / 200).matrixTransform(line.getScreenCTM());
       for (const [key, shape] of boxes) {
         const { left, right, top, bottom } = shape.getBoundingClientRect();
-        if (at.x > left && at.x < right && at.y > top && at.y < bottom) found.add(key);
+        if (at.x > left + 1 && at.x < right - 1 && at.y > top + 1 && at.y < bottom - 1) found.add(key);
       }
     }
     return [...found];

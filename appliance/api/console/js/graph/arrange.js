@@ -1,5 +1,6 @@
 /**
  * The layout: from left to right in the direction of messages; in a narrow frame from top to bottom, in two columns.
+ * Items without lines fill the rest of the frame, in rows.
  * While the graph changes only a little, existing items keep their places. New items are placed beside the items that
  * they are connected to; in a narrow frame, below all other items.
  */
@@ -12,28 +13,34 @@ export async function loadLayout() {
   dagre ??= await import(SOURCE);
 }
 
-/** @typedef {{x: number, y: number, w: number, h: number}} Spot the middle and the size */
+/** @typedef {{x: number, y: number, w: number, h: number, alone?: boolean, band?: number}} Spot the middle and the size; `alone`: without lines; `band`: of a folded layout */
 
 export const SIZES = {
-  node: [158, 46], topic: [206, 44], service: [206, 44], party: [158, 46], missing: [206, 44], master: [120, 46],
+  node: [180, 50], topic: [206, 50], service: [206, 50], party: [206, 50], missing: [206, 50], master: [158, 50],
 };
 const GAP = 16;
 const COLUMN = 52;
 const GROUP = [206, 50];
+const ROOM = 80; // for the lines that go back, between the connected items and the others
+const MOST_BANDS = 4;
+const FOLD = 1.25; // how much larger the drawing must become for a band more
+const NARROW_COLUMNS = 3; // of items without lines
 const BETWEEN = 44; // distance of the two columns in a narrow frame, for the lines
 const TALLEST = 12; // most parts of an opened group in one column
 const LITTLE = 0.25; // fraction of new items above which the whole layout is computed again
 
+/** @typedef {{narrow: boolean, w: number, h: number}} Frame the size on the screen */
+
 /**
- * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before @param {boolean} narrow
+ * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before @param {Frame} frame
  * @returns {Map<string, Spot>}
  */
-export function arrange(items, lines, before, narrow) {
+export function arrange(items, lines, before, frame) {
   before = unfolded(items, before);
   const fresh = [...items.keys()].filter((key) => !before.has(key));
-  if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, narrow ? new Map() : lines, before, fresh);
+  if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, frame.narrow ? new Map() : lines, before, fresh);
   if (before.size && !fresh.length) return new Map([...items.keys()].map((key) => [key, /** @type {Spot} */ (before.get(key))]));
-  return afresh(items, lines, narrow);
+  return afresh(items, lines, frame);
 }
 
 /**
@@ -53,7 +60,7 @@ function unfolded(/** @type {Map<string, any>} */ items, /** @type {Map<string, 
     const room = extent(placed.values());
     const [right, down] = [Math.max(0, room.w - here.w), Math.max(0, room.h - here.h)];
     spots = new Map([...spots].map(([key, spot]) => [key, { ...spot, x: spot.x + (spot.x > here.x ? right : 0), y: spot.y + (spot.y > here.y ? down : 0) }]));
-    for (const [key, spot] of placed) spots.set(key, spot);
+    for (const [key, spot] of placed) spots.set(key, { ...spot, band: here.band });
   }
   return spots;
 }
@@ -80,8 +87,66 @@ function inColumns(parts, left, top) {
   return spots;
 }
 
-/** Compute the whole layout again. @param {Map<string, any>} items @param {Map<string, any>} lines @param {boolean} narrow */
-export function afresh(items, lines, narrow) {
+/** Compute the whole layout again. @param {Map<string, any>} items @param {Map<string, any>} lines @param {Frame} frame */
+export function afresh(items, lines, frame) {
+  const joined = new Set([...lines.values()].filter((line) => line.from !== line.to).flatMap((line) => [line.from, line.to]));
+  const connected = new Map([...items].filter(([key]) => joined.has(key)));
+  const alone = [...items].filter(([key]) => !joined.has(key)).sort(([a], [b]) => (a < b ? -1 : 1)).map(([, item]) => item);
+  const spots = connected.size ? inRanks(connected, lines) : new Map();
+  const placed = frame.narrow ? stacked(spots) : folded(spots, frame);
+  return alone.length ? filled(placed, alone, frame) : placed;
+}
+
+/** Fold a layout that is much wider than the frame into bands below each other. @param {Map<string, Spot>} spots @param {Frame} frame @returns {Map<string, Spot>} */
+function folded(spots, frame) {
+  const ranks = [...new Set([...spots.values()].map((one) => one.x))].sort((a, b) => a - b);
+  const all = extent(spots.values());
+  let best = { zoom: FOLD * Math.min(frame.w / all.w, frame.h / all.h), bands: /** @type {[string, Spot][][]} */ ([]) };
+  for (let count = 2; count <= Math.min(MOST_BANDS, ranks.length); count += 1) {
+    const size = Math.ceil(ranks.length / count);
+    const bands = Array.from({ length: count }, (_, band) => [...spots].filter(([, { x }]) => Math.floor(ranks.indexOf(x) / size) === band)).filter((band) => band.length);
+    const sizes = bands.map((band) => extent(band.map(([, spot]) => spot)));
+    const zoom = Math.min(frame.w / Math.max(...sizes.map(({ w }) => w)), frame.h / sizes.reduce((sum, { h }) => sum + h + ROOM, -ROOM));
+    if (zoom > best.zoom) best = { zoom, bands };
+  }
+  if (!best.bands.length) return spots;
+  /** @type {Map<string, Spot>} */
+  const found = new Map();
+  let top = 0;
+  best.bands.forEach((some, band) => {
+    const { x, y, h } = extent(some.map(([, spot]) => spot));
+    for (const [key, spot] of some) found.set(key, { ...spot, x: spot.x - x, y: spot.y - y + top, band });
+    top += h + ROOM;
+  });
+  return found;
+}
+
+/** Place items without lines in rows below the others or beside them, so that all is drawn as large as possible. */
+function filled(/** @type {Map<string, Spot>} */ spots, /** @type {any[]} */ alone, /** @type {Frame} */ frame) {
+  const all = spots.size ? extent(spots.values()) : { x: 0, y: 0, w: 0, h: 0 };
+  const [w, h] = [GROUP[0] + GAP, GROUP[1] + GAP];
+  const apart = spots.size ? ROOM : 0;
+  let best = { zoom: 0, columns: 1, beside: false };
+  for (const beside of frame.narrow || !spots.size ? [false] : [false, true]) {
+    for (let columns = 1; columns <= Math.min(alone.length, frame.narrow ? NARROW_COLUMNS : Infinity); columns += 1) {
+      const [wide, high] = [columns * w - GAP, Math.ceil(alone.length / columns) * h - GAP];
+      const whole = beside ? [all.w + apart + wide, Math.max(all.h, high)] : [Math.max(all.w, wide), all.h + apart + high];
+      const zoom = Math.min(frame.w / whole[0], frame.h / whole[1]);
+      if (zoom > best.zoom + 1e-9) best = { zoom, columns, beside };
+    }
+  }
+  const { columns, beside } = best;
+  const left = beside ? all.x + all.w + apart : frame.narrow ? all.x + all.w / 2 - (Math.min(columns, alone.length) * w - GAP) / 2 : all.x;
+  const top = beside ? all.y : all.y + all.h + apart;
+  alone.forEach((item, at) => {
+    const [width, height] = sizeOf(item);
+    spots.set(item.key, { x: left + (at % columns) * w + GROUP[0] / 2, y: top + Math.floor(at / columns) * h + GROUP[1] / 2, w: width, h: height, alone: true });
+  });
+  return spots;
+}
+
+/** Place connected items in ranks, from left to right. @param {Map<string, any>} items @param {Map<string, any>} lines @returns {Map<string, Spot>} */
+function inRanks(items, lines) {
   const graph = new dagre.Graph({ multigraph: false });
   graph.setGraph({ rankdir: "LR", nodesep: GAP, ranksep: COLUMN, edgesep: 8, ranker: items.size > 150 ? "longest-path" : "tight-tree", acyclicer: "greedy" });
   graph.setDefaultEdgeLabel(() => ({}));
@@ -103,7 +168,7 @@ export function afresh(items, lines, narrow) {
     const [w, h] = sizeOf(items.get(key));
     spots.set(key, { x, y, w, h });
   }
-  return narrow ? stacked(spots) : spots;
+  return spots;
 }
 
 /** Place each column below the previous column, with two boxes in a row. */

@@ -9,9 +9,9 @@
 
 import { counted } from "../numbers.js";
 
-const RANGE = 40;
+const RANGE = 64;
 
-/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[], within?: string[]}} Shown `within`: the opened groups around it */
+/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[], within?: string[], brief?: string}} Shown `within`: the opened groups around it; `brief`: the first words of `sub` */
 /** @typedef {{key: string, label: string, items: import("./model.js").Item[], parts: Branch[]}} Branch */
 
 /**
@@ -48,7 +48,7 @@ export function collapse(model, opened, by, most) {
 function groupOf(/** @type {Branch} */ branch, /** @type {string} */ kind, /** @type {string} */ name) {
   const rate = branch.items.reduce((sum, one) => sum + (one.rate ?? 0), 0);
   return /** @type {Shown} */ ({
-    key: branch.key, kind, name, sub: counted(branch.items.length, kind === "missing" ? "thing" : kind), members: branch.items, rate,
+    key: branch.key, kind, name, sub: counted(branch.items.length, kind === "missing" ? "thing" : kind), brief: counted(branch.items.length, kind === "missing" ? "thing" : kind), members: branch.items, rate,
     mediated: branch.items.every((one) => one.mediated), lost: branch.items.every((one) => one.lost),
   });
 }
@@ -119,7 +119,7 @@ function grow(/** @type {Placed[]} */ items, /** @type {string} */ kind, /** @ty
 
 /** Merge neighbours in alphabetical order. @returns {Branch[]} */
 function ranges(/** @type {Branch[]} */ parts, /** @type {string} */ key) {
-  const size = Math.max(RANGE, Math.ceil(parts.length / RANGE));
+  const size = Math.ceil(parts.length / Math.ceil(parts.length / RANGE));
   const found = [];
   for (let at = 0; at < parts.length; at += size) {
     const some = parts.slice(at, at + size);

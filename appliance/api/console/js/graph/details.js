@@ -15,7 +15,7 @@ const MOST = 60;
 
 /** @param {{item: any, line: any, denials: any[], shown: {items: Map<string, any>, lines: Map<string, any>}, choose: (key: string | null) => void, open: (key: string) => void}} given `shown`: all that is drawn */
 export function Details({ item, line, denials, shown, choose, open }) {
-  const title = line ? "Denied" : item.members ? "Group" : { node: "Node", topic: "Topic", service: "Service", party: "Denied host", missing: "Denied, not in the graph", master: "RVMaster" }[/** @type {string} */ (item.kind)];
+  const title = line ? "Denied" : item.members ? "Group" : { node: "Node", topic: "Topic", service: "Service", party: item.owners ? "Uses other hosts' names" : "Denied host", missing: "Denied, not in the graph", master: "RVMaster" }[/** @type {string} */ (item.kind)];
   return html`<section class="panel details" aria-labelledby="details"><div class="panel-head"><h2 id="details">${title}</h2>
       <span class="end"><button class="button plain small" onClick=${() => choose(null)} aria-label="Close the details"><${Icon} name="close" size=${16} /></button></span></div>
     <div class="panel-body stack">${line ? html`<${Attempt} records=${line.denials} />` : item.members ? html`<${Group} item=${item} shown=${shown} choose=${choose} open=${open} />`
@@ -24,6 +24,7 @@ export function Details({ item, line, denials, shown, choose, open }) {
 
 function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choose) {
   const row = item.row;
+  if (item.owners) return html`<p>This host was denied ${counted(item.denied, "time")} under names of nodes of <${Given} value=${item.owners.join(", ")} most=${200} mono />.</p>`;
   if (!row) return html`<p class="muted"><${Given} value=${item.sub} /></p>`;
   if (item.kind === "node")
     return html`<dl class="facts"><dt>Host</dt><dd><${Given} value=${row.host} mono /></dd><dt>State</dt><dd><${Badge} word=${row.state} /></dd></dl>
@@ -72,10 +73,11 @@ function Attempt(/** @type {{records: any[]}} */ { records }) {
 }
 
 function Refusals(/** @type {{item: any, denials: any[]}} */ { item, denials }) {
-  const [caller, host] = item.kind === "party" ? [item.name, item.sub] : [item.name, null];
-  const own = denials.filter((one) => (item.kind === "node" || item.kind === "party" ? one.caller_id === caller && (host === null || one.host === host) : one.resource === item.name)).slice(0, 8);
+  const own = denials.filter((one) =>
+    item.kind === "party" ? one.host === item.host && (item.owners !== undefined || (one.caller_id ?? null) === (item.caller ?? null))
+    : item.kind === "node" ? one.caller_id === item.name && one.host === item.host : one.resource === item.name).slice(0, 8);
   if (!own.length) return null;
-  return html`<div><h3>Recently denied</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />
+  return html`<div><h3>Recently denied</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />${item.owners && html` <span class="muted">as</span> <${Given} value=${one.caller_id} mono />`}
     <div class="small"><${Rule} rule=${one.rule} revision=${one.revision} /></div></li>`)}</ul></div>`;
 }
 

@@ -2,17 +2,21 @@
 
 import { html, useEffect, useRef, useState } from "../html.js";
 import { Icon } from "../parts/icon.js";
-import { rate } from "../numbers.js";
+import { counted, rate } from "../numbers.js";
 import { plain } from "../words.js";
 import { extent } from "./arrange.js";
 
 const MARGIN = 24;
 const CLOSEST = 2.5;
 const FARTHEST = 0.27; // at this zoom a box is as high as its name, which is never drawn smaller than readable
+const NARROW_LEAST = 0.5; // a telephone shows names rather than everything
 const BOW = 46;
 const NARROW_BOW = 10;
-const NAME = 11.5; // font size of a name on the screen, as in graph.css
+const NAME = 11.5; // font size of a name on the screen
+const SUB = 10.5; // of the line below it
 const GLYPH = 0.61; // width of a letter in the name's typeface, as a fraction of the font size
+const SUB_GLYPH = 0.54;
+const TWO_LINES = 30; // least height of a box with two lines on the screen
 
 /** @typedef {{x: number, y: number, zoom: number}} Look the corner of what is seen, and how large it is drawn */
 
@@ -24,7 +28,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged, narrow 
   const own = useRef(false); // whether the user chose the view box; until then everything is shown
   const fit = () => {
     own.current = false;
-    if (box.current) setLook(fitted(all, box.current));
+    if (box.current) setLook(fitted(all, box.current, narrow));
   };
   const newest = useRef(fit);
   newest.current = fit;
@@ -80,13 +84,14 @@ function Tip(/** @type {{id: string}} */ { id }) {
 function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
   if (!spot) return null;
   const { x, y, w, h } = spot;
-  // Zoomed out, a name keeps its size on the screen and loses its middle; the line below it is hidden first.
-  const size = NAME * Math.max(1, 1 / zoom);
+  // Zoomed out, both lines keep their size on the screen; the second is shortened, and then hidden.
+  const least = Math.max(1, 1 / zoom);
+  const [size, small] = [NAME * least, SUB * least];
   const left = item.mediated ? 25 : 14;
-  const name = shortened(item.name, Math.floor((w - left - 8) / (size * GLYPH)));
-  const two = zoom > 0.85;
-  const sub = `${shortened(item.sub, item.rate ? 20 : 28)}${item.rate ? ` · ${rate(item.rate)}/s` : ""}`;
-  const state = [item.kind, item.members ? "many" : "", item.mediated ? "mediated" : "", item.lost ? "lost" : "", chosen ? "chosen" : "", faint ? "faint" : ""].filter(Boolean).join(" ");
+  const name = label(item.name, Math.floor((w - left - 8) / (size * GLYPH)));
+  const two = h * zoom >= TWO_LINES;
+  const sub = second(item, name, Math.floor((w - left - 6) / (small * SUB_GLYPH)));
+  const state = [item.kind, item.members ? "many" : "", item.owners ? "impostor" : "", item.mediated ? "mediated" : "", item.lost ? "lost" : "", chosen ? "chosen" : "", faint ? "faint" : ""].filter(Boolean).join(" ");
   const said = `${item.members ? "group " : ""}${item.kind} ${plain(item.name, 120)}, ${plain(item.sub, 60)}${item.mediated ? ", mediated" : ""}${item.rate ? `, ${rate(item.rate)} messages/s` : ""}${item.lost ? ", lost" : ""}`;
   const pick = (/** @type {any} */ event) => {
     if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
@@ -99,8 +104,8 @@ function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
     ${item.members && html`<rect class="behind" x="4" y="4" width=${w} height=${h} rx=${round} />`}
     <rect class="shape" width=${w} height=${h} rx=${round} />
     ${item.mediated && html`<circle class="mark" cx=${14} cy=${h / 2} r="3.500" />`}
-    <text class="box-name" x=${left} y=${two ? h / 2 - 2 : h / 2 + size * 0.35} font-size=${size}>${name}</text>
-    ${two && html`<text class="box-sub" x=${left} y=${h / 2 + 12}>${sub}</text>`}
+    <text class="box-name" x=${left} y=${two ? h / 2 - size * 0.15 : h / 2 + size * 0.35} font-size=${size}>${name}</text>
+    ${two && html`<text class="box-sub" x=${left} y=${h / 2 + small * 1.12} font-size=${small}>${sub}</text>`}
     <title>${said}</title></g>`;
 }
 
@@ -114,7 +119,8 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
   const shape = html`<path class=${`line ${kind}${line.kind === "flow" && line.rate > 0 ? " flowing" : ""}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
   if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && (line.from !== chosen || !chosen.startsWith("t/")) && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
-  const said = `denied: ${plain(line.from.slice(1), 60)} to ${plain(line.to.slice(1), 60)}, ${line.denials.length} times`;
+  const times = line.denials.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + (one.equality?.times ?? 1), 0);
+  const said = `denied: ${plain(line.from.replace(/^x?@?|^./, ""), 60)} to ${plain(line.to.slice(1), 60)}, ${counted(times, "time")}`;
   const pick = (/** @type {any} */ event) => {
     if (event.type === "keydown" && event.key !== "Enter" && event.key !== " ") return;
     event.preventDefault();
@@ -125,8 +131,8 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
     <path class="reach" d=${path} />${shape}<title>${said}</title></g>`;
 }
 
-/** A line from the right side of one box to the left side of the other. A line that goes back passes below all boxes on
- * its way; the longer it is, the further out it runs, beside the other lines. */
+/** A line from the right side of one box to the left side of the other. A line that goes back, or to
+ * a lower band, passes below all boxes of its band on its way; the longer it is, the further out it runs, beside the other lines. */
 function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<string, any>} */ spots) {
   const x1 = from.x + from.w / 2;
   const x2 = to.x - to.w / 2 - 2;
@@ -134,10 +140,11 @@ function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<st
     const bend = Math.max(24, (x2 - x1) / 2);
     return `M${x1} ${from.y}C${x1 + bend} ${from.y} ${x2 - bend} ${to.y} ${x2} ${to.y}`;
   }
-  const passed = [...spots.values()].filter((spot) => spot.x + spot.w / 2 > x2 && spot.x - spot.w / 2 < x1);
+  const passed = [...spots.values()].filter((spot) => !spot.alone && spot.band === from.band && spot.x + spot.w / 2 > x2 && spot.x - spot.w / 2 < x1);
   const low = Math.max(...passed.map((spot) => spot.y + spot.h / 2)) + 14 + Math.abs(x1 - x2) * 0.03;
   const aside = Math.min(24, 4 + Math.abs(x1 - x2) * 0.01);
-  return `M${x1} ${from.y}h${aside}q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - aside}q-16 0 -16 -16V${to.y + 16}q0 -16 16 -16h${aside}`;
+  const way = to.y > low ? `16V${to.y - 16}q0 16 16 16` : `-16V${to.y + 16}q0 -16 16 -16`;
+  return `M${x1} ${from.y}h${aside}q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - aside}q-16 0 -16 ${way}h${aside}`;
 }
 
 /** A line in the layout with two columns: between the inner sides of two boxes, through the space between the columns. */
@@ -146,12 +153,28 @@ function between(/** @type {any} */ from, /** @type {any} */ to) {
   return `M${inner(from, 0)} ${from.y}C${inner(from, BOW)} ${from.y} ${inner(to, BOW)} ${to.y} ${inner(to, 2)} ${to.y}`;
 }
 
-function shortened(/** @type {string} */ text, /** @type {number} */ most) {
+/** A name in at most so many letters: without its first namespaces, or without its end. @param {string} text @param {number} most */
+export function label(text, most) {
   const said = plain(text, 400);
-  const points = [...said];
-  if (points.length <= most) return said;
-  const head = most > 14 ? 5 : 0; // for short texts only the end is kept, because it says more
-  return `${points.slice(0, head).join("")}…${points.slice(-(most - head - 1)).join("")}`;
+  const words = said.split("/");
+  for (let from = 1; from < words.length && !said.includes(" … "); from += 1) {
+    const part = from === 1 ? said : words.slice(from).join("/");
+    if ([...part].length <= most) return part;
+  }
+  const last = said.includes(" … ") ? said : words[words.length - 1];
+  return [...last].length <= most ? last : `${[...last].slice(0, Math.max(1, most - 1)).join("")}…`;
+}
+
+/** The second line: what `label` left out, what it is, and its rate, as far as there is room. @param {any} item @param {string} name @param {number} most */
+function second(item, name, most) {
+  const said = plain(item.name, 400);
+  const space = !item.members && name !== said && said.endsWith(`/${name}`) ? said.slice(0, -name.length - 1) : "";
+  const flow = item.rate ? `${rate(item.rate)}/s` : "";
+  const sub = plain(item.sub, 200);
+  const messages = flow && `${flow.slice(0, -2)} messages/s`;
+  const forms = [[space, sub, messages], [item.brief ?? space, messages], [space, sub, flow], [item.brief ?? space, flow], [sub, flow], [item.brief ?? sub], [flow]];
+  const fitting = forms.map((form) => form.filter(Boolean).join(" · ")).find((form) => form && [...form].length <= most);
+  return fitting ?? `${[...(space || sub)].slice(0, Math.max(1, most - 1)).join("")}…`;
 }
 
 function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} */ lines) {
@@ -170,9 +193,10 @@ function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { 
   return { x: x - bow, y, w: w + 2 * bow, h: h + bow };
 }
 
-function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {
+function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box, /** @type {boolean} */ narrow) {
   const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
-  const readable = Math.max(zoom, FARTHEST); // the user pans to see the rest
+  const least = narrow ? Math.min(NARROW_LEAST, (box.clientWidth - MARGIN) / all.w) : FARTHEST;
+  const readable = Math.max(zoom, least); // the user pans to see the rest
   const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
   return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
 }

@@ -2,18 +2,21 @@
  * The graph's items and lines, from `/v1/graph` and the denials of the audit log.
  *
  * A key is a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`). The key of a denied caller that is not in the
- * graph is `x`, the caller's name, and its host. The model has no layout.
+ * graph is `x`, the caller's name, and its host. A host that was denied under the name of another host's node is one
+ * item with the host's address, and its lines lead to those nodes. The model has no layout.
  */
 
 /**
  * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
- *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any}} Item
+ *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, caller?: string | null, denied?: number, owners?: string[]}} Item
+ *   of a denied host: the `caller` that it gave (none for a host with `owners`: the hosts whose nodes' names it used), and how often it was `denied`
  * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
  *   denials?: any[], would?: boolean}} Line
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
  */
 
 import { letterOf } from "../categories.js";
+import { counted } from "../numbers.js";
 
 export const MASTER = "m/";
 const QUIET = new Set(["/rosout", "/rosout_agg", "/clock", "/statistics", "/diagnostics"]);
@@ -81,11 +84,14 @@ function serviceOf(/** @type {Model} */ model, /** @type {any} */ service) {
 function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt) {
   const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
-  const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
-  const to = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
+  const owner = known && known.host !== undefined && known.host !== host ? known.host : null;
+  const from = owner !== null ? `x@${host}` : known && known.host === host ? known.key : `x${caller ?? ""}@${host}`;
+  const target = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
+  const to = owner !== null && !model.items.has(target) && known ? known.key : target;
   // If the host now has the resource, the denial was brief (a late call) and not an attempt to show.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
-  if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });
+  const times = attempt.records.reduce((sum, one) => sum + (one.equality?.times ?? 1), 0);
+  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, times });
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
@@ -94,6 +100,18 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   const line = { key, from, to }; // always towards the resource, regardless of the direction of messages
   const would = attempt.records.every((one) => one.decision === "would deny");
   model.lines.set(key, { ...line, kind: "denied", mediated: false, rate: 0, denials: attempt.records, would });
+}
+
+/** Add a denied host, or one more of its attempts. */
+function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, times: number}} */ { host, caller, owner, times }) {
+  const before = model.items.get(key);
+  const denied = (before?.denied ?? 0) + times;
+  if (owner === null) {
+    put(model, { key, kind: "party", name: caller || "no name", sub: `${host} · ${counted(denied, "denial")}`, host, caller, denied });
+    return;
+  }
+  const owners = [...new Set([...(before?.owners ?? []), owner])];
+  put(model, { key, kind: "party", name: host || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, host, denied, owners });
 }
 
 function put(/** @type {Model} */ model, /** @type {Item} */ item) {

@@ -15,6 +15,8 @@ import { TopicList } from "./list.js";
 import { modelOf } from "./model.js";
 
 const NARROW = matchMedia("(max-width: 620px)"); // as in graph.css
+/** The frame of the drawing, about as large as graph.css makes it. @returns {import("./arrange.js").Frame} */
+const FRAME = () => (NARROW.matches ? { narrow: true, w: innerWidth - 36, h: innerHeight * 0.62 } : { narrow: false, w: innerWidth - (innerWidth > 860 ? 280 : 36), h: Math.max(420, innerHeight - 236) });
 const MOST = 42; // items of a kind to draw without groups
 const RECENT_HOURS = 1;
 
@@ -35,8 +37,10 @@ export function GraphView() {
   }, []);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
-  const shown = useMemo(() => (model && layout.loaded ? collapse(model, opened, by, MOST) : null), [model, opened, by, layout]);
-  const { spots, arranged, narrow } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`, NARROW.matches);
+  const ready = model !== null && layout.loaded && denials !== null;
+  const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MOST) : null), [model, opened, by, ready]);
+  const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST) : shown), [shown]);
+  const { spots, arranged, frame } = useSpots(shown, closed, round, `${search}|${JSON.stringify(wanted)}|${by}`, FRAME());
   const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
@@ -71,7 +75,7 @@ export function GraphView() {
             ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Compute the layout again">Arrange</button>`}</span></div>
         ${form === "list" ? html`<${TopicList} topics=${topics} denials=${recent} choose=${choose} chosen=${chosen} />`
           : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
-          : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} narrow=${narrow} /><${Legend} />`}
+          : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} narrow=${frame.narrow} /><${Legend} />`}
       </section>
       ${(item || line) && html`<${Details} key=${chosen} item=${item} line=${line} shown=${shown} denials=${recent} choose=${choose} open=${open} />`}
     </div>`;
@@ -85,22 +89,24 @@ function Legend() {
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-topic" x="1" y="1" width="28" height="14" rx="7" /></svg>topic or service</li>
     <li><svg width="34" height="16" aria-hidden="true"><path class="line mediated" d="M1 8H33" /></svg>through the relay</li>
     <li><svg width="34" height="16" aria-hidden="true"><path class="line flow" d="M1 8H33" /></svg>direct</li>
-    <li><svg width="34" height="16" aria-hidden="true"><path class="line denied" d="M1 8H33" /></svg>denied in the last hour</li>
+    <li><svg width="34" height="16" aria-hidden="true"><path class="line denied" d="M1 8H33" /></svg>denied, last hour</li>
+    <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-party" x="1" y="1" width="28" height="14" rx="4" /></svg>denied host</li>
     <li><svg width="34" height="16" aria-hidden="true"><path class="line would" d="M1 8H33" /></svg>would be denied</li></ul>`;
 }
 
-/** Places that stay while the graph changes; a search, a filter or an opened group computes a new layout. */
-function useSpots(/** @type {any} */ shown, /** @type {number} */ round, /** @type {string} */ cause, /** @type {boolean} */ narrow) {
-  const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0, narrow });
+/** Places that stay while the graph changes; a search, a filter or *Arrange* computes a new layout, in which groups open in place. */
+function useSpots(/** @type {any} */ shown, /** @type {any} */ closed, /** @type {number} */ round, /** @type {string} */ cause, /** @type {import("./arrange.js").Frame} */ frame) {
+  const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0, frame });
   return useMemo(() => {
     if (!shown) return kept.current;
-    const anew = kept.current.cause !== cause || kept.current.round !== round || kept.current.narrow !== narrow;
+    const anew = kept.current.cause !== cause || kept.current.round !== round || kept.current.frame.narrow !== frame.narrow;
     const before = kept.current.spots;
-    const spots = anew ? afresh(shown.items, shown.lines, narrow) : arrange(shown.items, shown.lines, before, narrow);
+    const start = anew ? afresh(closed.items, closed.lines, frame) : before;
+    const spots = anew && closed === shown ? start : arrange(shown.items, shown.lines, start, frame);
     const moved = anew || [...before].some(([key, spot]) => spots.has(key) && spots.get(key) !== spot);
-    kept.current = { spots, cause, round, narrow, arranged: kept.current.arranged + (moved || !before.size ? 1 : 0) };
+    kept.current = { spots, cause, round, frame, arranged: kept.current.arranged + (moved || !before.size ? 1 : 0) };
     return kept.current;
-  }, [shown, round, cause, narrow]);
+  }, [shown, round, cause, frame.narrow]);
 }
 
 function recentOf(/** @type {any[]} */ denials) {
