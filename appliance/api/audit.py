@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import json
 import pathlib
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -25,17 +25,17 @@ from appliance.api.problems import ProblemError
 from appliance.api.route_roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
+from appliance.api.shown_records import PAGE, RECORD_REFERENCE, page_of, readable, readable_by
 from appliance.api.streams import StreamResponse, Streams, in_thread, peer_of, turn
-from appliance.api.unrecorded import unrecorded
 from appliance.audit.chain_findings import Verification
 from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
+from appliance.audit.equality import equality_of
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
-from appliance.audit.record_format import LogEntry, as_json, as_object, without_contents
-from appliance.audit.schema import json_schema
-from appliance.audit.search import Follower, RecordInContext, export, search, show
+from appliance.audit.record_format import as_object
+from appliance.audit.search import Follower, RecordInContext, export, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verification import verify
 from appliance.channel.admin import PolicyWanted
@@ -51,31 +51,12 @@ _STREAM_PAGE = 500
 _LARGEST_PAGE = 1000
 _MOST_NEIGHBOURS = 1000  # the same limit as on the command line
 
-RECORD = {key: value for key, value in json_schema().items() if key != "$schema"}
-_RECORD_REF = {"$ref": "#/components/schemas/AuditRecord"}
-_PAGE = {
-    "type": "object",
-    "properties": {
-        "records": {"type": "array", "items": _RECORD_REF},
-        "cursor": {
-            "type": ["string", "null"],
-            "description": "cursor of the next page; null: this is the last page",
-        },
-        "notes": {
-            "type": "array",
-            "items": {"type": "string"},
-            "description": "only if there are any: an event or category that this version does not record",
-        },
-    },
-    "required": ["records", "cursor"],
-    "additionalProperties": False,
-}
 _ONE = {
     "type": "object",
     "properties": {
-        "record": _RECORD_REF,
-        "before": {"type": "array", "items": _RECORD_REF},
-        "after": {"type": "array", "items": _RECORD_REF},
+        "record": RECORD_REFERENCE,
+        "before": {"type": "array", "items": RECORD_REFERENCE},
+        "after": {"type": "array", "items": RECORD_REFERENCE},
     },
     "required": ["record", "before", "after"],
     "additionalProperties": False,
@@ -137,6 +118,7 @@ def _wanted(
 
 Wanted = Annotated[Filter, Depends(_wanted)]
 Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
+WithEquality = Annotated[bool, Query(description="1: also what makes equal records one row")]
 OneRecord = Annotated[
     str,
     Path(
@@ -199,17 +181,22 @@ def routes(services: Services) -> Routes:
 
 
 def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
-    @router.get("", responses=_json(_PAGE))
+    @router.get("", responses=_json(PAGE))
     async def search_audit(
         bearer: Viewer,
         wanted: Wanted,
+        *,
         cursor: Annotated[str | None, Query(max_length=18, description="cursor of the previous page")] = None,
         limit: Limit = 100,
         order: Annotated[Literal["newest", "oldest"], Query(description="order of the records")] = "newest",
+        equality: WithEquality = False,
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
+        newest = order == "newest"
         return JSONResponse(
-            await desk.read(page_of, desk.path, wanted, cursor, limit, bearer, newest_first=order == "newest")
+            await desk.read(
+                page_of, desk.path, wanted, cursor, limit, bearer, newest_first=newest, equality=equality
+            )
         )
 
     @router.get("/stream", responses=file("text/event-stream", "Events `record`."), response_class=Response)
@@ -217,10 +204,12 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         request: Request,
         bearer: Viewer,
         wanted: Wanted,
+        *,
         after: Annotated[
             int | None, Query(ge=0, le=10**18, description="start after the record with this sequence")
         ] = None,
         last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", pattern="^[0-9]{1,18}$")] = None,
+        equality: WithEquality = False,
     ) -> Response:
         """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
 
@@ -229,7 +218,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(Follower, desk.path, wanted, start)
         give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
-        following = _follow(services, desk, follower, bearer, wanted.text)
+        following = _follow(services, desk, follower, bearer, wanted.text, equality=equality)
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
 
@@ -276,8 +265,11 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
         shown = await desk.record(record_id, neighbours)
-        around = {"before": _shown(shown.before, bearer), "after": _shown(shown.after, bearer)}
-        return JSONResponse({"record": _shown([shown.entry], bearer)[0], **around})
+        around = {"before": shown.before, "after": shown.after}
+        answer = {
+            name: [as_object(readable_by(one, bearer)) for one in some] for name, some in around.items()
+        }
+        return JSONResponse({"record": as_object(readable_by(shown.entry, bearer)), **answer})
 
     @router.get("/{record_id}/why", responses=_UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
@@ -286,7 +278,7 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         policy in force that would allow it.
         """
         shown = await desk.record(record_id, 0)
-        record = _readable(shown.entry, bearer).record
+        record = readable_by(shown.entry, bearer).record
         known = None
         if asks_policy(record):
             known = await ask(services.control, PolicyWanted(), bearer)
@@ -306,59 +298,34 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
 
 
 async def _follow(
-    services: Services, desk: LogReader, follower: Follower, bearer: Bearer, text: str | None
+    services: Services,
+    desk: LogReader,
+    follower: Follower,
+    bearer: Bearer,
+    text: str | None,
+    *,
+    equality: bool,
 ) -> AsyncIterator[ServerSentEvent]:
     while not services.stopping.is_set():
         if not services.doorkeeper.still_good(bearer):
             yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
-        for entry in entries:
-            for record in _shown([entry], bearer, text):
-                yield ServerSentEvent(event="record", id=str(entry.sequence), data=_as_line(record))
+        for entry in readable(entries, bearer, text):
+            more = {"equality": equality_of(entry.record)} if equality else {}
+            yield ServerSentEvent(
+                event="record", id=str(entry.sequence), data=_as_line(as_object(entry) | more)
+            )
         if not entries:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
 
 
-def page_of(
-    path: pathlib.Path, wanted: Filter, cursor: str | None, limit: int, bearer: Bearer, *, newest_first: bool
-) -> dict[str, Any]:
-    """Return a page of records that the bearer may read; the cursor reveals nothing about hidden records."""
-    shown: list[dict[str, Any]] = []
-    more: str | None = cursor
-    count = limit + 1
-    while len(shown) <= limit:
-        entries, more = search(path, wanted, more, count, newest_first=newest_first)
-        shown += _shown(entries, bearer, wanted.text)
-        if more is None:
-            break
-        count = _STREAM_PAGE  # many records may be hidden; large steps skip them faster
-    last = str(shown[limit - 1]["sequence"]) if len(shown) > limit else None
-    page: dict[str, Any] = {"records": shown[:limit], "cursor": last}
-    return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
-
-
-def _shown(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
-    """Return the records that the bearer may read, without records that match `text` only in their hidden parts."""
-    shown = []
-    for entry in entries:
-        readable = _readable(entry, bearer)
-        if readable is entry or text is None or text.casefold() in as_json(readable).casefold():
-            shown.append(as_object(readable))
-    return shown
-
-
-def _readable(entry: LogEntry, bearer: Bearer) -> LogEntry:
-    """Return the record without the parts that the bearer may not read."""
-    return entry if reads_contents(bearer) else without_contents(entry)
-
-
 def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[str]:
     if reads_contents(bearer):
         return _begun(evidence_line(*record) for record in evidence(path, wanted))
-    shown = (_shown([entry], bearer, wanted.text) for entry in export(path, wanted))
-    return _begun(_as_line(record) for records in shown for record in records)
+    shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
+    return _begun(_as_line(as_object(entry)) for entries in shown for entry in entries)
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:

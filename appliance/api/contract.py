@@ -8,9 +8,9 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from appliance.api import moments
-from appliance.api.audit import RECORD
 from appliance.api.problems import MEDIA_TYPE, Problem
 from appliance.api.routing import CONTRACT
+from appliance.api.shown_records import RECORD
 
 # Answers that the request gate may give to any call.
 _ALWAYS = {

@@ -10,10 +10,11 @@ Invariants:
 4. Each record is in exactly one row, so the rows' counts add up.
 """
 
+import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import LogEntry
@@ -86,19 +87,45 @@ def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
     rows: list[EqualRecords] = []
     open_rows: list[tuple[EqualKey, EqualRecords]] = []
     for entry in entries:
-        key, monitors = equal_key(entry.record), "monitor" in entry.record.detail
-        reach = open_rows if monitors else open_rows[-1:]
-        at = next((place for place, (other, _row) in enumerate(reach) if key.equals(other)), None)
+        key, reach = equal_key(entry.record), _reach(entry.record)
+        reachable = open_rows[-reach:]
+        at = next((place for place, (other, _row) in enumerate(reachable) if key.equals(other)), None)
         if at is None:
             row = EqualRecords(entry, entry, 1, times(entry.record), plain_reason(entry.record))
             rows.append(row)
-            open_rows = [*open_rows[-_BETWEEN:], (key, row)] if monitors else [(key, row)]
+            open_rows = [*open_rows, (key, row)][-reach:]
             continue
-        other, row = reach[at]
+        other, row = reachable[at]
         _add(row, entry)
         if not other.reason and key.reason:
-            open_rows[open_rows.index(reach[at])] = (key, row)
+            open_rows[open_rows.index(reachable[at])] = (key, row)
     return rows
+
+
+def equality_of(record: AuditRecord) -> dict[str, Any]:
+    """Return all that a client needs to make the rows of `grouped` itself, from pages and streams.
+
+    Two records are equal if their `key` is equal, and their `reason` too unless one is empty. A record joins one of the
+    last `reach` rows, and `times` and `value` are its part of the row's count and value.
+    """
+    key = equal_key(record)
+    value = plain_reason(record)
+    return {
+        "key": _hash(repr(key.fields)),
+        "reason": key.reason and _hash(key.reason),
+        "reach": _reach(record),
+        "times": times(record),
+        "value": value,
+    }
+
+
+def _hash(text: str) -> str:
+    return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=12).hexdigest()
+
+
+def _reach(record: AuditRecord) -> int:
+    """Return how many of the last rows a record can join."""
+    return _BETWEEN + 1 if "monitor" in record.detail else 1
 
 
 def _add(row: EqualRecords, entry: LogEntry) -> None:

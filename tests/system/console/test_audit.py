@@ -1,6 +1,7 @@
 """Test the view Audit: find a record and the line that decided it; follow, verify and export the log."""
 
 import json
+import random
 import re
 import zipfile
 from collections.abc import Callable
@@ -8,6 +9,9 @@ from typing import Any
 
 from playwright.sync_api import Route, expect
 
+from appliance.audit.equality import equality_of, grouped
+from appliance.audit.record import AuditRecord, RuleReference, Severity
+from appliance.audit.record_format import LogEntry, as_object
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 
@@ -283,3 +287,98 @@ def test_grant_this_does_not_take_the_place_of_a_text_that_is_written(
     expect(page.get_by_text("unloaded changes")).to_be_visible()
     page.get_by_role("button", name="Replace that text").click()
     expect(reader.editor()).to_contain_text("/guarded = 10.9.9.9 robot")
+
+
+def drop(number: int, reason: str = "", monitor: str = "limit", **detail: Any) -> LogEntry:
+    """Return the record of a message that a monitor dropped."""
+    said = reason or f"{monitor}.drive dropped it: speed 0.{number}"
+    record = AuditRecord(
+        id=f"{number:020x}", time=number * 10**9, event="message dropped", severity=Severity.WARNING, reason=said,
+        host="10.0.0.1", caller_id="/teleop", category="monitor", resource="/cmd_vel",
+        detail={"monitor": monitor, **detail},
+    )  # fmt: skip
+    return LogEntry(number, record)
+
+
+def denial(number: int, resource: str) -> LogEntry:
+    """Return the record of a denied registration."""
+    record = AuditRecord(
+        id=f"{number:020x}", time=number * 10**9, event="decision", severity=Severity.NOTICE, decision="deny",
+        host="10.0.0.9", caller_id="/x", category="publish", resource=resource, reason="no rule",
+        rule=RuleReference("Publishers", "/arm", "robot.ini", 7),
+    )  # fmt: skip
+    return LogEntry(number, record)
+
+
+def page_of(entries: list[LogEntry]) -> dict[str, Any]:
+    """Return the answer of a search with equality, the newest record first."""
+    return {
+        "records": [as_object(entry) for entry in entries[::-1]],
+        "equality": [equality_of(entry.record) for entry in entries[::-1]],
+        "cursor": None,
+    }
+
+
+def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
+    """The console and `rosrv audit search` make the same rows of the same records, in either order."""
+    page = opened().go("audit")
+    rows = """async (page) => {
+      const { compared, grouped } = await import("/console/static/js/audit/rows.js");
+      return grouped(compared(page)).map((row) =>
+        [row.first.sequence, row.last.sequence, row.records.length, row.count, row.value]);
+    }"""
+    chance = random.Random(5)  # noqa: S311  the same records in every run
+    for _round in range(20):
+        entries = []
+        for number in range(1, 60):
+            monitor = chance.choice(["limit", "zone"])
+            counted = drop(number, "3 more in the same second", monitor, count=3)
+            valued = drop(number, f"3 more in the same second: {monitor} {number}", monitor, count=3)
+            kinds = [
+                drop(number, "", monitor),
+                counted,
+                valued,
+                denial(number, chance.choice(["/arm", "/leg"])),
+            ]
+            entries.append(chance.choice(kinds))
+        for some in (entries, entries[::-1]):
+            expected = [
+                [row.first.sequence, row.last.sequence, row.records, row.count, row.value]
+                for row in grouped(some)
+            ]
+            assert page.evaluate(rows, page_of(some[::-1])) == expected
+
+
+def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:
+    """A row has the count, the times, the first record and the last value; its button, also by keyboard, shows each."""
+    drops = [drop(2), drop(3, "7 more in the same second", count=7), drop(4)]
+    reader = opened()
+    reader.page.route(
+        re.compile(r"/v1/audit\?"), lambda route: route.fulfill(json=page_of([denial(1, "/arm"), *drops]))
+    )
+    page = reader.go("audit")
+    rows = page.locator("tbody tr")
+    expect(rows).to_have_count(2)
+    expect(page.locator(".head-sub")).to_have_text("4 records shown in 2 rows")
+    for text in ("limit", "9 times", "since", "/cmd_vel", "limit.drive dropped it: speed 0.4"):
+        expect(rows.first).to_contain_text(text)
+    expect(rows.first.get_by_role("link")).to_have_attribute("href", re.compile(f"{2:020x}$"))
+    more = rows.first.get_by_role("button", name="9 times")
+    more.press("Enter")
+    expect(more).to_have_attribute("aria-expanded", "true")
+    expect(rows).to_have_count(5)
+    expect(page.locator("tr.part").last).to_contain_text("speed 0.2")
+    assert reader.axe() == []
+    page.keyboard.press("Escape")
+    more.press("Enter")
+    expect(rows).to_have_count(2)
+    page.keyboard.press("j")
+    page.keyboard.press("j")
+    expect(page).to_have_url(re.compile(f"/{1:020x}"))
+    page = reader.go("now")
+    entry = page.get_by_role("region", name="Recent actions of monitors").get_by_role("listitem").first
+    for text in ("limit", "9 times", "since", "/cmd_vel", "speed 0.4"):
+        expect(entry).to_contain_text(text)
+    entry.get_by_role("button", name="9 times").press("Enter")
+    expect(entry.get_by_role("listitem")).to_have_count(3)
+    assert reader.axe() == []

@@ -1,7 +1,7 @@
 """Tests of `appliance.api.audit`."""
 
-from appliance.api.audit import page_of
 from appliance.api.monitor_routes import records_of
+from appliance.api.shown_records import page_of
 from appliance.audit.query import Filter
 from tests.support.audit import decision, settle
 from tests.unit.api.test_streams import bearer
@@ -36,6 +36,28 @@ def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> N
     assert page_of(log.path, hidden_only, None, 1, bearer("v"), newest_first=True) == empty
     reader = bearer("o", "operator")
     assert len(page_of(log.path, hidden_only, None, 1, reader, newest_first=True)["records"]) == 1
+
+
+def test_equality_is_of_the_parts_that_the_client_may_read(make_log: MakeLog) -> None:
+    """It comes only on request, one for each record, and reveals nothing about withheld contents."""
+    log = make_log()
+    for text in ("the password is 1", "the password is 2"):
+        detail = {"monitor": "m", "before_fields": {"data": text}, "why": text}
+        log.record(
+            decision(log, event="message dropped", category="monitor", reason="dropped", detail=detail)
+        )
+    settle(log)
+    wanted = Filter(event="message dropped")
+    plain = page_of(log.path, wanted, None, 9, bearer("v"), newest_first=True)
+    assert "equality" not in plain
+    for reader in (bearer("v"), bearer("o", "operator")):
+        page = page_of(log.path, wanted, None, 9, reader, newest_first=True, equality=True)
+        first, second = page["equality"]
+        assert first == second
+        assert (first["times"], first["value"]) == (1, "dropped")
+    assert page_of(log.path, wanted, None, 1, bearer("v"), newest_first=True, equality=True)["equality"] == [
+        first
+    ]
 
 
 def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeLog) -> None:

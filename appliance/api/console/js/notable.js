@@ -3,6 +3,7 @@
  * One stream serves all views; it keeps the last records, newest first.
  */
 
+import { compared } from "./audit/rows.js";
 import { follow } from "./events.js";
 import { get } from "./rest.js";
 import { createStore } from "./store.js";
@@ -26,14 +27,14 @@ export async function startNotable() {
   const mine = (generation += 1);
   running = { stop: () => {}, retry: () => {} };
   const past = (/** @type {Record<string, any>} */ query) =>
-    get("/v1/audit", { since: NEAR, limit: 100, ...query }).then(({ records }) => records, () => []);
+    get("/v1/audit", { since: NEAR, limit: 100, equality: 1, ...query }).then(compared, () => []);
   const [denials, doings, incidents] = await Promise.all([
     past({ decision: ["deny", "would deny"] }), past({ category: "monitor", severity: "notice" }).then((records) => records.filter(isDoing)), past({ severity: "alarm" }),
   ]);
   if (mine !== generation) return;
   notable.set({ denials, doings, incidents });
   const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
-  running = follow(() => `/v1/audit/stream?severity=notice&since=${NEAR}`, heard, () => {}, String(last));
+  running = follow(() => `/v1/audit/stream?severity=notice&equality=1&since=${NEAR}`, heard, () => {}, String(last));
 }
 
 export function stopNotable() {

@@ -3,6 +3,7 @@
 import { useCallback, useEffect, useRef, useState } from "../html.js";
 import { follow } from "../events.js";
 import { get, queryText } from "../rest.js";
+import { compared } from "./rows.js";
 
 const PAGE = 100;
 const KEPT = 2000; // records kept while following; pages that the user fetched come on top
@@ -32,8 +33,9 @@ export function useRecords(filter, following) {
     setState((state) => ({ ...state, loading: true }));
     const timer = setTimeout(async () => {
       try {
-        const { records, cursor, notes = [] } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE }, controller.signal);
-        setState({ records, cursor, notes, most: KEPT, error: null, loading: false });
+        const page = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, equality: 1 }, controller.signal);
+        const { cursor, notes = [] } = page;
+        setState({ records: compared(page), cursor, notes, most: KEPT, error: null, loading: false });
       } catch (error) {
         if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
       }
@@ -50,7 +52,7 @@ export function useRecords(filter, following) {
     if (!following || !ready) return undefined;
     const { until, ...rest } = askedOf(filter);
     const newest = state.records?.[0]?.sequence ?? 0; // the stream starts there, so no record since the list is missed
-    const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
+    const running = follow(() => `/v1/audit/stream${queryText({ ...rest, equality: 1 })}`, (event, record) => {
       if (event === "record") setState((state) => ({ ...state, ...added(state, record) }));
     }, setStanding, String(newest));
     return () => {
@@ -62,8 +64,9 @@ export function useRecords(filter, following) {
   const older = useCallback(async () => {
     if (!state.cursor) return;
     try {
-      const { records, cursor } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, cursor: state.cursor });
-      setState((state) => ({ ...state, records: [...(state.records ?? []), ...records], cursor, most: state.most + records.length, error: null }));
+      const page = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, cursor: state.cursor, equality: 1 });
+      const more = compared(page);
+      setState((state) => ({ ...state, records: [...(state.records ?? []), ...more], cursor: page.cursor, most: state.most + more.length, error: null }));
     } catch (error) {
       setState((state) => ({ ...state, error }));
     }

@@ -1,4 +1,4 @@
-/** Records as rows: time, outcome, host, resource, reason. */
+/** Records as rows: time, outcome, host, resource, reason. Equal consecutive records are one row, which opens in place. */
 
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
@@ -6,14 +6,24 @@ import { Outcome } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
+import { Count, Range } from "./rows.js";
 
-/** @param {{records: any[], chosen: string, filter: Record<string, string>}} given */
-export function RecordTable({ records, chosen, filter }) {
+/** @param {{rows: import("./rows.js").Row[], opened: (row: import("./rows.js").Row) => boolean, toggle: (row: import("./rows.js").Row) => void, chosen: string, filter: Record<string, string>}} given */
+export function RecordTable({ rows, opened, toggle, chosen, filter }) {
+  const is = (/** @type {any} */ one) => one.id === chosen || String(one.sequence) === chosen;
   return html`<div class="table-wrap"><table class="table records" aria-label="Records"><thead><tr><th>Time</th><th>Outcome</th><th>Event</th><th>Who</th><th>Host</th><th>Resource</th><th class="wide-only">Rule</th><th class="wide-only">Reason</th></tr></thead>
-    <tbody>${records.map((one) => html`<${Row} key=${one.id} record=${one} chosen=${one.id === chosen || String(one.sequence) === chosen} filter=${filter} />`)}</tbody></table></div>`;
+    <tbody>${rows.map((row) => {
+      const open = opened(row);
+      const time = html`<${Range} row=${row} />`;
+      const count = html`<${Count} row=${row} open=${open} toggle=${() => toggle(row)} />`;
+      return [
+        html`<${Row} key=${row.first.id} record=${row.first} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
+        open && row.records.map((one) => html`<${Row} key=${`each ${one.id}`} record=${one} time=${html`<${Moment} at=${one.time} />`} reason=${one.reason} part chosen=${is(one)} filter=${filter} />`),
+      ];
+    })}</tbody></table></div>`;
 }
 
-function Row(/** @type {{record: any, chosen: boolean, filter: Record<string, string>}} */ { record, chosen, filter }) {
+function Row(/** @type {{record: any, time: any, count?: any, reason: string, part?: boolean, chosen: boolean, filter: Record<string, string>}} */ { record, time, count, reason, part = false, chosen, filter }) {
   const open = () => go(auditPath(filter, record.id));
   const link = (/** @type {MouseEvent} */ event) => {
     event.preventDefault();
@@ -21,13 +31,13 @@ function Row(/** @type {{record: any, chosen: boolean, filter: Record<string, st
     open();
   };
   const who = record.caller_id || record.detail.who;
-  return html`<tr class=${`pick${chosen ? " chosen" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
-    <td class="nowrap"><a href=${auditPath(filter, record.id)} onClick=${link}><${Moment} at=${record.time} /></a></td>
+  return html`<tr class=${`pick${chosen ? " chosen" : ""}${part ? " part" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
+    <td class="time"><a href=${auditPath(filter, record.id)} onClick=${link}>${time}</a></td>
     <td><${Outcome} record=${record} /></td>
-    <td><${Given} value=${record.event === "decision" ? record.category : record.event} most=${30} /></td>
+    <td><${Given} value=${record.event === "decision" ? record.category : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
     <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono /></td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
-    <td data-label="Reason" class=${`wide-only reason${record.reason ? "" : " bare"}`}><${Given} value=${record.reason} most=${110} /></td></tr>`;
+    <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${110} /></td></tr>`;
 }

@@ -1,6 +1,6 @@
 /** Audit: search and follow the log, open a record, verify and export the log. */
 
-import { html, useEffect, useRef, useState } from "../html.js";
+import { html, useEffect, useMemo, useRef, useState } from "../html.js";
 import { counted } from "../numbers.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
@@ -12,6 +12,7 @@ import { Presets } from "./presets.js";
 import { Evidence, Export, Verify } from "./proof.js";
 import { RecordPanel } from "./record.js";
 import { useRecords } from "./records.js";
+import { grouped } from "./rows.js";
 import { RecordTable } from "./table.js";
 import { Timeline } from "./timeline.js";
 
@@ -20,9 +21,16 @@ export function Audit() {
   const filter = filterOf(query);
   const [following, setFollowing] = useState(false);
   const { records, cursor, notes, error, loading, standing, older, again } = useRecords(filter, following);
-  useSteps(records, chosen, filter);
+  const rows = useMemo(() => grouped(records ?? []), [records]);
+  const [open, setOpen] = useState(/** @type {Set<string>} */ (new Set())); // ids of records whose row is open
+  const opened = (/** @type {import("./rows.js").Row} */ row) => row.records.length > 1 && row.records.some((one) => open.has(one.id));
+  const toggle = (/** @type {import("./rows.js").Row} */ row) => {
+    const ids = row.records.map((one) => one.id);
+    setOpen(opened(row) ? new Set([...open].filter((id) => !ids.includes(id))) : new Set([...open, ...ids]));
+  };
+  useSteps(rows.flatMap((row) => (opened(row) ? row.records.map((one) => [one]) : [[row.first, ...row.records]])), chosen, filter);
   useReturn(chosen);
-  return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${cursor ? ", more below" : ""}`}</span>
+  return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${rows.length < records.length ? ` in ${counted(rows.length, "row")}` : ""}${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">
         <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
         <${Verify} /><${Export} filter=${filter} /><${Evidence} filter=${filter} /></div></div>
@@ -33,20 +41,20 @@ export function Audit() {
       <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
         ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
         ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${notes.length ? notes.join(" · ") : Object.keys(filter).length ? "Remove a filter, or search further back." : "The log is empty."}</${Empty}>`
-          : html`<${Timeline} records=${records} chosen=${chosen} filter=${filter} /><${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
+          : html`<${Timeline} records=${records} chosen=${chosen} filter=${filter} /><${RecordTable} rows=${rows} opened=${opened} toggle=${toggle} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
       </section>
       ${chosen && html`<${RecordPanel} key=${chosen} id=${chosen} filter=${filter} />`}
     </div>`;
 }
 
-/** j and k move through the records, Escape closes the open one. */
-function useSteps(/** @type {any[] | null} */ records, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
+/** j and k move through what is listed, Escape closes the open record. @param {any[][]} listed the records that each place stands for */
+function useSteps(listed, /** @type {string} */ chosen, /** @type {Record<string, string>} */ filter) {
   useKeys((key) => {
     const step = { j: 1, k: -1 }[key];
     if (key === "Escape" && chosen) go(auditPath(filter));
-    else if (step && records?.length) {
-      const at = records.findIndex((one) => one.id === chosen || String(one.sequence) === chosen);
-      go(auditPath(filter, records[at < 0 ? 0 : Math.min(records.length - 1, Math.max(0, at + step))].id));
+    else if (step && listed.length) {
+      const at = listed.findIndex((some) => some.some((one) => one.id === chosen || String(one.sequence) === chosen));
+      go(auditPath(filter, listed[at < 0 ? 0 : Math.min(listed.length - 1, Math.max(0, at + step))][0].id));
     } else return false;
     return true;
   });

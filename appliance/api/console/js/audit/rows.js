@@ -1,0 +1,61 @@
+/**
+ * Equal records as one row. The appliance decides which records are equal and how far apart they may be
+ * (`appliance/audit/equality.py`); this only puts them into rows, as `grouped` does there.
+ */
+
+import { html } from "../html.js";
+import { Moment } from "../moments.js";
+import { counted } from "../numbers.js";
+import { Icon } from "../parts/icon.js";
+
+/** @typedef {{records: any[], first: any, last: any, count: number, value: string}} Row `records`: as listed; `value`: of the last record that has one */
+
+/** The records of a page, each with its equality. @param {{records: any[], equality: any[]}} page */
+export function compared({ records, equality }) {
+  return records.map((one, at) => ({ ...one, equality: equality[at] }));
+}
+
+/** @param {any[]} records in either order @returns {Row[]} */
+export function grouped(records) {
+  /** @type {Row[]} */
+  const rows = [];
+  let open = /** @type {{key: string, reason: string, row: Row}[]} */ ([]);
+  for (const record of records) {
+    const { key, reason, reach, times, value } = record.equality;
+    const known = open.slice(-reach).find((one) => one.key === key && (one.reason === reason || !one.reason || !reason));
+    if (!known) {
+      const row = { records: [record], first: record, last: record, count: times, value };
+      rows.push(row);
+      open = [...open, { key, reason, row }].slice(-reach);
+      continue;
+    }
+    const { row } = known;
+    known.reason ||= reason;
+    row.records.push(record);
+    row.count += times;
+    if (record.sequence < row.first.sequence) {
+      row.first = record;
+      row.value ||= value;
+    } else {
+      row.last = record;
+      row.value = value || row.value;
+    }
+  }
+  return rows;
+}
+
+/** How often it happened, and a button that shows each record. @param {{row: Row, open: boolean, toggle: () => void}} given */
+export function Count({ row, open, toggle }) {
+  if (row.count === 1) return null;
+  if (row.records.length === 1) return html`<span class="count-badge">${counted(row.count, "time")}</span>`;
+  const press = (/** @type {Event} */ event) => {
+    event.stopPropagation();
+    toggle();
+  };
+  return html`<button class="count-badge" aria-expanded=${String(open)} title=${open ? "Show one row" : "Show each record"} onClick=${press}>${counted(row.count, "time")}<${Icon} name=${open ? "minus" : "plus"} size=${12} /></button>`;
+}
+
+/** The time of the last record, and of the first if there are several. @param {{row: Row}} given */
+export function Range({ row: { first, last } }) {
+  return first === last ? html`<${Moment} at=${last.time} />` : html`<${Moment} at=${last.time} /> <span class="muted small nowrap">since <${Moment} at=${first.time} /></span>`;
+}
