@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.answers.status import ProcessInfo, Status
+from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
 
 Severity = Literal["alarm", "warning", "notice"]
@@ -30,6 +30,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     """Return the alarms for the present conditions, the most severe first."""
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
+    found += _blocks(status.blocks)
     alarms = (
         Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
     )
@@ -102,6 +103,14 @@ def _monitors(status: Status) -> Iterator[_Condition]:
     if monitors.differs_from_folder:
         text = f"revision {monitors.revision} of the specifications differs from their folder"
         yield "notice", "monitors-differ", "monitors", text
+
+
+def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
+    if blocks.hosts:
+        count = "1 host is blocked" if blocks.hosts == 1 else f"{blocks.hosts} hosts are blocked"
+        which = "the first block ends" if blocks.hosts > 1 else "the block ends"
+        end = "without an end" if blocks.first_end is None else f"{which} at {_moment(blocks.first_end)}"
+        yield "warning", "hosts-blocked", "hosts", f"{count}, {end}: rosrv host blocks"
 
 
 def _failing(process: ProcessInfo) -> str:

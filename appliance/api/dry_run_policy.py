@@ -106,7 +106,8 @@ def explanation(
     text: str | None, current: PolicyKnown, *, host: str, node: str, category: Category, resource: str
 ) -> DecisionExplanation:
     """Return the reasons for the decision of a request. Raises `ProblemError` if the request is invalid."""
-    policy = judge_text(text, current, cases=False).policy
+    fields = msgspec.structs.asdict(current)
+    policy = replace(judge_text(text, current, cases=False).policy, blocks=PolicyContext.of(fields).blocks)
     try:
         request = Request(find_hosts(host, policy)[0], node, category, check_resource(category, resource))
     except BadWordError as error:

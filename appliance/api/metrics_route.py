@@ -135,6 +135,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_rosmaster_reachable": [((), status.rosmaster == "reachable")],
         "rosrv_delivery_queue": [((), body.queued_deliveries)],
         **_tunnels(body.hosts),
+        "rosrv_hosts_blocked": [((), status.blocks.hosts)],
         "rosrv_ipsec_troubles": [((), len(status.ipsec.troubles))],
         "rosrv_audit_queue": [((), audit.lag_records)],
         "rosrv_audit_lag_seconds": [((), audit.lag_seconds)],

@@ -23,6 +23,10 @@ EVENTS: dict[str, str] = {
     "host revoked": "A host was excluded: its certificate is revoked, its tunnel closed, its registrations removed.",
     "certificate ends soon": "The certificate of an enrolled host expires within days and was not renewed.",
     "certificate ended": "The certificate of an enrolled host has expired; the host can no longer connect.",
+    "host blocked": "An operator blocked a host: all its requests are denied; `detail` has who, `until`, the note, and"
+    " what ended.",
+    "host unblocked": "An operator lifted the block of a host; `detail` has who.",
+    "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
     "host awaited": "A one-time token was made; the host that presents it is enrolled under this name.",
     "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
     "hosts reloaded": "The file of declared hosts was read again; `detail` has the tunnels that were opened and"
@@ -136,6 +140,7 @@ SEVERITIES: dict[str, Severity] = {
     name: severity
     for severity, names in {
         Severity.NOTICE: (
+            "host block ended", "host unblocked",
             "appliance started", "appliance stopped", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "host awaited", "host awaited no longer", "host enrolled",
             "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
@@ -145,8 +150,8 @@ SEVERITIES: dict[str, Severity] = {
         ),
         Severity.WARNING: (
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
-            "forwarding failed", "host revoked", "limit exceeded", "malformed", "packets refused", "policy refused",
-            "recording missed", "renewal refused", "specifications refused", "tunnel refused",
+            "forwarding failed", "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
+            "policy refused", "recording missed", "renewal refused", "specifications refused", "tunnel refused",
         ),
         Severity.ALARM: (
             "forwarding gap", "monitors restarted", "probe failed", "process failing", "protection forgotten",

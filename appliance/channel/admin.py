@@ -609,6 +609,39 @@ class HostPorts(AdminRequest[host_answers.PortsReport], frozen=True, tag="host p
     expected: int | None = None
 
 
+@rest(
+    "operator", "POST", "/v1/blocks", name="block_host", body=bodies.NewBlock, tag="hosts",
+    problems={422: "The address cannot be blocked, or only with `force`."},
+)  # fmt: skip
+class HostBlock(AdminRequest[host_answers.HostBlocked], frozen=True, tag="host block"):
+    """Block a host: deny its requests and end its registrations and connections, for `for_seconds`, or until `DELETE`.
+
+    The block of a host that is already blocked is replaced.
+    """
+
+    address: str
+    for_seconds: float | None = None
+    note: str = ""
+    force: bool = False
+
+
+@rest(
+    "operator", "DELETE", "/v1/blocks/{address}", name="unblock_host", tag="hosts",
+    problems={404: "This host is not blocked."},
+)  # fmt: skip
+class HostUnblock(AdminRequest[host_answers.HostUnblocked], frozen=True, tag="host unblock"):
+    """Lift the block of a host: the policy decides its requests again, and its withdrawn registrations return."""
+
+    address: Annotated[
+        str, parameter("address or name of the host", min_length=1, max_length=64, examples=["10.0.0.7"])
+    ]
+
+
+@rest("viewer", "GET", "/v1/blocks", name="host_blocks", tag="hosts")
+class HostBlocks(AdminRequest[host_answers.BlockedHosts], frozen=True, tag="host blocks"):
+    """The hosts that operators block, the earliest block first."""
+
+
 @rest("operator", "POST", "/v1/hosts/reload", name="reload_hosts", of=HOSTS)
 class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
     """Read hosts.yaml again: open and close tunnels as it says. Enrolments and revocations do not change."""

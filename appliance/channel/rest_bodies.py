@@ -16,6 +16,7 @@ LONGEST_REQUEST = 16 << 10
 LONGEST_DAYS = 398
 LONGEST_TOKEN_SECONDS = 7 * 86_400
 LONGEST_REVISION = 10**15
+LONGEST_BLOCK_SECONDS = 365 * 86_400
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
     str,
@@ -187,6 +188,20 @@ class NewKit(KitWishes, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     days: Days = 90
     request: SigningRequest | None = None
+
+
+class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A host to block."""
+
+    address: Annotated[
+        str, doc("an IPv4 or IPv6 address, or the name of an enrolled host", min_length=1, max_length=64)
+    ]
+    for_seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_BLOCK_SECONDS)] | None,
+        doc("the block ends after this time; null: it ends by an order only"),
+    ] = None
+    note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
+    force: Annotated[bool, doc("block the robot's own host also")] = False
 
 
 class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

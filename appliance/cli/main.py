@@ -121,13 +121,16 @@ VERBS: dict[str, Verb | Group] = {
         {"check": Verb("config_verbs:check"), "show": Verb("config_verbs:show")},
     ),
     "host": Group(
-        "Enrol, list and revoke hosts that connect through IPsec tunnels.",
+        "Block hosts; enrol, list and revoke hosts that connect through IPsec tunnels.",
         {
             "add": Verb("host.host_verbs:add"),
+            "block": Verb("host.block_verbs:block"),
+            "blocks": Verb("host.block_verbs:list_blocks"),
             "kit": Verb("host.host_verbs:kit"),
             "list": Verb("host.host_verbs:list_hosts"),
             "reload": Verb("host.host_verbs:reload"),
             "revoke": Verb("host.host_verbs:revoke"),
+            "unblock": Verb("host.block_verbs:unblock"),
         },
     ),
     "backup": Verb("backup:backup"),

@@ -50,13 +50,14 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     NotSealedError: "failed",
     StoreError: "failed",
 }
-# Requests that are rejected if the store cannot be written. A revocation is not in the list: it takes effect at once,
-# and its answer reports if it was not stored. The recorder checks its own disk space.
+# Requests that are rejected if the store cannot be written. A block or revocation is not in the list: it takes effect
+# at once, and its answer reports if it was not stored. The recorder checks its own disk space.
 KEPT = (
     admin.CHANGES
     | {admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}
 ) - {
-    admin.HostRevoke, admin.TokenRevoke, admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove
+    admin.HostBlock, admin.HostRevoke, admin.TokenRevoke,
+    admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove,
 }  # fmt: skip
 
 

@@ -1,7 +1,6 @@
 """Make the first part of control: the store, the audit log, the policy, the tunnels and the listening sockets."""
 
 import asyncio
-import contextlib
 import socket
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,8 +12,8 @@ from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
-from appliance.channel import messages
 from appliance.configuration.settings import Settings
+from appliance.control.host_blocks import HostBlocks
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.policies import Policies
 from appliance.control.quota_class import HostQuotaClass, charged_to
@@ -79,6 +78,7 @@ class Foundation:
     trail: AuditTrail
     plan: RecordingPlan
     store: StateStore
+    blocks: HostBlocks
     table: HostTable
     tunnels: Tunnels
     policies: Policies
@@ -111,7 +111,7 @@ async def make_foundation(
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
     authority = Authority(signing.link)
-    audit.set(_open_audit(settings, signing, _log_held(lifeline), quota_class))
+    audit.set(_open_audit(settings, signing, lifeline.log_held(), quota_class))
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
         audit(),
@@ -122,6 +122,7 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
+    blocks = HostBlocks.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))
@@ -133,6 +134,7 @@ async def make_foundation(
         trail,
         robot=robot_addresses(settings),
         hosts=lambda: tunnels().addresses,
+        blocks=lambda: blocks.reasons,
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,
@@ -150,6 +152,7 @@ async def make_foundation(
         trail=trail,
         plan=plan,
         store=store,
+        blocks=blocks,
         table=table,
         tunnels=tunnels(),
         policies=policies,
@@ -177,17 +180,6 @@ def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, 
                 ) from error
             lifeline.keep(name, sockets[name])
     return sockets
-
-
-def _log_held(lifeline: ControlLifeline) -> Callable[[list[int]], None]:
-    """Return a thread-safe function that tells the supervisor which processes lock the log."""
-    loop = asyncio.get_running_loop()
-
-    def report(processes: list[int]) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(lifeline.say, messages.LogHeld(processes))
-
-    return report
 
 
 def _open_audit(

@@ -1,7 +1,7 @@
 """Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints.
 
-An unknown host (an address that no rule of the policy names) is refused. The beginning of its body is read first, to
-record the name of the call. While the ROS master is not hidden, every host is refused.
+An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. The beginning of
+its body is read first, to record the name of the call. While the ROS master is not hidden, every host is refused.
 """
 
 import asyncio
@@ -13,7 +13,7 @@ from appliance.audit.record import Severity
 from appliance.configuration.settings import Settings
 from appliance.master.calls.call import with_record
 from appliance.master.calls.request_peek import asked_for
-from appliance.policy.model import Address
+from appliance.policy.model import Address, text_for_caller
 from appliance.policy.policy import Policy
 from appliance.quotas.descriptors import connections_within
 from appliance.quotas.pool import Bounds, QuotaClass
@@ -119,14 +119,19 @@ class ListenerLimits:
         if self._unhidden:
             fault = build_fault(1, f"the appliance does not serve nodes: {self._unhidden}")
             return lambda _beginning: fault
+        policy = self._policy()
         # The rosout aggregator calls from this machine. The policy need not name this machine.
-        if peer.here or self._policy().knows(peer.host):
+        if peer.here or policy.knows(peer.host):
             return None
-        return partial(self._refuse_unknown, peer)
+        denial = policy.blocked(peer.host)
+        if denial is None:
+            reason = told = f"no rule of the policy names {peer.text}"
+        else:
+            reason, told = denial.reason, text_for_caller(denial, policy.tell)
+        return partial(self._refuse_unknown, peer, reason, told)
 
-    def _refuse_unknown(self, peer: Peer, beginning: bytes) -> bytes:
+    def _refuse_unknown(self, peer: Peer, reason: str, told: str, beginning: bytes) -> bytes:
         asked = asked_for(peer, beginning)
-        reason = f"no rule of the policy names {peer.text}"
         record = self._trail.happened(
             "decision",
             reason,
@@ -138,7 +143,7 @@ class ListenerLimits:
             resource=asked.resource,
             more=asked.about,
         )
-        return build_fault(1, with_record(reason, record))
+        return build_fault(1, with_record(told, record))
 
     def troubled(self, peer: Peer, reason: str) -> None:
         """Record that a peer exceeded a limit."""

@@ -6,10 +6,12 @@ from functools import partial
 from appliance.channel.answers.status import AuditState
 from appliance.control.administration import Administration
 from appliance.control.assembly import Parts
+from appliance.control.block_orders import BlockOrders
 from appliance.control.clock_check import ClockCheck
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder_link import ForwarderLink
 from appliance.control.foundation import Current, Foundation
+from appliance.control.overview import hosts_connected
 from appliance.control.queries import Queries
 from appliance.control.request_methods import request_methods
 from appliance.control.rest import RestLink
@@ -30,6 +32,7 @@ class Operators:
     clock: ClockCheck
     forwarded: ForwarderLink
     switched_off: SwitchedOffWatch
+    blocks: BlockOrders
     administration: Administration
     rest: RestLink
 
@@ -61,6 +64,18 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
+    core = parts.core
+    blocks = BlockOrders(
+        base.blocks,
+        base.policies,
+        base.store,
+        trail,
+        live=core.revocation.live,
+        connected=partial(hosts_connected, parts),
+        enrolled=lambda: {row.name: row.address for row in base.table.enrolled()},
+        remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
+        carried_out=ends.relay.carried_out,
+    )
     looks = Queries(
         parts,
         trail,
@@ -71,8 +86,9 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         clock=clock.state,
         recorder=ends.recordings.state,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
-        live=parts.core.revocation.live,
+        live=core.revocation.live,
         switched_off=switched_off.rows,
+        blocks=blocks.status,
     )
     administration = Administration(
         looks,
@@ -84,6 +100,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             certification=certification,
             tokens=tokens,
             recordings=ends.recordings,
+            blocks=blocks,
             evidence=EvidenceOrders(base.audit, trail),
         ),
         durable=trail.durable,
@@ -105,6 +122,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         clock=clock,
         forwarded=forwarded,
         switched_off=switched_off,
+        blocks=blocks,
         administration=administration,
         rest=rest(),
     )

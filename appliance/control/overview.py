@@ -3,6 +3,8 @@
 All values are a snapshot of the registry and the relay's reports. The appliance's own nodes are left out.
 """
 
+from collections.abc import Iterator
+
 from msgspec.structs import asdict
 
 from appliance.channel.answers.graph_answers import Connection, Graph, Node, Publisher, Service, Topic
@@ -27,6 +29,14 @@ def graph_of(parts: Parts) -> Graph:
         _topics(parts, live, names),
         _services(parts, live, names),
     )
+
+
+def hosts_connected(parts: Parts) -> Iterator[set[str]]:
+    """Yield the two hosts of each connection through the relay: of the publisher or service, and of the client."""
+    registry = parts.core.registry
+    for connection in parts.core.carried.connections.values():
+        holder = registry.by_key(connection.key)
+        yield {connection.host} if holder is None else {connection.host, str(holder.host)}
 
 
 def _node(incarnation: Incarnation) -> Node:

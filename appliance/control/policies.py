@@ -78,13 +78,15 @@ class Policies(Revisions[RevisionRow]):
         *,
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
+        blocks: Callable[[], Mapping[Address, str]],
         changed: Callable[[Policy, Policy], int],
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
         """Prepare; `start` brings a policy into force.
 
-        `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change.
+        `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
+        returns the blocked hosts (`Policy.blocks`); the owner calls `blocks_changed` when they change.
         `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
         waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
         """
@@ -94,6 +96,7 @@ class Policies(Revisions[RevisionRow]):
         self._trail = trail
         self._robot = robot
         self._hosts = hosts
+        self._blocks = blocks
         self._changed = changed
         self._carried_out = carried_out
         self._site_keys = site_keys
@@ -172,13 +175,16 @@ class Policies(Revisions[RevisionRow]):
 
     def hosts_changed(self) -> int:
         """Compile the policy in force again, because hosts changed. Return the number of revocations."""
-        before = self.current
         try:
-            self._current = self._judged(before.text, self.in_force.signature, before.file, self.known)
+            policy = self._judged(self.current.text, self.in_force.signature, self.current.file, self.known)
         except PolicyRefusedError as error:  # a defect: the same text was valid before
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
-        return self._changed(before, self._current)
+        return self._enforce(policy)
+
+    def blocks_changed(self) -> int:
+        """Decide by the present blocks of hosts. Return the number of revocations."""
+        return self._enforce(self.current)
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
         """Bring a kept revision into force. Raises `PolicyRefusedError` and `RevisionChangedError`."""
@@ -237,7 +243,9 @@ class Policies(Revisions[RevisionRow]):
     @property
     def known(self) -> PolicyContext:
         """Return the present context of policies: hosts, robot and site keys."""
-        return PolicyContext(dict(self._hosts()), self._robot, site_keys=self._site_keys)
+        return PolicyContext(
+            dict(self._hosts()), self._robot, site_keys=self._site_keys, blocks=self._blocks()
+        )
 
     def with_cases(self, known: PolicyContext) -> PolicyContext:
         """Add the test cases from the file beside the policy to a context."""
@@ -326,9 +334,9 @@ class Policies(Revisions[RevisionRow]):
         return self._loaded(before, revoked)
 
     def _enforce(self, policy: Policy) -> int:
-        before, self._current = self._current, policy
+        before, self._current = self._current, replace(policy, blocks=dict(self._blocks()))
         self._trail.revision = self.revision
-        return 0 if before is None else self._changed(before, policy)
+        return 0 if before is None else self._changed(before, self._current)
 
     def _loaded(self, before: int, revoked: int) -> Loaded:
         warnings = [str(warning) for warning in self.current.warnings]

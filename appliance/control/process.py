@@ -129,6 +129,7 @@ class _Control:
             SpareMemory().watch(),
             operators.clock.watch(),
             operators.switched_off.watch(),
+            operators.blocks.watch(),
             self._save_parameters(),
             base.tunnels.run(operators.certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),

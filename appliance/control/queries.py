@@ -21,6 +21,7 @@ from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.status import (
     AuditState,
+    BlocksState,
     ClockState,
     PolicyState,
     RecorderState,
@@ -56,7 +57,7 @@ class Queries:
 
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
     recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
-    that is switched off.
+    that is switched off. `blocks()` returns the state of the blocks of hosts.
     """
 
     parts: Parts
@@ -70,6 +71,7 @@ class Queries:
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[LiveRight]]
     switched_off: Callable[[], list[SwitchedOff]]
+    blocks: Callable[[], BlocksState]
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
@@ -192,6 +194,7 @@ class Queries:
             clock=self.clock(),
             recorder=self.recorder(),
             switched_off=self.switched_off(),
+            blocks=self.blocks(),
         )
 
     def _policy(self) -> PolicyState:

@@ -6,6 +6,7 @@ from typing import Any, Generic
 
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
+from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
@@ -38,6 +39,7 @@ def request_methods(
     certification: Certification,
     tokens: TokenOrders,
     recordings: RecordingOrders,
+    blocks: BlockOrders,
     evidence: EvidenceOrders,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request."""
@@ -77,6 +79,9 @@ def request_methods(
         RequestMethod(admin.HostToken, hosts.token, who=True),
         RequestMethod(admin.HostRevoke, hosts.revoke, who=True),
         RequestMethod(admin.HostsReload, hosts.reload, who=True),
+        RequestMethod(admin.HostBlock, blocks.block, who=True),
+        RequestMethod(admin.HostUnblock, blocks.unblock, who=True),
+        RequestMethod(admin.HostBlocks, blocks.listed, order=False),
         RequestMethod(admin.HostEnrol, hosts.itself.enrol),
         RequestMethod(admin.HostRenewItself, hosts.itself.renew),
         RequestMethod(admin.HostRenewed, hosts.itself.renewed),

@@ -1,6 +1,7 @@
 """Exchange messages with the supervisor over control's lifeline."""
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import Callable
 from typing import Any
@@ -76,6 +77,16 @@ class ControlLifeline:
     def say(self, message: messages.Message) -> None:
         """Send the supervisor a message."""
         self._send(message, ())
+
+    def log_held(self) -> Callable[[list[int]], None]:
+        """Return a thread-safe function that tells the supervisor which processes lock the audit log."""
+        loop = asyncio.get_running_loop()
+
+        def report(processes: list[int]) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self.say, messages.LogHeld(processes))
+
+        return report
 
     def keep(self, name: str, sock: socket.socket) -> None:
         """Have the supervisor keep a listening socket, so that it survives a crash of control."""

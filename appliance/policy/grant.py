@@ -66,6 +66,9 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
     """
     word = _word(text, known, asked.request.host)
     policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
+    block = replace(policy, blocks=known.blocks).blocked(asked.request.host)
+    if block is not None:
+        raise UngrantableError(f"no line of a policy grants it: {block.reason}")
     added: list[str] = []
     while (
         missing := next((right for right in asked.rights if not _granted(policy, right)), None)

@@ -19,7 +19,8 @@ class PolicyContext:
     """The context of a policy: the addresses of `host:NAME` and `robot`, and the text of its test cases.
 
     `cases` is None if the policy has no test cases. `cases_error` is the reason if they could not be read; it rejects
-    the policy. If `site_keys` is not empty, one of these keys must have signed the policy.
+    the policy. If `site_keys` is not empty, one of these keys must have signed the policy. `blocks` has the hosts that
+    an operator blocks (`Policy.blocks`); they do not affect checks and test cases.
     """
 
     hosts: Mapping[str, Address] = field(default_factory=dict)
@@ -28,6 +29,7 @@ class PolicyContext:
     cases: str | None = None
     cases_error: str | None = None
     site_keys: Sequence[str] = ()
+    blocks: Mapping[Address, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
@@ -35,7 +37,8 @@ class PolicyContext:
         return cls(
             {name: ipaddress.ip_address(address) for name, address in fields["hosts"].items()},
             [ipaddress.ip_network(place) for place in fields["robot"]],
-            *(fields[name] for name in ("cases_file", "cases", "cases_error", "site_keys")),
+            **{name: fields[name] for name in ("cases_file", "cases", "cases_error", "site_keys")},
+            blocks={ipaddress.ip_address(address): block for address, block in fields["blocks"].items()},
         )
 
     def fields(self) -> dict[str, Any]:
@@ -47,6 +50,7 @@ class PolicyContext:
             "cases": self.cases,
             "cases_error": self.cases_error,
             "site_keys": list(self.site_keys),
+            "blocks": {str(address): block for address, block in self.blocks.items()},
         }
 
 

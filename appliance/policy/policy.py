@@ -4,7 +4,8 @@ The function is pure: the same request always gets the same answer, without I/O 
 
 Invariants:
 1. A request that no rule grants is denied. Exception: if an extension section is missing, its requests are allowed.
-2. Exactly one rule decides a request: the rule with the most specific matching key of its section, or `default`.
+   An operator's block denies every request of its host, whatever the rules say, also in audit-only mode.
+2. Otherwise one rule decides a request: the rule with the most specific matching key of its section, or `default`.
 3. `Decision.reason` is a sentence shorter than 300 characters.
 4. Memory does not grow with requests: answers are kept for at most `_KEPT_DECISIONS` short resource names.
 """
@@ -72,7 +73,8 @@ class Policy:
     `text` and `file` are its source. `warnings` are the findings of the lint. `named` has the atoms of all hosts that a
     rule names. `present` lists the categories that have a section. `ports` are the ports for proxy endpoints and relay.
     `monitored_topics` and `monitored_services` are the names in `[Monitor]`. `takeover` is `same-host` or `granted`.
-    `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`.
+    `enrolled` and `robot` are the given addresses of `host:NAME` and `robot`. `blocks` has the hosts that an operator
+    blocks, by canonical address: the end of a sentence, such as `blocked by ann`.
     """
 
     text: str
@@ -90,6 +92,7 @@ class Policy:
     tell: str
     enrolled: Mapping[str, Address]
     robot: tuple[Network, ...]
+    blocks: Mapping[Address, str] = field(default_factory=dict)
     kept: dict[tuple[int, int, Category, str], Decision] = field(default_factory=dict, init=False)
     _kept_below: dict[tuple[int, int, Category, str, bool], Decision] = field(
         default_factory=dict, init=False
@@ -170,9 +173,17 @@ class Policy:
     def knows(self, address: Address) -> bool:
         """Whether any rule includes this address. Requests from other addresses need not even be read.
 
-        If a section is in audit-only mode, every address is known, because its requests pass.
+        If a section is in audit-only mode, every address is known, because its requests pass. A blocked host is not.
         """
+        if self.blocked(address) is not None:
+            return False
         return self._any_audit_only or not self.named.isdisjoint(self.hosts.atoms_of(address))
+
+    def blocked(self, address: Address) -> Decision | None:
+        """Return the denial of every request of a host that an operator blocks; None for any other host."""
+        if not self.blocks or (block := self.blocks.get(host := canonical_address(address))) is None:
+            return None
+        return Decision(False, None, f"{host} is {block}", told=f"{host} is blocked by an operator")
 
     def named_as(self, address: Address) -> Network:
         """Return the smallest network of the policy that contains the address, or the address itself as a network."""
@@ -187,8 +198,8 @@ class Policy:
         return self.alike(address) if self.knows(address) else ""
 
     def names(self, address: Address) -> bool:
-        """Whether the policy names this address or a network that contains it; `*` does not count."""
-        return self.hosts.names(address)
+        """Whether the policy names this address or a network that contains it; `*` and blocked hosts do not count."""
+        return self.hosts.names(address) and self.blocked(address) is None
 
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
@@ -207,6 +218,9 @@ class Policy:
         return tuple(self.tables[category].rules)
 
     def _decide(self, request: Request) -> Decision:
+        denial = self.blocked(request.host)
+        if denial is not None:
+            return denial
         category = request.category
         name = request.resource
         if category is Category.COMMAND:

@@ -4,7 +4,7 @@ import functools
 import ipaddress
 import itertools
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.policy.host_sets import Network
 from appliance.policy.model import Address, Category, Decision, Request
@@ -41,8 +41,9 @@ class HostAnswer:
 def who_may(policy: Policy, category: Category, resource: str, node: str = "") -> Iterator[HostAnswer]:
     """Yield the answer for each network in order of addresses, then for all other hosts.
 
-    Without the name of a `node`, the right to a node's name is not decided.
+    Without the name of a `node`, the right to a node's name is not decided. Blocks of hosts are ignored.
     """
+    policy = replace(policy, blocks={})
     networks = sorted(policy.hosts.networks(), key=lambda one: (one.version, one))
     inside = [
         (network, _only_in(policy, network, networks[place:]))

@@ -11,10 +11,11 @@ import array
 import ipaddress
 import socket
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import structlog
 
+from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
@@ -39,7 +40,7 @@ _log = structlog.get_logger()
 class NamedFirst:
     """Make the program that sends connections of this machine, and of hosts that the policy names, to the first socket.
 
-    Call the object to get the program.
+    Blocked hosts are sent to the second socket. Call the object to get the program.
     """
 
     def __init__(self, policy: Callable[[], Policy]) -> None:
@@ -51,7 +52,9 @@ class NamedFirst:
         """Return the program for the policy in force."""
         policy = self._policy()
         if policy is not self._of:
-            self._of, self._program = policy, first_for([*_LOOPBACK, *policy.hosts.networks()])
+            blocked = [address for address in policy.blocks if policy.hosts.names(address)]
+            self._of = policy
+            self._program = first_for([*_LOOPBACK, *policy.hosts.networks()], blocked)
         return self._program
 
 
@@ -98,31 +101,41 @@ class SourceQueues:
         self._attached = program
 
 
-def first_for(networks: Iterable[Network]) -> bytes:
-    """Return the program that sends these sources to the first socket, and all others to the second.
+def first_for(networks: Iterable[Network], blocked: Iterable[Address] = ()) -> bytes:
+    """Return the program that sends these sources, except blocked addresses, to the first socket, others to the second.
 
-    If there are too many networks for a program, it sends all sources to the first socket.
+    If there are too many addresses for a program, it ignores the blocks. If there are still too many, it sends all
+    sources to the first socket.
     """
     networks = list(networks)
-    code = [_instruction(_LOAD, _PROTOCOL)]
-    for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
-        tests = _tests(version, [network for network in networks if network.version == version])
-        code += [_instruction(_JUMP_EQUAL, ethertype, 1, 0), _instruction(_JUMP, len(tests)), *tests]
-    code.append(_instruction(_RETURN, SECOND))
+    tests = [(network, FIRST) for network in networks]
+    code = _program([*((ipaddress.ip_network(address), SECOND) for address in blocked), *tests])
+    if len(code) > _MOST_INSTRUCTIONS:
+        code = _program(tests)
     if len(code) > _MOST_INSTRUCTIONS:
         _log.warning("the policy names too many networks to sort connections", networks=len(networks))
         code = [_instruction(_RETURN, FIRST)]
     return b"".join(code)
 
 
-def _tests(version: int, networks: list[Network]) -> list[bytes]:
+def _program(tests: Sequence[tuple[Network, int]]) -> list[bytes]:
+    """Return the program for these networks and their sockets; the first network that contains the source decides."""
+    code = [_instruction(_LOAD, _PROTOCOL)]
+    for version, ethertype in ((4, 0x0800), (6, 0x86DD)):
+        own = _tests(version, [test for test in tests if test[0].version == version])
+        code += [_instruction(_JUMP_EQUAL, ethertype, 1, 0), _instruction(_JUMP, len(own)), *own]
+    code.append(_instruction(_RETURN, SECOND))
+    return code
+
+
+def _tests(version: int, networks: list[tuple[Network, int]]) -> list[bytes]:
     """Return the instructions that compare the source address with each network, word by word."""
     words = 4 if version == 6 else 1
     code = []
     for word in range(words):
         code += [_instruction(_LOAD, _SOURCE[version] + 4 * word), _instruction(_STORE, word)]
-    for network in networks:
-        test = [_instruction(_RETURN, FIRST)]
+    for network, socket_number in networks:
+        test = [_instruction(_RETURN, socket_number)]
         for word in reversed(range(words)):
             shift = 32 * (words - 1 - word)
             mask, wanted = (

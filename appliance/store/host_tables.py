@@ -1,4 +1,4 @@
-"""The tables of hosts that connect through tunnels: enrolled hosts, their certificates, awaited hosts."""
+"""The tables of hosts: hosts that connect through tunnels, their certificates, awaited hosts, blocked hosts."""
 
 import json
 from typing import NamedTuple
@@ -24,6 +24,9 @@ CREATE TABLE IF NOT EXISTS enrolment_token (
 CREATE TABLE IF NOT EXISTS revoked_certificate (serial TEXT PRIMARY KEY, moment REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS revocation (
     serial TEXT PRIMARY KEY, name TEXT NOT NULL, moment REAL NOT NULL, expires REAL NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS host_block (
+    address TEXT PRIMARY KEY, since REAL NOT NULL, ends INTEGER, who TEXT NOT NULL, note TEXT NOT NULL
 ) WITHOUT ROWID;
 """
 _LONGEST_SECONDS = 398 * 86_400.0  # the longest life of a certificate that the authority makes
@@ -91,6 +94,19 @@ class RevokedCertificateRow(NamedTuple):
     name: str
     moment: float
     expires: float
+
+
+class HostBlockRow(NamedTuple):
+    """A host that an operator blocks, since this time (seconds since the epoch).
+
+    `ends` is the end by the age clock (`base/age_clock.py`), in nanoseconds; None: it ends by an order only.
+    """
+
+    address: str
+    since: float
+    ends: int | None
+    who: str
+    note: str
 
 
 class HostTables:
@@ -163,3 +179,15 @@ class HostTables:
             (_LONGEST_SECONDS,),
         )
         return [RevokedCertificateRow(*row) for row in rows]
+
+    def save_block(self, row: HostBlockRow) -> None:
+        """Store that a host is blocked, replacing its earlier block."""
+        self._database.put("host_block", *row)
+
+    def forget_block(self, address: str) -> None:
+        """Remove the block of a host."""
+        self._database.delete("host_block", address=address)
+
+    def blocks(self) -> list[HostBlockRow]:
+        """Return the blocked hosts, the earliest block first."""
+        return [HostBlockRow(*row) for row in self._database.query("SELECT * FROM host_block ORDER BY since")]

@@ -104,6 +104,7 @@ METRICS = (
         "host",
     ),
     _gauge("rosrv_hosts", "hosts by state, as `rosrv host list` shows it", "state"),
+    _gauge("rosrv_hosts_blocked", "hosts that operators block (`rosrv host blocks`)"),
     _gauge("rosrv_ipsec_troubles", "number of IPsec problems that `rosrv status` reports"),
     _gauge("rosrv_audit_queue", "audit records that wait to be written to disk"),
     _gauge("rosrv_audit_lag_seconds", "how long the oldest such record has waited"),

@@ -72,6 +72,49 @@ class Hosts(msgspec.Struct, frozen=True):
     troubles: Annotated[list[str], doc("problems that need a person's attention")]
 
 
+class BlockedHost(msgspec.Struct, frozen=True):
+    """A host that an operator blocks."""
+
+    address: str
+    name: Annotated[str, doc("its name if it is enrolled, else empty")]
+    since: Moment
+    until: Annotated[Moment | None, doc("null: it ends by an order only")]
+    who: Annotated[str, doc("name of the token, or `operator`")]
+    note: str
+
+
+class BlockedHosts(msgspec.Struct, frozen=True):
+    """The blocked hosts, the earliest block first."""
+
+    blocks: Annotated[list[BlockedHost], doc("the blocked hosts")]
+
+
+class BlockEnded(msgspec.Struct, frozen=True):
+    """The registrations and the connections through the relay that a block ended."""
+
+    publications: Annotated[int, doc("registered topics that its nodes publish")]
+    subscriptions: Annotated[int, doc("registered topics to which its nodes subscribe")]
+    services: Annotated[int, doc("registered services of its nodes")]
+    parameters: Annotated[int, doc("subscriptions to parameters")]
+    connections: Annotated[int, doc("connections through the relay, to or from the host")]
+
+
+class HostBlocked(BlockedHost, frozen=True, kw_only=True):
+    """A host was blocked."""
+
+    ended: BlockEnded
+    replaced: Annotated[BlockedHost | None, doc("its earlier block; null: it was not blocked")]
+    other_addresses: Annotated[
+        list[str], doc("addresses of the same machine that are not blocked: of its tunnel, or outside it")
+    ]
+
+
+class HostUnblocked(BlockedHost, frozen=True, kw_only=True):
+    """The block of a host was lifted."""
+
+    restored: Annotated[int, doc("registrations that the block had withdrawn and that returned")]
+
+
 class KitParts(msgspec.Struct, frozen=True, kw_only=True):
     """The contents of an enrolled host's kit, without its private key.
 

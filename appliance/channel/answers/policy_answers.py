@@ -31,7 +31,7 @@ class RevisionText(PolicyRevision, frozen=True):
     signature: str
 
 
-class PolicyInForce(RevisionText, frozen=True):
+class PolicyInForce(RevisionText, frozen=True, kw_only=True):
     """The policy in force. It rolls back at `confirm_by` (seconds since the epoch) unless confirmed."""
 
     policy_file: Annotated[str, doc("the file that `reload` reads")]
@@ -41,6 +41,10 @@ class PolicyInForce(RevisionText, frozen=True):
     site_keys: Annotated[list[str], doc("if there are any, one of them must have signed what is loaded")]
     robot: Annotated[list[str], doc("addresses and networks of the group robot")]
     hosts: Annotated[dict[str, str], doc("address of each enrolled host, for host:NAME")]
+    blocks: Annotated[
+        dict[str, str],
+        doc("hosts that an operator blocks, by address: the end of the reason of their denials"),
+    ] = {}
 
 
 class PolicyKnown(PolicyInForce, frozen=True):

@@ -172,6 +172,13 @@ class SwitchedOff(msgspec.Struct, frozen=True):
     forgotten: Annotated[bool, doc("off for longer than `forgotten_after`: an alarm")]
 
 
+class BlocksState(msgspec.Struct, frozen=True):
+    """The hosts that operators block (`rosrv host blocks`)."""
+
+    hosts: int
+    first_end: Annotated[Moment | None, doc("when the first block ends; null: none ends without an order")]
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -200,3 +207,4 @@ class Status(msgspec.Struct, frozen=True):
     clock: ClockState
     recorder: Annotated[RecorderState | None, doc("null: nothing is recorded")] = None
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
+    blocks: BlocksState = BlocksState(0, None)

@@ -104,7 +104,7 @@ def _impact(
 
 def _allowing(policy: Policy, request: Request) -> Iterator[str]:
     """Yield the smallest change of the policy that would allow the request."""
-    known = PolicyContext(policy.enrolled, policy.robot)
+    known = PolicyContext(policy.enrolled, policy.robot, blocks=policy.blocks)
     try:
         found = grant_of(policy.text, policy.file, known, DecidedRequest(request, rights_of(request)))
     except UngrantableError as error:
@@ -116,11 +116,12 @@ def _allowing(policy: Policy, request: Request) -> Iterator[str]:
 def compiled(
     appliance: Appliance, file: Path | None, robot: list[str] | None, enrolled: list[str] | None
 ) -> Policy:
-    """Return the policy of a file, or the one in force. Exits with status 1 if the file has errors."""
+    """Return the policy of a file, or the one in force with its blocks. Exits with status 1 if the file has errors."""
     if file is not None:
         return _judge_or_exit(file, robot, enrolled).policy
     text, name, known = policy_in_force(appliance, robot, enrolled)
-    return compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
+    policy = compile_policy(text, file=name, hosts=known.hosts, robot=known.robot)
+    return replace(policy, blocks=known.blocks)
 
 
 @speaks

@@ -50,6 +50,8 @@ def list_who_may(
     if not appliance.as_json:
         for line in _notes(category, resource, node, may=may):
             say(line)
+        for address, block in policy.blocks.items():
+            say(f"whatever the rules say: {address} is {block}", "yellow")
     raise typer.Exit(0 if may else 1)
 
 

@@ -95,6 +95,10 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/hosts/laptop/token", {"days": 3, "token_seconds": 90, "endpoint": None}),
     ("POST", "/v1/hosts/laptop/kit", {}),
     ("POST", "/v1/hosts/laptop/kit", {"request": "PEM", "days": 7}),
+    ("POST", "/v1/blocks", {"address": "10.0.0.7"}),
+    ("POST", "/v1/blocks", {"address": "ocu-1", "for_seconds": 3600, "note": "strange traffic", "force": True}),
+    ("DELETE", "/v1/blocks/10.0.0.7", None),
+    ("DELETE", "/v1/blocks/fd00%3A%3A7", None),
     ("POST", "/v1/hosts/reload", None),
     ("DELETE", "/v1/hosts/laptop", None),
     ("PUT", "/v1/hosts/laptop/ports", {"state": "closed"}),
@@ -111,7 +115,7 @@ LEAST = {
         (
             "status", "inventory", "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
             "monitor_revision",
-            "recordings", "recording", "hosts", "challenge",
+            "recordings", "recording", "hosts", "host_blocks", "challenge",
         ),
         "viewer",
     ),
@@ -120,6 +124,7 @@ LEAST = {
         (
             "reload_policy", "roll_back_policy", "confirm_policy", "topic_messages", "reload_monitors",
             "confirm_monitors", "switch_monitors", "switch_monitor", "record_now", "tell_host_ports", "reload_hosts",
+            "block_host", "unblock_host",
         ),
         "operator",
     ),

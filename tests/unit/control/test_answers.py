@@ -9,6 +9,7 @@ from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
+from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
@@ -37,6 +38,7 @@ CLASSES: dict[str, Any] = {
     "certification": Certification,
     "tokens": TokenOrders,
     "recordings": RecordingOrders,
+    "blocks": BlockOrders,
     "evidence": EvidenceOrders,
 }
 METHODS = request_methods(**CLASSES)

@@ -55,6 +55,7 @@ class Appliance:
         *,
         restarted: bool = False,
         hosts: Callable[[], Mapping[str, Address]] = dict,
+        blocks: Callable[[], Mapping[Address, str]] = dict,
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
@@ -67,6 +68,7 @@ class Appliance:
             records,
             robot=(),
             hosts=hosts,
+            blocks=blocks,
             changed=changed,
             carried_out=at_once,
             site_keys=site_keys,

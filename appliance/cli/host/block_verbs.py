@@ -1,0 +1,108 @@
+"""`rosrv host block|unblock|blocks`: hosts that operators block during an incident."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock
+from appliance.channel.answers.host_answers import BlockedHost, BlockEnded
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import span_given
+from appliance.cli.output import moment, say_json
+from rosmop.tool.terminal import counted, say
+
+_Address = Annotated[
+    str, typer.Argument(help="An IPv4 or IPv6 address, or the name of an enrolled host", show_default=False)
+]
+
+
+@speaks
+def block(
+    running: Appliance,
+    address: _Address,
+    *,
+    time: Annotated[
+        str | None,
+        typer.Option(
+            "--for", metavar="TIME", help="End the block after this time (30s, 10m, 1h, 2d; default: never)"
+        ),
+    ] = None,
+    note: Annotated[str, typer.Option(help="The reason, for other operators")] = "",
+    force: Annotated[bool, typer.Option("--force", help="Block even the robot's own host")] = False,
+) -> None:
+    """Block a host at once: deny all its calls, and end its registrations and connections.
+
+    It stays blocked for the given time, or until `rosrv host unblock`, also over restarts. Blocking it again replaces
+    the block.
+
+    Example: rosrv host block 10.0.0.7 --for 1h --note "strange traffic"
+    """
+    seconds = None if time is None else span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv host")
+    body = running.answer_or_exit(HostBlock(address, seconds, note, force))
+    end = (
+        f"until {moment(body.until)}"
+        if body.until is not None
+        else f"until `rosrv host unblock {body.address}`"
+    )
+    say(f"{_named(body)} is blocked {end}; it lost {_in_words(body.ended)}")
+    if body.replaced is not None:
+        say(f"this replaces the block by {_whose(body.replaced)}")
+    for other in body.other_addresses:
+        say(
+            f"! the same machine also has the address {other}, which is not blocked: rosrv host block {other}",
+            "yellow",
+        )
+
+
+@speaks
+def unblock(running: Appliance, address: _Address) -> None:
+    """Lift the block of a host. Its withdrawn registrations return as far as the policy allows.
+
+    Example: rosrv host unblock 10.0.0.7
+    """
+    body = running.answer_or_exit(HostUnblock(address))
+    say(f"{_named(body)} is no longer blocked; {counted(body.restored, 'registration')} returned")
+
+
+@speaks
+def list_blocks(running: Appliance) -> None:
+    """List the blocked hosts: address, start and end of the block, operator, note.
+
+    Example: rosrv host blocks
+    """
+    blocks = running.ask_or_exit(HostBlocks()).blocks
+    for row in blocks:
+        if running.as_json:
+            say_json(row)
+        else:
+            end = "no end" if row.until is None else f"until {moment(row.until)}"
+            say(f"{_named(row):<37}  since {moment(row.since)}  {end:<23}  by {row.who}{_note(row)}")
+    if not blocks and not running.as_json:
+        say("no host is blocked")
+
+
+def _named(row: BlockedHost) -> str:
+    return f"{row.address} ({row.name})" if row.name else row.address
+
+
+def _whose(row: BlockedHost) -> str:
+    end = "without an end" if row.until is None else f"until {moment(row.until)}"
+    return f"{row.who}, {end}{_note(row)}"
+
+
+def _note(row: BlockedHost) -> str:
+    return f": {row.note}" if row.note else ""
+
+
+def _in_words(ended: BlockEnded) -> str:
+    parts = (
+        counted(ended.publications, "publication"),
+        counted(ended.subscriptions, "subscription"),
+        counted(ended.services, "service"),
+        counted(ended.parameters, "parameter subscription"),
+        counted(ended.connections, "connection"),
+    )
+    return (
+        ", ".join(part for part in parts if not part.startswith("0 "))
+        or "nothing: nothing of it was registered"
+    )
