@@ -10,8 +10,9 @@ Invariants:
 
 1. Every module becomes one function scope, so private names do not collide. It is included once, after all modules
    that it imports.
-2. Everything else raises `ModuleError`, at the start of the API: other forms of import and export, cycles, missing
-   files, names that a module does not export, unclosed strings and brackets.
+2. Everything else raises `ModuleError`, at the start of the API: other forms of import and export, `import()` of a
+   module that is joined, cycles, missing files, names that a module does not export, unclosed strings and brackets, and
+   a slash after a bracket that may begin a regular expression.
 3. Comments and needless spaces are removed, but not inside strings, templates and regular expressions.
 """
 
@@ -21,16 +22,19 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 _TOKEN = re.compile(
-    r"""(?P<space>\s+|//[^\n]*|/\*.*?\*/)|(?P<text>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
+    r"""(?P<space>\s+|//[^\n\r\u2028\u2029]*|/\*.*?\*/)|(?P<text>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
     r"""|(?P<word>[\w$]+)|(?P<mark>[^"'\s])""",
     re.DOTALL,
 )
 _TEMPLATE = re.compile(r"(?:\\.|\$(?!\{)|[^`\\$])*(?:`|\$\{)", re.DOTALL)
 _REGULAR_EXPRESSION = re.compile(r"/(?:\\.|\[(?:\\.|[^\]\\\n])*\]|[^/\\\n\[])+/\w*")
-_BEFORE_A_VALUE = frozenset(
-    {"return", "typeof", "case", "of", "in", "await", "yield", "void", "delete", "throw"}
-)
+_BEFORE_A_VALUE = frozenset({
+    "return", "typeof", "case", "of", "in", "await", "yield", "void", "delete", "throw", "else", "do", "instanceof",
+})  # fmt: skip
+_LINE_BREAK = re.compile(r"[\n\r\u2028\u2029]")
+_RELATIVE = ('"./', "'./", "`./", '"../', "'../", "`../")
 _OPENING = {")": "(", "]": "[", "}": "{"}
+_AMBIGUOUS = re.compile(r"/(?![/*=\s])")
 _NO_BREAK_AFTER = frozenset("{([,;")  # a statement never ends here by a line break, or it has ended already
 _SEPARATING = frozenset("{}()[],;:?=<>&|!*")
 _FROM = re.compile(r'(?:import|export)\s*\{([\w$,\s]+)\}\s*from\s*"([^"]+)"\s*;')
@@ -60,15 +64,20 @@ def join_modules(sources: Mapping[str, str], entry: str) -> str:
     return joining.script()
 
 
-def join_styles(sources: Mapping[str, str], entry: str) -> str:
+def join_styles(sources: Mapping[str, str], entry: str, within: tuple[str, ...] = ()) -> str:
     """Return one style sheet: the entry with the files that it imports, without comments and indentation.
 
-    Raise `ModuleError` for a missing file, and for an import of another form.
+    `within` are the files whose imports led to the entry. Raise `ModuleError` for a missing file, a cycle, and an
+    import of another form.
     """
     if entry not in sources:
         raise ModuleError(f"there is no file {entry}")
+    way = (*within, entry)
+    if entry in within:
+        raise ModuleError(f"style sheets import each other: {', '.join(way)}")
     joined = _STYLE_IMPORT.sub(
-        lambda found: join_styles(sources, _path(entry, found[1])), _STYLE_COMMENT.sub("", sources[entry])
+        lambda found: join_styles(sources, _path(entry, found[1]), way),
+        _STYLE_COMMENT.sub("", sources[entry]),
     )
     if "@import" in joined:
         raise ModuleError(f'{entry}: unsupported import; write @import "./FILE.css";')
@@ -109,10 +118,12 @@ class _Joining:
         while at < len(tokens):
             token = tokens[at]
             at += 1
+            following = [one for one in tokens[at : at + 8] if one.kind != "space"]
+            if token.text == "import" and token.kind == "word":
+                _require_separate(path, token, following)
             if not token.outermost or token.kind != "word" or token.text not in ("import", "export", "await"):
                 body.append(token)
                 continue
-            following = [one for one in tokens[at : at + 8] if one.kind != "space"]
             if token.text == "export" and (name := _declared(following)):
                 exports[name] = name
                 continue
@@ -189,6 +200,14 @@ def _declared(tokens: list[_Token]) -> str | None:
     return None
 
 
+def _require_separate(path: str, token: _Token, following: list[_Token]) -> None:
+    """Raise `ModuleError` for `import()` of a joined module, and for the address of the module: neither exists."""
+    words = [one.text for one in following]
+    if words[:1] == ["."] or (words[:1] == ["("] and words[1:2] and words[1].startswith(_RELATIVE)):
+        shown = "".join(["import", *words[:3]])
+        raise ModuleError(f"{path}:{token.line}: unsupported in a module of the console: {shown}")
+
+
 def _path(of: str, address: str) -> str:
     return posixpath.normpath(posixpath.join(posixpath.dirname(of), address))
 
@@ -198,9 +217,11 @@ def _tokens(path: str, text: str) -> Iterator[_Token]:
     brackets: list[str] = []
     at, line, before = 0, 1, _Token("mark", ";", 1, outermost=True)
     while at < len(text):
-        value_follows = before.text in _BEFORE_A_VALUE or (
-            before.kind == "mark" and before.text not in _OPENING
-        )
+        value_follows = before.text in _BEFORE_A_VALUE or _awaits_value(before)
+        if before.text in _OPENING and _AMBIGUOUS.match(text, at):
+            raise ModuleError(
+                f"{path}:{line}: put a regular expression in brackets, or a space after a division"
+            )
         outermost = not brackets
         in_template = text[at] == "}" and brackets[-1:] == ["`"]
         found = _next(text, at, in_template=in_template, value_follows=value_follows)
@@ -218,7 +239,7 @@ def _tokens(path: str, text: str) -> Iterator[_Token]:
             brackets.append(piece)
         shown = piece
         if kind == "space":
-            shown = "\n" if "\n" in piece else "" if piece.startswith("//") else " "
+            shown = "\n" if _LINE_BREAK.search(piece) else "" if piece.startswith("//") else " "
         token = _Token(kind, shown, line, outermost)
         yield token
         if kind != "space":
@@ -227,6 +248,12 @@ def _tokens(path: str, text: str) -> Iterator[_Token]:
         line += piece.count("\n")
     if brackets:
         raise ModuleError(f"{path}:{line}: unclosed {brackets[-1]}")
+
+
+def _awaits_value(before: _Token) -> bool:
+    if before.kind == "template":
+        return before.text.endswith("${")
+    return before.kind == "mark" and before.text not in _OPENING
 
 
 def _next(text: str, at: int, *, in_template: bool, value_follows: bool) -> tuple[str, str] | None:

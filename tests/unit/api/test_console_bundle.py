@@ -33,6 +33,24 @@ def test_only_comments_and_indentation_are_removed() -> None:
 
 
 @pytest.mark.parametrize(
+    "kept",
+    [
+        "t=`${/a  \"/.test(x)}`;", "if(a)b;else /a  \"/.test(x);", "const f=()=>/a  \"/;", "a=(b)/ 2 / c;",
+        "function f(){import(SOURCE);}", "f(a.import);",
+    ],
+)  # fmt: skip
+def test_a_slash_is_read_as_its_place_demands(kept: str) -> None:
+    """A regular expression keeps its spaces and quotes, a division is none; an import of a separate file stays."""
+    assert join_modules({"a.js": kept}, "a.js") == f"const $m0=(()=>{{{kept}\nreturn {{}};}})();\n"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\u2028", "\u2029"])
+def test_a_comment_ends_with_its_line(end: str) -> None:
+    """Code after each line break of JavaScript is no part of a comment."""
+    assert "{a\nb;" in join_modules({"a.js": f"a // c{end}b;"}, "a.js")
+
+
+@pytest.mark.parametrize(
     ("sources", "error"),
     [
         ({"a.js": 'import x from "./b.js";'}, "a.js:1: unsupported in a module"),
@@ -56,6 +74,14 @@ def test_only_comments_and_indentation_are_removed() -> None:
         ({"a.js": "a = /open"}, "a.js:1: unclosed string"),
         ({"a.js": "f(() => {"}, "a.js:1: unclosed {"),
         ({"a.js": "f(]"}, "a.js:1: unexpected ]"),
+        ({"a.js": "\nif (a) /b  c/.test(d);"}, "a.js:2: put a regular expression in brackets"),
+        ({"a.js": "function f() { }\n/b  c/.test(d);"}, "a.js:2: put a regular expression in brackets"),
+        ({"a.js": 'const f = () => import("./b.js");'}, "a.js:1: unsupported in a module"),
+        (
+            {"a.js": 'function f() { return import("../b.js"); }'},
+            'a.js:1: unsupported in a module of the console: import("../b.js"',
+        ),
+        ({"a.js": "function f() { return import.meta.url; }"}, "a.js:1: unsupported in a module"),
     ],
 )
 def test_unsupported_modules_are_an_error(sources: dict[str, str], error: str) -> None:
@@ -73,3 +99,5 @@ def test_styles_are_joined_in_the_order_of_their_imports() -> None:
         join_styles({"c/a.css": sources["c/a.css"]}, "c/a.css")
     with pytest.raises(ModuleError, match=r"c/a\.css: unsupported import"):
         join_styles({"c/a.css": "@import url(./b.css);"}, "c/a.css")
+    with pytest.raises(ModuleError, match=r"import each other: c/a\.css, c/b\.css, c/a\.css"):
+        join_styles(sources | {"c/b.css": '@import "./a.css";'}, "c/a.css")
