@@ -6,6 +6,7 @@ restarts.
 
 from collections.abc import Collection
 
+from appliance.audit.equality import equality_of
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import without_binding
 from appliance.channel.answers.recording_answers import APPLIANCE, Trigger, TriggerKind
@@ -36,5 +37,21 @@ def trigger_of(record: AuditRecord, wanted: Collection[TriggerKind]) -> Trigger 
             reason = without_binding(record.reason, record.detail)
             text = f"{record.event}: {reason}" if reason else record.event
             charged_to = str(record.detail.get("charged_to", APPLIANCE))
-            return Trigger(record.time, what, record.id, text[:_LONGEST_TEXT], charged_to)
+            equality = equality_of(record)
+            return Trigger(
+                record.time,
+                what,
+                record.id,
+                text[:_LONGEST_TEXT],
+                charged_to,
+                monitor=_short(record.detail.get("monitor")),
+                resource=_short(record.resource),
+                host=_short(record.host),
+                caller_id=_short(record.caller_id),
+                equal=f"{equality['key']} {equality['reason']}",
+            )
     return None
+
+
+def _short(value: object) -> str:
+    return "" if value is None else str(value)[:_LONGEST_TEXT]

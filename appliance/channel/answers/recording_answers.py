@@ -23,6 +23,13 @@ class Trigger(msgspec.Struct, frozen=True):
     charged_to: Annotated[
         str, doc("who caused it: robot, operators, appliance, unknown hosts, a host or network")
     ] = APPLIANCE
+    monitor: Annotated[str, doc("the monitor that acted; empty for other triggers")] = ""
+    resource: Annotated[str, doc("topic, service or call of the audit record")] = ""
+    host: Annotated[str, doc("address of the peer in the audit record")] = ""
+    caller_id: Annotated[str, doc("the name that this peer gave: a claim")] = ""
+    equal: Annotated[str, doc("the same in triggers whose audit records are equal; empty: equal to none")] = (
+        ""
+    )
 
 
 class RecordedTopic(msgspec.Struct, frozen=True):

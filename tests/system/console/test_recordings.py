@@ -1,12 +1,15 @@
 """Test recordings in the console: from a record, an investigator fetches the messages and an evidence bundle."""
 
+import copy
 import json
+import re
 import zipfile
 from collections.abc import Callable, Iterator
 
 import pytest
 from playwright.sync_api import expect
 
+from appliance.api.contract import EXAMPLES
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 
@@ -48,3 +51,29 @@ def test_an_investigator_takes_a_recording_from_its_record(
     expect(page.get_by_role("button", name="Bag")).to_have_attribute(
         "title", "For the role investigator; yours is admin"
     )
+
+
+def test_recordings_are_listed_by_their_trigger(opened: Callable[..., Reader]) -> None:
+    """A row begins with monitor, topic and node; equal ones in a row are one, whose button shows each by keyboard."""
+    shown = copy.deepcopy(EXAMPLES["Recordings"])
+    [recording] = shown["recordings"]
+    trigger = recording["triggers"][0] | {"monitor": "censor", "resource": "/rude", "caller_id": "/lout"}
+    trigger |= {"host": "10.0.0.9", "equal": "a b"}
+    other = trigger | {"monitor": "", "resource": "", "host": "", "text": "ann: the door", "equal": ""}
+    shown["recordings"] = [
+        recording | {"id": f"{number:020x}", "triggers": [one]}
+        for number, one in enumerate([other, other, trigger, trigger, trigger])
+    ]
+    reader = opened()
+    reader.page.route(re.compile("/v1/recordings$"), lambda route: route.fulfill(json=shown))
+    page = reader.go("recordings")
+    rows = page.locator("tbody tr")
+    expect(rows).to_have_count(3)
+    expect(rows.first.locator("td").first).to_contain_text("censor on /rude")
+    expect(rows.first.locator("td").first).to_contain_text("by /lout of 10.0.0.9")
+    expect(rows.nth(1).locator("td").first).to_contain_text("ann: the door")
+    more = rows.first.get_by_role("button", name="3 recordings")
+    more.press("Enter")
+    expect(more).to_have_attribute("aria-expanded", "true")
+    expect(rows).to_have_count(5)
+    assert reader.axe() == []

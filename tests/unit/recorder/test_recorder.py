@@ -111,7 +111,8 @@ def test_before_and_after(scene: Scene) -> None:
     scene.later(20)
     scene.say(TEXT.replace(b"hello", b"alarm"))
     scene.later(1)
-    dropped = scene.happen(reason="too fast")
+    where = {"host": "10.0.0.1", "caller_id": "/voice", "resource": "/chatter"}
+    dropped = scene.happen(reason="too fast", **where, detail={"monitor": "limit"})
     assert not scene.closed(scene.later(0.2))
     scene.say()
     assert not scene.closed(scene.later(4.9))
@@ -121,7 +122,18 @@ def test_before_and_after(scene: Scene) -> None:
     happened = BEGAN + 21 * SECOND
     assert (recording.began, recording.ended) == (happened - 10 * SECOND, happened + 5 * SECOND)
     assert (recording.complete, recording.why_not) == (True, "")
-    assert recording.triggers == [Trigger(happened, "drop", dropped, "message dropped: too fast")]
+    [trigger] = recording.triggers
+    assert trigger.equal
+    assert msgspec.structs.replace(trigger, equal="") == Trigger(
+        happened,
+        "drop",
+        dropped,
+        "message dropped: too fast",
+        monitor="limit",
+        resource="/chatter",
+        host="10.0.0.1",
+        caller_id="/voice",
+    )
     [topic] = recording.topics
     assert (topic.topic, topic.type, topic.messages, topic.missed) == ("/chatter", "std_msgs/String", 2, 0)
     found = scene.bag(recording)

@@ -3,7 +3,7 @@
 import { html, useState } from "../html.js";
 import { live } from "../live.js";
 import { lasting, Moment } from "../moments.js";
-import { bytes, count, counted } from "../numbers.js";
+import { bytes, counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
@@ -35,6 +35,7 @@ function List(/** @type {{value: any, error: unknown, again: () => void, running
   const [shown, setShown] = useState(PAGE);
   const off = error instanceof Problem && error.status === 404;
   const rows = [...(value?.recordings ?? [])].reverse();
+  const groups = alike(rows);
   const size = rows.reduce((sum, row) => sum + row.size, 0);
   return html`<div class="head"><h1>Recordings</h1>${value && html`<span class="head-sub">${counted(rows.length, "recording")}, ${bytes(size)}</span>`}
       <div class="head-actions"><${RecordNow} disabled=${off || !running} /></div></div>
@@ -42,18 +43,42 @@ function List(/** @type {{value: any, error: unknown, again: () => void, running
       ${off ? html`<${Empty} icon="recordings" title="The flight recorder is off">With <code>recorder: {enabled: true}</code> in appliance.yaml it keeps the robot's messages of the minute before an event.</${Empty}>`
         : error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${6} />`
         : !rows.length ? html`<${Empty} icon="recordings" title="No recording yet">A message dropped by a monitor, an alarm and the other triggers in <code>recorder.triggers</code> start one; so does Record now.</${Empty}>`
-        : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Began</th><th>Why</th><th class="number">Lasts</th><th class="number">Messages</th><th class="number">Size</th><th>State</th><th><span class="sr-only">Actions</span></th></tr></thead>
-          <tbody>${rows.slice(0, shown).map((row) => html`<${Row} key=${row.id} row=${row} again=${again} />`)}</tbody></table></div>
-          ${rows.length > shown && html`<div class="panel-body"><button class="button" onClick=${() => setShown(shown + PAGE)}>Older recordings</button></div>`}`}
+        : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>What happened</th><th>Began</th><th class="number">Lasts</th><th class="number">Contents</th><th class="number">Size</th><th>State</th><th><span class="sr-only">Actions</span></th></tr></thead>
+          <tbody>${groups.slice(0, shown).map((some) => html`<${Alike} key=${some[some.length - 1].id} rows=${some} again=${again} />`)}</tbody></table></div>
+          ${groups.length > shown && html`<div class="panel-body"><button class="button" onClick=${() => setShown(shown + PAGE)}>Older recordings</button></div>`}`}
     </section>`;
 }
 
-function Row(/** @type {{row: any, again: () => void}} */ { row, again }) {
+/** Recordings with equal first triggers in a row, newest first. @param {any[]} rows */
+export function alike(rows) {
+  /** @type {any[][]} */
+  const found = [];
+  for (const row of rows) {
+    const equal = row.triggers[0].equal;
+    if (equal && found.at(-1)?.[0].triggers[0].equal === equal) /** @type {any[]} */ (found.at(-1)).push(row);
+    else found.push([row]);
+  }
+  return found;
+}
+
+function Alike(/** @type {{rows: any[], again: () => void}} */ { rows, again }) {
+  const [open, setOpen] = useState(false);
+  const count = rows.length > 1 && html`<button class="count-badge" aria-expanded=${String(open)} title=${open ? "Show the last one only" : "Show each recording"} onClick=${() => setOpen(!open)}>${counted(rows.length, "recording")}<${Icon} name=${open ? "minus" : "plus"} size=${12} /></button>`;
+  return html`<${Row} row=${rows[0]} first=${rows[rows.length - 1]} count=${count} again=${again} />${open && rows.slice(1).map((row) => html`<${Row} key=${row.id} row=${row} part again=${again} />`)}`;
+}
+
+/** @param {{row: any, first?: any, count?: any, part?: boolean, again: () => void}} given `first`: the oldest of the recordings that the row stands for */
+function Row({ row, first = row, count, part = false, again }) {
   const [why, ...more] = row.triggers;
   const messages = row.topics.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + one.messages, 0);
-  return html`<tr><td class="first"><${Link} to=${`/console/recordings/${row.id}`}><${Moment} at=${row.began / 1e9} /></${Link}></td>
-    <td class="why" data-label="Why"><span><${Badge} word=${why.what} tone=${kindOf(why.what).tone} /> <${Given} value=${why.text} most=${120} />${more.length > 0 && html` <span class="muted">and ${counted(more.length, "more", "more")}</span>`}</span></td>
-    <td class="number nowrap" data-label="Lasts">${lasting((row.ended - row.began) / 1e9)}</td><td class="number" data-label="Messages"><span>${count(messages)} <span class="muted small nowrap">of ${counted(row.topics.length, "topic")}</span></span></td><td class="number nowrap" data-label="Size">${bytes(row.size)}</td>
+  return html`<tr class=${part ? "part" : ""}><td class="first why"><div class="row"><${Badge} word=${why.what} tone=${kindOf(why.what).tone} />
+      <${Link} to=${`/console/recordings/${row.id}`}>${why.monitor || why.resource ? html`${why.monitor && html`<strong><${Given} value=${why.monitor} most=${60} /></strong>`}${why.monitor && why.resource && " on "}${why.resource && html`<${Given} value=${why.resource} most=${80} mono />`}` : html`<${Given} value=${why.text} most=${120} />`}</${Link}>
+      ${(why.caller_id || why.host) && html`<span class="muted">by <${Given} value=${why.caller_id} most=${60} mono none="no name" /> of <${Given} value=${why.host} mono none="no address" /></span>`}${count}</div>
+      ${(why.monitor || why.resource) && html`<div class="muted"><${Given} value=${why.text} most=${160} />${more.length > 0 && html` <span class="small">and ${counted(more.length, "more", "more")}</span>`}</div>`}</td>
+    <td data-label="Began"><span><${Moment} at=${row.began / 1e9} />${first !== row && html` <span class="muted small nowrap">since <${Moment} at=${first.began / 1e9} /></span>`}</span></td>
+    <td class="number nowrap" data-label="Lasts">${lasting((row.ended - row.began) / 1e9)}</td>
+    <td class="number" data-label="Contents"><span>${counted(messages, "message")} <span class="muted small nowrap">of ${counted(row.topics.length, "topic")}</span></span></td>
+    <td class="number" data-label="Size"><span><span class="nowrap">${bytes(row.size)}</span> <span class="muted small mono">${row.id}</span></span></td>
     <td data-label="State">${row.complete ? html`<${Badge} word="complete" tone="allow" />` : html`<${Badge} word="incomplete" tone="warn" title=${row.why_not} />`}</td>
     <td><div class="row taking"><${Taking} row=${row} small /><${Remove} row=${row} small gone=${again} /></div></td></tr>`;
 }
