@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from rosmop.form.findings import Position
 from rosmop.logics.catalogue import LOGICS, compile_property
-from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError
+from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Source
+from rosmop.logics.lexer import TokenReader
 from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, ORIGIN, compiled, play, refusal, seeded
 
@@ -105,6 +106,14 @@ def test_the_documented_example_compiles(logic: str) -> None:
     example = page.split(f"\n## {logic}\n")[1].split("\n\n")[0]
     formula = example.split("```")[1] if "```" in example else example.strip("`")
     assert compiled(logic, formula, ROWS[logic][2]).categories
+
+
+def test_a_logic_may_have_no_signs() -> None:
+    """A formula of names and numbers only is read; every sign is refused."""
+    reader = TokenReader(Source("plain", "3 a // b", ABC, ORIGIN), ())
+    assert [reader.take().text for _ in range(3)] == ["3", "a", ""]
+    with pytest.raises(FormulaError, match="`%` has no meaning in plain"):
+        TokenReader(Source("plain", "3 %", ABC, ORIGIN), ())
 
 
 def test_an_unknown_logic_has_the_position_of_its_name() -> None:
