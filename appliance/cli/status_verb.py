@@ -3,10 +3,12 @@
 import datetime
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -23,33 +25,72 @@ from appliance.channel.answers.status import (
     Status,
 )
 from appliance.channel.status_summary import process_names
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import moment, say_json, usage_error
+from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
 _MOST_TROUBLES = 5
+_WATCH_SECONDS = 2.0
 _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
-@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object")])
-def status(appliance: Appliance) -> None:
+@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object; with --watch one a line")])
+def status(
+    appliance: Appliance,
+    seconds: Annotated[
+        float | None,
+        typer.Argument(
+            min=LEAST_SECONDS,
+            max=LONGEST_SECONDS,
+            help="With --watch: the time between two statuses (default: 2)",
+            show_default=False,
+        ),
+    ] = None,
+    *,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
+    ] = False,
+) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 
-    Exit status: 0 in service, 1 needs attention, 2 not running.
+    Exit status: 0 in service, 1 needs attention, 2 not running; with --watch that of the last status.
 
-    Example: rosrv status --state /var/lib/rosrv
+    Example: rosrv status --watch 5
     """
-    body = appliance.ask_or_exit(StatusWanted())
-    troubles = list(troubles_of(body))
+    if seconds is not None and not watch:
+        raise usage_error("SECONDS needs --watch", "rosrv status")
+    try:
+        if watch:
+            each = seconds or _WATCH_SECONDS
+            raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
+        view = _view(appliance.body_or_exit(appliance.ask(StatusWanted())))
+    except NotRunningError as error:
+        raise usage_error(str(error)) from None
     if appliance.as_json:
-        say_json({**in_full(body), "troubles": troubles})
+        say_json(view.fields)
     else:
-        show(body, troubles)
-    raise typer.Exit(1 if troubles else 0)
+        Console(highlight=False).print(view.screen)
+    raise typer.Exit(view.exit_status)
+
+
+def _look(appliance: Appliance) -> StatusView:
+    """Return the present status. Raises `NotRunningError` also for an appliance that cannot give it now."""
+    answer = appliance.ask(StatusWanted())
+    if not answer.ok:
+        raise NotRunningError(answer.error)
+    return _view(answer.given())
+
+
+def _view(body: Status) -> StatusView:
+    troubles = list(troubles_of(body))
+    fields = {**in_full(body), "troubles": troubles}
+    return StatusView(1 if troubles else 0, StatusScreen(body, troubles), fields)
 
 
 def troubles_of(body: Status) -> list[str]:
@@ -61,12 +102,23 @@ def troubles_of(body: Status) -> list[str]:
     ]
 
 
-def show(body: Status, troubles: list[str]) -> None:
-    """Print a status as text, problems first."""
-    console = Console(highlight=False)
+@dataclass(frozen=True, slots=True)
+class StatusScreen:
+    """A status as text, problems first; its tables have the width of the terminal."""
+
+    body: Status
+    troubles: list[str]
+
+    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield its parts."""
+        for trouble in shortened(self.troubles, _MOST_TROUBLES):
+            yield Text(f"! {trouble}", style=_RED)
+        yield _grid(self.body)
+        yield processes_table(self.body.processes, options.max_width)
+
+
+def _grid(body: Status) -> Table:
     audit = body.audit
-    for trouble in shortened(troubles, _MOST_TROUBLES):
-        console.print(Text(f"! {trouble}", style=_RED))
     grid = Table.grid(padding=(0, 2))
     grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since)}")
     isolation = Text(_isolation(body), style=_YELLOW if body.isolation == "none" else _GREEN)
@@ -110,9 +162,7 @@ def show(body: Status, troubles: list[str]) -> None:
     if body.recorder is not None:
         kept = body.recorder
         grid.add_row("recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB")
-    console.print(grid)
-    table = processes_table(body.processes, console.width)
-    console.print(table)
+    return grid
 
 
 def _policy(policy: PolicyState) -> Text:

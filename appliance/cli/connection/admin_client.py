@@ -25,6 +25,10 @@ class NotRunningError(Exception):
     """Report that no appliance answers, or that it rejects this user or token; the text has the remedy."""
 
 
+class AccessDeniedError(NotRunningError):
+    """Report that this user or token may not use the appliance, which waiting does not change."""
+
+
 class AdminSocket:
     """A client of the appliance that runs with a state directory; each answer may take `seconds`."""
 
@@ -57,7 +61,7 @@ class AdminSocket:
                 f"{self.state}: no appliance is running with this state directory; start it: rosrv up"
             ) from None
         except PermissionError:
-            raise NotRunningError(f"{path}: only its owner and root have access; use sudo") from None
+            raise AccessDeniedError(f"{path}: only its owner and root have access; use sudo") from None
         except ConnectionRefusedError:
             raise NotRunningError(
                 f"{self.state}: the appliance that used this state directory has stopped"

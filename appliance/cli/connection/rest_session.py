@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.base.input_files import read_given_text
-from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, NotRunningError
+from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, AccessDeniedError, NotRunningError
 from appliance.configuration.settings import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from appliance.store.access_tokens import parse_token
@@ -167,11 +167,11 @@ class RestClient:
         wait = answer.headers.get("Retry-After")
         match answer.status_code:
             case 401:
-                return NotRunningError(
+                return AccessDeniedError(
                     f"{self.url}: the token in ROSRV_TOKEN is not accepted: {detail}; {_MAKE}"
                 )
             case 403 | 421:
-                return NotRunningError(f"{self.url}: {detail}")
+                return AccessDeniedError(f"{self.url}: {detail}")
             case 429 | 503 if wait is not None:
                 return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
         if kind == "unknown-path":

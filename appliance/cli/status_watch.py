@@ -1,0 +1,122 @@
+"""Show the status again and again: in place on a terminal, one after the other in a pipe."""
+
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from appliance.audit.record_format import rfc3339
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
+from appliance.cli.output import say_json
+from rosmop.tool.terminal import printable
+
+LEAST_SECONDS, LONGEST_SECONDS = 1.0, 3600.0
+_INTERRUPTED, _AWAY = 130, 2
+_MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment
+_MINUTES = slice(11, 19)  # the time of day in RFC 3339
+
+
+class StatusView(NamedTuple):
+    """One status: its exit status, how a terminal shows it, and its JSON object."""
+
+    exit_status: int
+    screen: RenderableType
+    fields: Mapping[str, Any]
+
+
+Look = Callable[[], StatusView]
+
+
+class _Looks:
+    """Looks at the appliance; while it does not answer, the view has the reason and the time since when."""
+
+    def __init__(self, look: Look) -> None:
+        self._look = look
+        self._away_since: int | None = None
+        self._denied = -math.inf  # the first denial is final
+        self.exit_status = _INTERRUPTED
+
+    def next(self) -> StatusView:
+        """Return the next view. Raises `AccessDeniedError`."""
+        try:
+            view = self._look()
+        except AccessDeniedError as error:
+            self._denied += 1
+            if not 0 < self._denied < _MOST_DENIED:
+                raise
+            view = self._away(error)
+        except NotRunningError as error:
+            view = self._away(error)
+        else:
+            self._away_since, self._denied = None, 0
+        self.exit_status = view.exit_status
+        return view
+
+    def _away(self, error: NotRunningError) -> StatusView:
+        if self._away_since is None:
+            self._away_since = time.time_ns()
+        since = rfc3339(self._away_since)
+        text = f"not running since {since[_MINUTES]}Z: {printable(str(error))}"
+        return StatusView(
+            _AWAY, Text(text, style="bold red"), {"not_running_since": since, "error": str(error)}
+        )
+
+
+def watched(look: Look, seconds: float, *, as_json: bool) -> int:
+    """Show the status every `seconds` until it is interrupted; return the exit status of the last one.
+
+    `look` raises `NotRunningError` while the appliance does not answer. Raises `AccessDeniedError`.
+    """
+    looks, console = _Looks(look), Console(highlight=False)
+    try:
+        if as_json or not console.is_terminal or console.is_dumb_terminal:
+            _print_each(looks, seconds, console, as_json=as_json)
+        else:
+            _redraw(looks, seconds, console)
+    except KeyboardInterrupt:
+        pass
+    except BrokenPipeError:  # the reader (head, less) has ended: discard the buffered output
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return looks.exit_status
+
+
+def _print_each(looks: _Looks, seconds: float, console: Console, *, as_json: bool) -> None:
+    between, pause = "", threading.Event()
+    while True:
+        view = looks.next()
+        if as_json:
+            say_json(view.fields)
+        else:
+            with console.capture() as captured:
+                console.print(view.screen)
+            sys.stdout.write(between + captured.get())
+            between = "\n"
+        sys.stdout.flush()
+        pause.wait(seconds)
+
+
+def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
+    """Redraw on the terminal's other screen, also when its size changes; leave the last status on the normal one."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
+    view = None
+    try:
+        with Live(console=console, screen=True, auto_refresh=False) as live:
+            while True:
+                view = looks.next()
+                now = f"{rfc3339(time.time_ns())[_MINUTES]}Z, every {seconds:g} s until Ctrl-C"
+                live.update(Group(Text(now, style="dim"), view.screen), refresh=True)
+                end = time.monotonic() + seconds
+                while (left := end - time.monotonic()) > 0:
+                    if signal.sigtimedwait({signal.SIGWINCH}, left) is not None:
+                        live.refresh()
+    finally:
+        if view is not None:
+            console.print(view.screen)
