@@ -45,7 +45,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[FormulaToken]:
             0, f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties"
         )
     longest_first = [_sign_pattern(sign) for sign in sorted(signs, key=len, reverse=True)]
-    lettered = "|".join(sign for sign in longest_first if sign[0].isalpha())
+    lettered = "|".join(sign for sign in longest_first if sign[0].isalpha()) or "(?!)"
     alternatives = "|".join(longest_first) or "(?!)"
     pattern = re.compile(
         r"(?P<space>\s+|//[^\n]*|/\*.*?\*/)"
