@@ -49,6 +49,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
+        ("blocks.hosts", 1, "hosts-blocked", "warning", "hosts"),
         ("recorder", {"running": False}, "recorder", "warning", "system"),
         (
             "processes",
@@ -71,6 +72,20 @@ def test_one_missing_relay_is_not_reported_as_all() -> None:
     (alarm,) = open_alarms(changed("relay", "1 of 2 are away"))
     assert "1 of 2 are away: their topics" in alarm.text
     assert open_alarms(changed("audit.forwarding", FORWARDING)) == []
+
+
+@pytest.mark.parametrize(
+    ("hosts", "end", "text"),
+    [
+        (1, None, "1 host is blocked, without an end: rosrv host blocks"),
+        (1, 0.0, "1 host is blocked, the block ends at 1970-01-01T00:00:00+00:00: rosrv host blocks"),
+        (3, 0.0, "3 hosts are blocked, the first block ends at 1970-01-01T00:00:00+00:00: rosrv host blocks"),
+    ],
+)
+def test_blocks_are_one_line_with_count_and_earliest_end(hosts: int, end: float | None, text: str) -> None:
+    """A thousand blocks do not fill the status."""
+    [alarm] = open_alarms(example(Status, **GOOD, blocks={"hosts": hosts, "first_end": end}))
+    assert alarm.text == text
 
 
 def test_the_gravest_come_first() -> None:

@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 
 from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
+from appliance.audit.search import export
 from appliance.configuration.settings import Settings
 from appliance.control.listener_limits import ListenerLimits, class_of
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.rpc.connection_table import ConnectionTable, Stage
-from appliance.rpc.server import HttpRequest
+from appliance.rpc.server import HttpRequest, Peer
 from appliance.telemetry.audit_trail import AuditTrail
+from roswire.xmlrpc import build_call
 
 pytestmark = pytest.mark.anyio
 
@@ -148,3 +151,29 @@ def test_connections_of_a_wildcard_displace_no_named_host(everybodys: ListenerLi
 
 
 ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")
+
+
+@pytest.mark.parametrize(
+    ("tell", "told"), [("rule", "10.0.0.1 is blocked by an operator ["), ("id", "denied [")]
+)
+def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, tell: str, told: str) -> None:
+    """The record has the whole reason, and the answer what `tell` allows; the appliance's own calls are served."""
+    policy = compile_policy(
+        f"[Options]\ntell = {tell}\naudit-only = all\n[Nodes]\ndefault = *\n", file="a.ini"
+    )
+    blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
+    log = AuditLog(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
+    refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))
+    assert refusal is not None
+    assert told in str(refusal(build_call("getPid", ("/node",))))
+    assert limits.refuse(Peer(address_of("10.0.0.2"), "10.0.0.2", "10.0.0.9")) is None
+    assert limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.1")) is None
+    log.close()
+    [record] = [entry.record for entry in export(tmp_path / "audit.db", Filter(decision=("deny",)))]
+    assert (record.reason, record.host, record.resource) == (
+        "10.0.0.1 is blocked by ann: odd",
+        "10.0.0.1",
+        "getPid",
+    )

@@ -1,6 +1,7 @@
 """The quota class of a host: from the policy in force and its registrations."""
 
 import ipaddress
+from dataclasses import replace
 
 from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.quota_class import HostQuotaClass, charged_to
@@ -41,3 +42,13 @@ def test_recordings_are_charged_by_the_policys_names() -> None:
         UNKNOWN,
         APPLIANCE,
     ]
+
+
+def test_a_blocked_host_is_unknown() -> None:
+    """Its quota is shared with all unknown hosts, and so is the charge for recordings about it."""
+    policy = replace(
+        compile_policy("[Nodes]\n/a = 10.0.0.1 10.0.0.2\n", file="a.ini"), blocks={NAMED: "blocked"}
+    )
+    quota_class = HostQuotaClass(lambda: policy, lambda _host: 0)
+    assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.NAMED)
+    assert (quota_class.of_text("10.0.0.1"), charged_to(policy, "10.0.0.1")) == (QuotaClass.UNKNOWN, UNKNOWN)

@@ -2,6 +2,7 @@
 
 import ipaddress
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -213,3 +214,49 @@ def test_memory_does_not_grow_with_requests() -> None:
     assert len(policy.kept) <= 8192
     assert len(policy.hosts.kept) <= 1024
     assert max(len(key[-1]) for key in policy.kept) <= 256
+
+
+BLOCK = {
+    ipaddress.ip_address(
+        "10.0.0.5"
+    ): "blocked by ann until noon: odd; lift it with `rosrv host unblock 10.0.0.5`"
+}
+
+
+@pytest.mark.parametrize("options", ["", "[Options]\naudit-only = all\n"])
+@pytest.mark.parametrize("spelling", ["10.0.0.5", "::ffff:10.0.0.5"])
+def test_a_block_denies_every_request_of_its_host_alone(options: str, spelling: str) -> None:
+    """Whatever the rules say: named calls, parameters without a section, audit-only sections, unknown resources."""
+    free = compiled(
+        options + "[Nodes]\ndefault=10.0.0.0/24\n[Commands]\ndefault=*\nshutdownMaster=10.0.0.5\n"
+    )
+    policy = replace(free, blocks=BLOCK)
+    asked = [("node", "/n"), ("read", "/p"), ("write", "/"), ("publish", "nonsense")]
+    asked += [("command", name) for name in ("getPid", "shutdownMaster", "nonsense")]
+    for category, resource in asked:
+        decision = ask(policy, spelling, category, resource)
+        assert (decision.allowed, decision.would_deny, decision.rule) == (False, False, None)
+        assert decision.reason == f"10.0.0.5 is {next(iter(BLOCK.values()))}"
+        request = Request(ipaddress.ip_address(spelling), "/n", Category(category), resource)
+        assert not decide(policy, rights_of(request)).allowed
+        if category in ("read", "write"):
+            assert not policy.decide_parameter(request, namespace=True).allowed
+        assert ask(policy, "10.0.0.6", category, resource) == ask(free, "10.0.0.6", category, resource)
+    assert ask(free, spelling, "command", "getPid").allowed
+
+
+def test_a_blocked_host_counts_as_unknown() -> None:
+    """It is not named, and counted with all unknown hosts; the other hosts of its network are counted as before."""
+    policy = replace(compiled("[Nodes]\ndefault=10.0.0.0/24 10.0.0.5\n"), blocks=BLOCK)
+    host, other = ipaddress.ip_address("::ffff:10.0.0.5"), ipaddress.ip_address("10.0.0.6")
+    assert (policy.knows(host), policy.names(host), policy.counted_as(host)) == (False, False, "")
+    assert (policy.knows(other), policy.names(other), policy.counted_as(other)) == (True, True, "10.0.0.0/24")
+
+
+@pytest.mark.parametrize(("tell", "told"), [("rule", "is blocked by an operator"), ("id", "denied")])
+def test_a_blocked_host_learns_neither_operator_nor_note(tell: str, told: str) -> None:
+    """Only `tell = full` gives it the whole reason."""
+    policy = replace(compiled("[Nodes]\ndefault=*\n"), blocks=BLOCK)
+    decision = ask(policy, "10.0.0.5", "node", "/n")
+    assert text_for_caller(decision, tell).removeprefix("10.0.0.5 ") == told
+    assert text_for_caller(decision, "full") == decision.reason

@@ -4,6 +4,7 @@ import contextlib
 import ipaddress
 import socket
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -176,3 +177,32 @@ def test_hosts_that_the_policy_names_are_accepted_first() -> None:
         assert choose(program, address_of(text)) == FIRST
     for text in ("10.0.0.2", "10.2.0.1", "fd78::9", "::2"):
         assert choose(program, address_of(text)) == SECOND
+
+
+def test_blocked_hosts_are_accepted_after_named_hosts() -> None:
+    """A block wins over the network that holds the host; with too many blocks, the named hosts stay in front."""
+    known, blocked = networks("10.0.0.0/16", "fd00::/64"), ["10.0.0.7", "fd00::7"]
+    program = first_for(known, map(address_of, blocked))
+    for source, socket_number in (
+        ("10.0.0.7", SECOND),
+        ("fd00::7", SECOND),
+        ("10.0.0.8", FIRST),
+        ("fd00::8", FIRST),
+    ):
+        assert choose(program, address_of(source)) == socket_number, source
+    many = [address_of(f"10.0.{number >> 8}.{number & 255}") for number in range(1000)]
+    program = first_for(known, many)
+    assert choose(program, address_of("10.0.200.1")) == FIRST
+    assert choose(program, address_of("192.0.2.1")) == SECOND
+
+
+def test_a_block_makes_a_new_program() -> None:
+    """The block of a host that no rule names needs no instruction."""
+    policies = [compile_policy("[Nodes]\n/a = 10.0.0.0/24\n", file="a.ini")]
+    program = NamedFirst(lambda: policies[-1])
+    before = program()
+    policies.append(replace(policies[0], blocks={address_of("192.0.2.7"): "blocked"}))
+    assert program() == before
+    policies.append(replace(policies[0], blocks={address_of("10.0.0.7"): "blocked"}))
+    assert choose(program(), address_of("10.0.0.7")) == SECOND
+    assert choose(before, address_of("10.0.0.7")) == FIRST

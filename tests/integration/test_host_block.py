@@ -1,0 +1,115 @@
+"""A host is blocked while a robot works: its messages stop, others continue, and it returns without a restart."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import pytest
+
+from appliance.channel.admin import HostBlocks, HostUnblock
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import Client, RosSession
+from tests.support.processes import Process
+from tests.support.waiting import eventually
+
+TABLET = "10.77.0.66"
+SOME = 15
+"""The number of messages of the robot's own talker in which a blocked talker would have been heard."""
+
+
+@pytest.fixture(scope="module")
+def appliance(own_appliance: Appliance) -> Appliance:
+    """Return the appliance of this file."""
+    return own_appliance
+
+
+@pytest.fixture(scope="module")
+def tablet(common_lab: Lab) -> Host:
+    """The host that is blocked."""
+    return common_lab.host("tablet", f"{TABLET}/24")
+
+
+class Robot(NamedTuple):
+    """A listener and a talker on the robot, and a talker on the tablet."""
+
+    listener: Process
+    tablet: RosSession
+
+    def hears(self, name: str) -> None:
+        """Wait for a new message of a talker."""
+        self.listener.wait_for(event="received", publisher=name, since=self.listener.mark())
+
+    def heard(self) -> set[str]:
+        """Return the talkers of the messages that arrive with the next messages of the robot's own talker."""
+        self.hears("/friend")  # messages that were already sent have arrived
+        first = self.listener.mark()
+        self.listener.wait_for_count(SOME, event="received", publisher="/friend", since=first)
+        return {event["publisher"] for event in self.listener.events[first:] if "publisher" in event}
+
+
+@pytest.fixture
+def robot(appliance: Appliance, ros: RosSession, tablet: Host) -> Iterator[Robot]:
+    """A robot that hears its own talker and one on the tablet; the tablet is not blocked afterwards."""
+    appliance.ignore_earlier_records()
+    client: Client = "rospy"
+    listener = ros.listener(client, "/chatter")
+    ros.talker("roscpp", "/chatter", name="friend")
+    ros.on(tablet).talker(client, "/chatter", name="stranger")
+    found = Robot(listener, ros.on(tablet))
+    found.hears("/friend")
+    found.hears("/stranger")
+    yield found
+    for row in appliance.ask(HostBlocks()).blocks:
+        appliance.ask(HostUnblock(row.address))
+
+
+def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, robot: Robot) -> None:
+    """The answer has the numbers; calls of the host are denied with the reason; no node is restarted."""
+    said = appliance.rosrv("host", "block", TABLET, "--for", "1h", "--note", "tablet lost").stdout
+    assert said.startswith(f"{TABLET} is blocked until ")
+    assert "it lost 2 publications, 2 services, " in said  # /chatter and /rosout, and rospy's loggers
+    assert robot.heard() == {"/friend"}
+
+    assert robot.tablet.run("rostopic", "list", check=False).returncode != 0
+    [denied, *_] = appliance.recorded("--deny", "--event", "decision", host=TABLET)
+    assert denied["reason"].startswith(f"{TABLET} is blocked by operator until ")
+    assert denied["reason"].endswith(f": tablet lost; lift it with `rosrv host unblock {TABLET}`")
+    assert f"{TABLET} is blocked by operator" in appliance.rosrv("audit", "why", denied["id"]).stdout
+    explained = appliance.rosrv(
+        "policy", "explain", "--host", TABLET, "--node", "/stranger", "--publish", "/chatter", check=False
+    )
+    assert explained.returncode == 1
+    assert f"denied: {TABLET} is blocked by operator until " in explained.stdout
+    assert f"answer to the host: {TABLET} is blocked by an operator\n" in explained.stdout
+    assert any("1 host is blocked, the block ends at" in line for line in appliance.status()["troubles"])
+
+    assert "4 registrations returned" in appliance.rosrv("host", "unblock", TABLET).stdout
+    robot.hears("/stranger")
+    assert "/chatter" in robot.tablet.run("rostopic", "list").stdout
+
+
+def test_a_block_survives_a_crash_right_after_its_order(appliance: Appliance, robot: Robot) -> None:
+    """Control is killed as soon as the order is answered, and later the whole appliance is restarted."""
+    appliance.rosrv("host", "block", TABLET)
+    appliance.kill("control")
+    assert robot.heard() == {"/friend"}
+    appliance.stop()
+    appliance.start()
+    assert robot.heard() == {"/friend"}
+    assert [row.address for row in appliance.ask(HostBlocks()).blocks] == [TABLET]
+    appliance.rosrv("host", "unblock", TABLET)
+    robot.hears("/stranger")
+
+
+def test_a_block_ends_on_time_also_while_the_appliance_is_off(appliance: Appliance, robot: Robot) -> None:
+    """The host's nodes are heard again, and new ones can register without an order."""
+    appliance.rosrv("host", "block", TABLET, "--for", "2s")
+    appliance.recorded("--event", "host block ended")
+    robot.hears("/stranger")
+    appliance.rosrv("host", "block", TABLET, "--for", "3s")
+    appliance.stop()
+    appliance.start()
+    eventually(lambda: not appliance.ask(HostBlocks()).blocks, "the block is over")
+    robot.hears("/stranger")
+    robot.tablet.talker("roscpp", "/chatter", name="late_stranger")
+    robot.hears("/late_stranger")
