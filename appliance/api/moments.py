@@ -27,8 +27,8 @@ def in_full(value: Any) -> Any:
         if units is None:
             return value
         fields: dict[str, Any] = {}
-        for name in value.__struct_fields__:
-            fields[name] = in_full(getattr(value, name))
+        for name, inner in msgspec.structs.asdict(value).items():
+            fields[name] = in_full(inner)
             if name in units and fields[name] is not None:
                 fields[name + _UTC] = _text(fields[name], units[name])
         return fields

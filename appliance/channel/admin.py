@@ -703,8 +703,9 @@ else:
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:
     """Return the row of a request, or None if REST does not have the request."""
+    given = msgspec.structs.asdict(request)
     for operation in rows().get(type(request), ()):
-        if all(getattr(request, name) == operation.fixed[name] for name in operation.fixed):
+        if all(given[name] == value for name, value in operation.fixed.items()):
             return operation
     return None
 

@@ -123,10 +123,10 @@ class _Deferred(TyperCommand):
         try:
             return command.make_context(info_name, args, parent, **extra)
         except typer.BadParameter as error:
-            # typer chains pydantic's error.
-            wrong: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
-            if wrong:
-                error.message = refusal(wrong[0])
+            from pydantic import ValidationError  # noqa: PLC0415  a correct command line does not need it
+
+            if isinstance(error.__cause__, ValidationError):  # typer chains it
+                error.message = refusal(error.__cause__.errors()[0])
             raise
 
 

@@ -24,7 +24,7 @@ from appliance.control.host_blocks import HostBlocks
 from appliance.control.policies import Policies
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.live_rights import LiveRight
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
 from appliance.rpc.front import plain_address
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
@@ -125,9 +125,8 @@ class BlockOrders:
                 f"{address} is blocked now, but a stop of the appliance ends it: {error}"
             ) from error
         await self._carried_out()
-        others = sorted(
-            self._same_machine(row.address) - {one.address for one in self._blocks.rows().values()}
-        )
+        knows = self._policies.current.knows
+        others = sorted(other for other in self._same_machine(row.address) if knows(address_of(other)))
         return answers.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
 
     async def unblock(self, request: admin.HostUnblock, who: str) -> answers.HostUnblocked:
@@ -263,9 +262,8 @@ def _is_own(address: Address) -> bool:
 
 
 def _difference(before: answers.BlockEnded, after: answers.BlockEnded) -> answers.BlockEnded:
-    return answers.BlockEnded(
-        **{name: count - getattr(after, name) for name, count in asdict(before).items()}
-    )
+    left = asdict(after)
+    return answers.BlockEnded(**{name: count - left[name] for name, count in asdict(before).items()})
 
 
 def in_words(held: answers.BlockEnded) -> str:

@@ -296,6 +296,14 @@ def test_the_matrix_has_every_operation() -> None:
     }  # fmt: skip
 
 
+def test_rows_name_fields_of_their_requests() -> None:
+    """A misspelt field in a row would be sent elsewhere, or not be protected."""
+    for one in OPERATIONS:
+        known = {field.name for field in one.fields().values()}
+        assert {*one.query, *one.fixed, *one.admin_with, *one.filled} <= known, one.request
+        assert set(re.findall(r"{(\w+)", one.path)) <= {*one.fields()}, one.path
+
+
 def test_pruning_is_for_admins() -> None:
     """Operators load the folder's files; only admins remove monitors whose files the folder does not have."""
     for role, status in (("operator", 403), ("admin", 503)):

@@ -1,5 +1,6 @@
 """Tests of `appliance.supervisor.roles`."""
 
+import pkgutil
 import subprocess
 from pathlib import Path
 
@@ -106,6 +107,7 @@ def test_rows_are_consistent() -> None:
     """Each role has a user of the design, and runs our code or a foreign program. No two of ours share a part."""
     assert all(role.user in NUMERIC_IDS for role in ROLES)
     assert all((role.entry is None) != (role.program is None) for role in ROLES)
+    assert all(callable(pkgutil.resolve_name(role.entry)) for role in ROLES if role.entry is not None)
     parts = [role.part for role in ROLES if role.entry]
     assert len(parts) == len(set(parts))
 
