@@ -1,0 +1,16 @@
+"""The console's editors know the words of the languages."""
+
+import re
+from pathlib import Path
+
+import appliance.api
+from rosmop.logics.catalogue import LOGICS
+
+LANGUAGES = Path(appliance.api.__file__).parent / "console" / "js" / "parts" / "languages.js"
+
+
+def test_every_logic_is_highlighted() -> None:
+    """The names of all logics are keywords of specifications."""
+    found = re.search(r'KEYWORDS = new Set\("([^"]+)"', LANGUAGES.read_text(encoding="utf-8"))
+    assert found is not None
+    assert LOGICS.keys() - set(found[1].split()) == set()
