@@ -20,7 +20,7 @@ from appliance.channel.answers import host_answers as answers
 from appliance.channel.answers.status import BlocksState
 from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.host_blocks import HostBlocks
+from appliance.control.host_blocks import BlockTable
 from appliance.control.policies import Policies
 from appliance.hosts.host_table import HostRefusedError
 from appliance.policy.live_rights import LiveRight
@@ -52,7 +52,7 @@ class BlockOrders:
 
     def __init__(
         self,
-        blocks: HostBlocks,
+        blocks: BlockTable,
         policies: Policies,
         store: StateStore,
         trail: AuditTrail,

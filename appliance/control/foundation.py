@@ -13,7 +13,7 @@ from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
 from appliance.configuration.settings import Settings
-from appliance.control.host_blocks import HostBlocks
+from appliance.control.host_blocks import BlockTable
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.policies import Policies
 from appliance.control.quota_class import HostQuotaClass, charged_to
@@ -78,7 +78,7 @@ class Foundation:
     trail: AuditTrail
     plan: RecordingPlan
     store: StateStore
-    blocks: HostBlocks
+    blocks: BlockTable
     table: HostTable
     tunnels: Tunnels
     policies: Policies
@@ -122,7 +122,7 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
-    blocks = HostBlocks.of(store, settings.state / "control")
+    blocks = BlockTable.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))

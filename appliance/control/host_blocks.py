@@ -22,14 +22,14 @@ _SECOND = 1_000_000_000
 _NOTE_SHOWN = 60  # characters; the reason of a decision is bounded
 
 
-class HostBlocks:
+class BlockTable:
     """All blocks, by canonical address; `clock()` is the age clock."""
 
     def __init__(self, store: StateStore, clock: Callable[[], int]) -> None:
         self._store = store
         self._clock = clock
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
-        self._now = clock() if self._rows else 0
+        self._now, self._wall = clock() if self._rows else 0, time.time()
         self.reasons: Mapping[Address, str] = self._described()
 
     @classmethod
@@ -46,11 +46,11 @@ class HostBlocks:
 
     def read_clock(self) -> None:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
-        self._now = self._clock()
+        self._now, self._wall = self._clock(), time.time()
 
     def until(self, row: HostBlockRow) -> float | None:
         """Return the end of a block by the present system clock, in seconds since the epoch; None: it has no end."""
-        return None if row.ends is None else time.time() + (row.ends - self._now) / _SECOND
+        return None if row.ends is None else self._wall + (row.ends - self._now) / _SECOND
 
     def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:
         """Store a block from now on, in place of an earlier block of the host."""

@@ -45,6 +45,7 @@ class Host(msgspec.Struct, frozen=True):
     last_seen: Annotated[Moment | None, doc("when a packet last arrived through its tunnel")]
     token_expires: Annotated[Moment | None, doc("when its one-time token expires; null: none")]
     ports: PortsSeen
+    token_by: Annotated[str, doc("who made its one-time token; empty: there is none")] = ""
 
 
 class Machine(msgspec.Struct, frozen=True):
@@ -105,7 +106,8 @@ class HostBlocked(BlockedHost, frozen=True, kw_only=True):
     ended: BlockEnded
     replaced: Annotated[BlockedHost | None, doc("its earlier block; null: it was not blocked")]
     other_addresses: Annotated[
-        list[str], doc("addresses of the same machine that are not blocked: of its tunnel, or outside it")
+        list[str],
+        doc("addresses of the same machine with rights that are not blocked: of its tunnel, or outside it"),
     ]
 
 

@@ -78,6 +78,27 @@ def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> 
     assert (row["name"], row["address"], row["state"], row["remote"]) == ("ocu-1", joined.address, "up", OCU)
 
 
+def test_a_host_is_blocked_by_its_name_while_its_tunnel_stays(site: TunnelSite, joined: JoinedHost) -> None:
+    """Its messages stop and return; the answer names the machine's other address, whose block alone changes nothing."""
+    with site.talking(joined) as (_talker, listener):
+        said = site.appliance.rosrv("host", "block", OCU).stdout
+        assert f"the same machine also has the address {joined.address}, which is not blocked" in said
+        listener.wait_for(event="received", since=listener.mark())
+        said = site.appliance.rosrv("host", "block", "ocu-1").stdout
+        assert said.startswith(
+            f"{joined.address} (ocu-1) is blocked until `rosrv host unblock {joined.address}`; "
+        )
+        assert "which is not blocked" not in said
+        with RosSession(joined.master, site.home, joined) as there:
+            assert there.run("rostopic", "list", check=False).returncode != 0
+        quiet = listener.mark()
+        assert site.is_up()["address"] == joined.address
+        assert not [event for event in listener.events[quiet:] if event["event"] == "received"]
+        site.appliance.rosrv("host", "unblock", "ocu-1")
+        listener.wait_for(event="received", since=listener.mark())
+        site.appliance.rosrv("host", "unblock", OCU)
+
+
 def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
     """Packets in clear text from the trusted address are dropped, with or without a tunnel."""
     forged = "10.113.11.2"

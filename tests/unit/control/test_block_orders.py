@@ -71,7 +71,7 @@ class Control(ControlParts):
         state.mkdir(exist_ok=True)
         (state / "policy.ini").write_text(text)
         self.state = StateStore(state, failed=print)
-        self.blocks = host_blocks.HostBlocks(self.state, clock)
+        self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
         self.policies = Policies(
             state / "policy.ini",
