@@ -15,10 +15,12 @@ def lines_of(record: AuditRecord) -> Iterator[str]:
     detail = record.detail
     yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]
-    who = [part for part in (record.caller_id, record.host and f"on {record.host}") if part]
+    author = detail.get("who")
+    who = [str(part) for part in (record.caller_id, author, record.host and f"on {record.host}") if part]
     if who or sent:
         message = f"message {', '.join(sent)} of " if sent else ""
-        yield f"by: {message}{' '.join(who) or 'unknown'}"
+        when = f", {rfc3339(record.time)}" if author else ""
+        yield f"by: {message}{' '.join(who) or 'unknown'}{when}"
     if record.rule is not None:
         yield f"rule: {rule_text(record.rule)}"
     places = _list(detail.get("at"))

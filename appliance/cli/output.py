@@ -24,6 +24,12 @@ def moment(seconds: float) -> str:
     return datetime.datetime.fromtimestamp(seconds, datetime.UTC).strftime("%Y-%m-%d %H:%MZ")
 
 
+def loaded_by(who: str, seconds: float | None) -> str:
+    """Return who loaded a policy or specifications, and when; those of the disk were read."""
+    how = "read from disk" if who == "disk" else f"loaded by {who}"
+    return how if seconds is None else f"{how} {moment(seconds)}"
+
+
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
     """Print an error of the command line; the caller raises the result (exit status 2)."""
     typer.echo(f"{verb}: {printable(text)}", err=True)

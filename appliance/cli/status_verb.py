@@ -27,7 +27,7 @@ from appliance.channel.answers.status import (
 from appliance.channel.status_summary import process_names
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.output import moment, say_json, usage_error
+from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
@@ -169,10 +169,12 @@ def _policy(policy: PolicyState) -> Text:
     differs = ""
     if policy.differs_from_file:
         theirs = policy.who != "disk"
-        differs = f"; loaded by {policy.who}, differs from the file" if theirs else "; the file has changed"
-        differs += "" if theirs else ", load it: rosrv policy reload"
+        differs = (
+            "; differs from the file" if theirs else "; the file has changed, load it: rosrv policy reload"
+        )
     warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
-    line = Text(f"revision {policy.revision} of {policy.file}{warnings}{differs}")
+    how = loaded_by(policy.who, policy.loaded)
+    line = Text(f"revision {policy.revision} of {policy.file}, {how}{warnings}{differs}")
     if policy.audit_only:
         line.append(f"; AUDIT-ONLY: denies nothing by {', '.join(policy.audit_only)}", style=_YELLOW)
     return line

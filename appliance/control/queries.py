@@ -210,4 +210,5 @@ class Queries:
                 decider.name for decider in DECIDERS if policies.current.audit_only(decider.categories[0])
             ],
             confirm_by=policies.confirm_by,
+            loaded=policies.in_force.loaded,
         )

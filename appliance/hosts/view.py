@@ -63,6 +63,7 @@ class HostView:
             bytes_out=seen.bytes_out if seen else None,
             last_seen=self._tunnels.last.get(name),
             token_expires=awaited.expires if awaited else None,
+            token_by=awaited.who if awaited else "",
             ports=self.ports(name),
         )
 

@@ -64,6 +64,7 @@ class PolicyState(msgspec.Struct, frozen=True):
     warnings: int
     audit_only: Annotated[list[str], doc("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
+    loaded: Annotated[Moment | None, doc("when it came into force; null: an earlier version")] = None
 
 
 class IpsecState(msgspec.Struct, frozen=True):

@@ -36,7 +36,7 @@ def print_entries(entries: list[LogEntry], *, each: bool = False) -> None:
 
 
 def line(entry: LogEntry) -> str:
-    """Return a record as one line: time, sequence, decision, event, host, caller, resource, reason."""
+    """Return a record as one line: time, sequence, decision, event, host, caller, resource, author, reason."""
     record = entry.record
     parts = [
         rfc3339(record.time),
@@ -47,6 +47,7 @@ def line(entry: LogEntry) -> str:
         record.caller_id,
         record.category,
         record.resource,
+        _by(record),
     ]
     shown = " ".join(printable(part) for part in parts if part)
     return shown + (f": {_why(record)}" if _why(record) else "")
@@ -163,7 +164,7 @@ def _table(rows: list[EqualRecords]) -> Table:
             _times(row),
             Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
             Text(printable(record.event), style="bold red" if alarming else ""),
-            Text(_joined(record.host, record.caller_id)),
+            Text(_joined(record.host, record.caller_id, _by(record))),
             Text(_joined(record.category, _monitor(record), record.resource)),
             Text(_why(record) if row.records == 1 else _why_of_several(row)),
         )
@@ -182,6 +183,12 @@ def _times(row: EqualRecords) -> str:
 def _monitor(record: AuditRecord) -> str | None:
     name = record.detail.get("monitor")
     return str(name) if name else None
+
+
+def _by(record: AuditRecord) -> str | None:
+    """Return the holder of a token, or `operator`, who gave an order or made a REST call."""
+    who = record.detail.get("who")
+    return f"by {who}" if who else None
 
 
 def _why_of_several(row: EqualRecords) -> str:

@@ -204,7 +204,8 @@ def _words(row: Host) -> list[str]:
     if row.expires is not None and row.state != "revoked":
         parts.append(f"certificate until {moment(row.expires)}" + (" (soon!)" if row.expires_soon else ""))
     if row.token_expires is not None:
-        parts.append(f"token until {moment(row.token_expires)}")
+        by = f" by {row.token_by}" if row.token_by else ""
+        parts.append(f"token{by} until {moment(row.token_expires)}")
     if row.state not in ("not enrolled", "revoked", "awaited"):
         parts.append(_ports_words(row.ports))
     if row.groups:
@@ -217,4 +218,5 @@ def _words(row: Host) -> list[str]:
 def _ports_words(ports: PortsSeen) -> str:
     if ports.checked is None:
         return "ports never checked"
-    return f"ports {ports.state} ({moment(ports.checked)})"
+    by = f" by {ports.who}" if ports.who else ""
+    return f"ports {ports.state} ({moment(ports.checked)}{by})"

@@ -15,7 +15,7 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import loaded_by, moment, say_json
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, printable, say
 
@@ -69,7 +69,8 @@ def list_monitors(appliance: Appliance) -> None:
         if body.folder and body.differs_from_folder
         else ""
     )
-    say(f"revision {body.revision} of the specifications{source}, by {body.who}{differs}")
+    how = f", {loaded_by(body.who, body.loaded)}" if body.revision else ""
+    say(f"revision {body.revision} of the specifications{source}{how}{differs}")
 
 
 @speaks

@@ -14,8 +14,8 @@ from appliance.channel.admin import (
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_json
-from rosmop.tool.terminal import counted, say
+from appliance.cli.output import loaded_by, say_json
+from rosmop.tool.terminal import counted, printable, say
 
 
 @speaks
@@ -26,7 +26,7 @@ def show(
         typer.Argument(help="A kept revision (default: the one in force)"),
     ] = None,
 ) -> None:
-    """Print the text of the policy in force, or of a revision.
+    """Print the text of the policy in force, or of a revision; on standard error who loaded it, and when.
 
     Example: rosrv policy show > policy.ini
     """
@@ -39,6 +39,9 @@ def show(
     else:
         for line in body.text.splitlines():
             say(line)
+        how = loaded_by(body.who, body.loaded)
+        note = f": {body.note}" if body.note else ""
+        typer.echo(printable(f"rosrv: revision {body.revision}, {how}{note}"), err=True)
 
 
 @speaks

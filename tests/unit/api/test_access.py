@@ -97,7 +97,7 @@ def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
 
 
 def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wrong, unknown or expired token is no use; a new list of tokens is followed by a new report."""
+    """Wrong, unknown and expired tokens are not reported; a new list of tokens is followed by a new report."""
     row, text = make_token("a", "viewer", now=time.time(), seconds=60)
     ended, late = make_token("b", "viewer", now=time.time() - 100, seconds=50)
     used: list[str] = []

@@ -199,7 +199,7 @@ async def test_impossible_times_of_a_rotation_change_nothing(lives: Lives, order
     assert [one.id for one in tokens.usable()] == [old.id]
 
 
-async def test_of_two_rotations_at_once_one_is_rejected(lives: Lives) -> None:
+async def test_one_of_two_simultaneous_rotations_is_rejected(lives: Lives) -> None:
     """The text that one of them printed is valid."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "viewer", 3600))

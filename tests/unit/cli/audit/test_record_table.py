@@ -44,6 +44,22 @@ def test_a_table_of_records_has_their_numbers(
     assert (head.split()[0], row.split()[0]) == ("record", "4711")
 
 
+def test_a_table_of_records_has_the_author_of_a_change(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is in the column of hosts and callers; a damaged author is text too."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", "200")
+    changes = [
+        AuditRecord(id="0" * 20, time=0, event="policy loaded", detail={"who": who}) for who in ("alice", 7)
+    ]
+    print_entries([LogEntry(number, change) for number, change in enumerate(changes)])
+    head, *rows = capsys.readouterr().out.splitlines()
+    column = head.index("who")
+    assert [row[column:].strip() for row in rows] == ["by alice", "by 7"]
+
+
 def test_equal_records_are_one_row(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
