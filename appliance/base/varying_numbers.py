@@ -1,18 +1,23 @@
 """Replace the numbers in a text, so that two reports of one cause with other measured values have the same words.
 
-Kept are digits that name something: in a word or ROS name (`joint_1`, `/arm/2`), an address or version (`10.0.0.66`),
-and the place in a file (`robot.ini:12`).
+Kept are digits that name something: in a word or ROS name (`joint_1`, `/arm/2`), an address or version (`10.0.0.66`,
+`2001:db8::42`), and the place in a file (`robot.ini:12`).
 """
 
+import functools
 import re
 
+_HEX = r"[\da-fA-F]"
+_PART = rf"{_HEX}{{1,4}}+"
+_IPV6 = rf"(?<![\w:.])(?:(?:{_PART}:){{1,7}}+:(?:{_HEX}|:)*+|::(?:{_HEX}|:)++|(?:{_PART}:){{7}}{_PART})"
 _NUMBER = re.compile(
-    r"(?P<place>\.\w++:\d++(?::\d++)*+)"
+    rf"(?P<kept>\.\w++:\d++(?::\d++)*+|{_IPV6})"
     r"|(?<![\w/.])[-+]?(?:nan\b|inf\b|\d++(?:\.\d++)?+(?:[eE][-+]?\d++)?+(?!\.\d))"
 )
 # Possessive, so the time is linear in the length of the text, parts of which may come from peers.
 
 
+@functools.lru_cache(4)  # a line of output is compared with the previous one
 def without_numbers(text: str) -> str:
     """Return the text with `#` for each number."""
-    return _NUMBER.sub(lambda found: found["place"] or "#", text)
+    return _NUMBER.sub(lambda found: found["kept"] or "#", text)
