@@ -1,6 +1,7 @@
 /** One record: the decision and its reason, the rule in the policy, a monitor's changes, records around it. */
 
 import { isDecided } from "../categories.js";
+import { Block } from "../hosts/block.js";
 import { html, useEffect, useRef, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { Badge, Outcome } from "../parts/badge.js";
@@ -54,7 +55,8 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     </dl>
     ${((MONITORS.has(record.event) && !record.detail.count) || isDenial(record)) && html`<${Why} key=${record.id} id=${record.id} />`}
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
-    ${record.decision && isDecided(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
+    <div class="row">${record.decision && isDecided(record.category) && html`<${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}>`}
+      ${record.host && isDenial(record) && html`<${Block} host=${record.host}>Block this host…</${Block}>`}</div>
     ${isDenial(record) && (isDecided(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
     <${OnTimeline} key=${`t${record.id}`} record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}

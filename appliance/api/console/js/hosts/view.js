@@ -12,6 +12,7 @@ import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
 import { done, failed } from "../parts/toast.js";
 import { ask } from "../rest.js";
 import { useStore } from "../store.js";
+import { Block, Blocked } from "./block.js";
 import { Enrol } from "./enrol.js";
 import { Revoke } from "./revoke.js";
 
@@ -22,6 +23,7 @@ export function Hosts() {
   const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
   const [open, setOpen] = useState(/** @type {{what: "enrol" | "again" | "revoke", host?: any} | null} */ (null));
   const mark = useStore(live, (one) => JSON.stringify(one.status?.ipsec ?? null));
+  const blocks = useStore(live, (one) => JSON.stringify(one.status?.blocks ?? null));
   const isolation = useStore(live, (one) => one.status?.isolation);
   const again = async () => {
     try {
@@ -48,10 +50,10 @@ export function Hosts() {
     }
   };
   return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "host")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up</span>
-      <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
+      <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Block}>Block a host…</${Block}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
     <div class="standing">${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}
       ${body.troubles.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn" title="Needs attention"><${Given} value=${one} most=${400} /></${Notice}>`)}</div>
-    <div class="stack"><section class="panel" aria-label="Hosts with tunnels">${!body.hosts.length ? html`<${Empty} icon="hosts" title="No host is enrolled">Enrol an operator's laptop or a second robot: it gets a name (host:NAME in the policy) and an address that no other host can use.</${Empty}>` : html`<${HostTable} hosts=${body.hosts} open=${setOpen} />`}</section>
+    <div class="stack"><${Blocked} mark=${blocks} /><section class="panel" aria-label="Hosts with tunnels">${!body.hosts.length ? html`<${Empty} icon="hosts" title="No host is enrolled">Enrol an operator's laptop or a second robot: it gets a name (host:NAME in the policy) and an address that no other host can use.</${Empty}>` : html`<${HostTable} hosts=${body.hosts} open=${setOpen} />`}</section>
       <section class="panel" aria-labelledby="machines"><div class="panel-head"><h2 id="machines">Machines without a tunnel</h2></div>${!body.machines.length ? html`<${Empty} icon="hosts" title="No nodes without a tunnel">Machines whose nodes register without a tunnel appear here.</${Empty}>` : html`<${MachineTable} machines=${body.machines} />`}</section>
       <section class="panel"><div class="panel-body"><dl class="facts"><dt>ESP runs in</dt><dd>${body.esp ?? html`<span class="muted">no tunnels are open</span>`}</dd><dt>Key exchange</dt><dd>${body.key_exchange.length ? html`<${Given} value=${body.key_exchange.join(", ")} mono />` : html`<span class="muted">not known yet</span>`}${body.post_quantum === null ? "" : body.post_quantum ? html` <${Badge} word="post-quantum" tone="allow" />` : html` <${Badge} word="not post-quantum" />`}</dd>
         <dt>Addresses</dt><dd><${Given} value=${body.pool} mono />, the appliance is <${Given} value=${body.address} mono /></dd><dt>Declared in</dt><dd><${Given} value=${body.hosts_file} mono most=${200} /></dd></dl></div></section></div>
@@ -66,11 +68,11 @@ function HostTable(/** @type {{hosts: any[], open: (what: any) => void}} */ { ho
       <td data-label="Address"><${Given} value=${one.address} mono /></td><td data-label="From"><div><${Given} value=${one.remote} mono />${one.remote && html`<div class="muted small nowrap">${bytes(one.bytes_in)} in, ${bytes(one.bytes_out)} out</div>`}</div></td>
       <td class="nowrap" data-label="Certificate"><div>${one.expires === null ? html`<span class="muted">–</span>` : html`<${Moment} at=${one.expires} always="day" />`}${one.expires_soon && html`<div><${Badge} word="expires soon" tone="warn" /></div>`}${one.renewing && html`<div class="muted small">a renewed certificate waits for the host</div>`}</div></td>
       <td class="nowrap" data-label="Last seen"><${Moment} at=${one.last_seen} /></td><td data-label="Ports"><${Ports} ports=${one.ports} /></td>
-      <td><div class="row row-end">${one.state !== "revoked" && html`<${Button} small role="admin" onClick=${() => open({ what: "again", host: one })}>${one.enrolled === null ? "Token" : "New kit"}</${Button}>`}${one.enrolled !== null && one.revoked === null && html`<${Button} small role="admin" tone="danger" onClick=${() => open({ what: "revoke", host: one })}>Revoke</${Button}>`}</div></td></tr>`)}</tbody></table></div>`;
+      <td><div class="row row-end"><${Block} small host=${one.name}>Block…</${Block}>${one.state !== "revoked" && html`<${Button} small role="admin" onClick=${() => open({ what: "again", host: one })}>${one.enrolled === null ? "Token" : "New kit"}</${Button}>`}${one.enrolled !== null && one.revoked === null && html`<${Button} small role="admin" tone="danger" onClick=${() => open({ what: "revoke", host: one })}>Revoke</${Button}>`}</div></td></tr>`)}</tbody></table></div>`;
 }
 
 function MachineTable(/** @type {{machines: any[]}} */ { machines }) {
-  return html`<div class="table-wrap"><table class="table"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td><${Given} value=${one.address} mono /></td><td class="number">${one.nodes}</td><td><${Ports} ports=${one.ports} /></td></tr>`)}</tbody></table></div>`;
+  return html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td class="first"><${Given} value=${one.address} mono /></td><td class="number" data-label="Nodes">${one.nodes}</td><td data-label="Ports"><${Ports} ports=${one.ports} /></td><td><div class="row row-end"><${Block} small host=${one.address}>Block…</${Block}></div></td></tr>`)}</tbody></table></div>`;
 }
 
 /** The last check's result: whether other machines can reach the ports of the host's nodes. */
