@@ -86,12 +86,12 @@ class FoldState(msgspec.Struct, kw_only=True):
 
 def new_state(record: AuditRecord, scope: str) -> FoldState:
     """Return the state of a kind that begins with this record."""
-    about = {name: str(record.detail[name])[:_LONGEST_KEY] for name in ABOUT if name in record.detail}
+    known = {name: record.detail.get(name) for name in ABOUT}
+    about = {name: str(value)[:_LONGEST_KEY] for name, value in known.items() if value is not None}
     return FoldState(
         scope=scope, event=record.event, severity=record.severity, decision=record.decision, host=record.host,
         caller_id=record.caller_id, category=record.category, resource=record.resource, rule=record.rule,
-        revision=record.revision, reason=record.reason, recorded_id=record.id, about=about, tallies={},
-        folds=record.folds,
+        revision=record.revision, reason=record.reason, recorded_id=record.id, about=about, folds=record.folds,
     )  # fmt: skip
 
 

@@ -188,7 +188,10 @@ def _monitor(record: AuditRecord) -> str | None:
 def _by(record: AuditRecord) -> str | None:
     """Return the holder of a token, or `operator`, who gave an order or made a REST call."""
     who = record.detail.get("who")
-    return f"by {who}" if who else None
+    unknown = (
+        who == "None" and record.event in FOLDED
+    )  # as versions up to 0.2.0 counted calls without a token
+    return f"by {who}" if who and not unknown else None
 
 
 def _why_of_several(row: EqualRecords) -> str:

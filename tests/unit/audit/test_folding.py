@@ -65,6 +65,16 @@ def test_summaries_continue_with_the_repetitions() -> None:
     assert offer(folder, again, now=31) == [again]
 
 
+def test_a_summary_has_no_author_if_none_is_known() -> None:
+    """A call without a valid token has no author."""
+    folder = make_folder(seconds=10)
+    calls = [denial(detail={"who": None, "method": "GET", "status": 401}) for _ in range(2)]
+    offer(folder, *calls, now=0)
+    [summary] = folder.expire(10)
+    assert "who" not in summary.detail
+    assert summary.detail["method"] == "GET"
+
+
 def test_different_records_are_not_folded() -> None:
     """A record that differs in host, caller, resource, reason, rule, revision, category or decision is not folded."""
     folder = make_folder()

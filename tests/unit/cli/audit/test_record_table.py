@@ -47,17 +47,21 @@ def test_a_table_of_records_has_their_numbers(
 def test_a_table_of_records_has_the_author_of_a_change(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is in the column of hosts and callers; a damaged author is text too."""
+    """It is in the column of hosts and callers; a damaged author is text too, and a missing one is not shown."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "dumb")
     monkeypatch.setenv("COLUMNS", "200")
-    changes = [
-        AuditRecord(id="0" * 20, time=0, event="policy loaded", detail={"who": who}) for who in ("alice", 7)
-    ]
-    print_entries([LogEntry(number, change) for number, change in enumerate(changes)])
+    authors = (
+        ("policy loaded", "alice"),
+        ("policy loaded", 7),
+        ("rest call", None),
+        ("denials folded", "None"),
+    )
+    records = [AuditRecord(id="0" * 20, time=0, event=event, detail={"who": who}) for event, who in authors]
+    print_entries([LogEntry(number, record) for number, record in enumerate(records)], each=True)
     head, *rows = capsys.readouterr().out.splitlines()
     column = head.index("who")
-    assert [row[column:].strip() for row in rows] == ["by alice", "by 7"]
+    assert [row[column:].strip() for row in rows] == ["by alice", "by 7", "", ""]
 
 
 def test_equal_records_are_one_row(
