@@ -33,9 +33,7 @@ def check(
     Return the exit status: 0 without errors, 1 with errors. A usage error ends with 2.
     """
     if prove and find_spec("z3") is None:
-        raise program.usage_error(
-            f"--prove needs the package z3-solver: pip install '{program.package}[prove]'"
-        )
+        raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
     try:
         monitors = MonitorSet.of(load(program, files, folders))
         certificates, wrong = certificates_of(monitors.compiled.specifications)
@@ -81,7 +79,12 @@ def _say_slow(compiled: Compiled, *, as_json: bool) -> None:
         else:
             say(f"{path.position}: {path.topic}: each message is interpreted, because it {path.reason}")
     if not found and not as_json:
-        say("compiled code processes every message")
+        here = (
+            ""
+            if find_spec("wasmtime") is not None
+            else "; here all are interpreted: wasmtime is not installed"
+        )
+        say(f"compiled code processes every message{here}")
 
 
 def _summarise(findings: list[Diagnostic], errors: int, monitors: MonitorSet | None) -> None:

@@ -87,5 +87,5 @@ app = typer.Typer(
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for _name, _command in commands_of(CommandContext("rosmop", "rosmop", Path.write_bytes)).items():
+for _name, _command in commands_of(CommandContext("rosmop", Path.write_bytes)).items():
     app.command(_name, help=f"{SUMMARIES[_name]}\n\n{_command.__doc__}")(_command)

@@ -29,12 +29,10 @@ _KINDS = {
 class CommandContext:
     """The context of a command.
 
-    `name` begins each message, and `package` is the name that pip installs. `write` replaces a file, or raises
-    `OSError`.
+    `name` begins each message. `write` replaces a file, or raises `OSError`.
     """
 
     name: str
-    package: str
     write: Callable[[Path, bytes], object]
 
     def read(self, path: Path) -> bytes:

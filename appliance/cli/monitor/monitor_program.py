@@ -3,4 +3,4 @@
 from appliance.cli.output import write_told
 from rosmop.tool.command_context import CommandContext
 
-MONITOR = CommandContext("rosrv monitor", "rosrv-appliance", write_told)
+MONITOR = CommandContext("rosrv monitor", write_told)

@@ -88,7 +88,18 @@ def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
     said = "rosmop: cannot read b.rv: No such file or directory\n"
     assert (missing.returncode, missing.stderr) == (2, said)
     unproved = run(environment / "bin/rosmop", "check", "a.rv", "--prove", folder=tmp_path)
-    assert "pip install 'rosmop[prove]'" in unproved.stderr
+    assert "pip install z3-solver" in unproved.stderr
+
+
+def test_why_slow_says_that_nothing_is_compiled_here(environment: Path, tmp_path: Path) -> None:
+    """Without wasmtime every message is interpreted, also of specifications that could be compiled."""
+    (tmp_path / "a.rv").write_text(
+        "a() { event e(int n) /n std_msgs/UInt8 '{data:n}' { if (n == 2) return; } }"
+    )
+    slow = run(environment / "bin/rosmop", "check", "a.rv", "--why-slow", folder=tmp_path)
+    assert slow.stdout.splitlines()[-1] == (
+        "compiled code processes every message; here all are interpreted: wasmtime is not installed"
+    )
 
 
 def test_the_readme_links_to_files() -> None:
