@@ -106,6 +106,7 @@ def _print_each(looks: _Looks, seconds: float, console: Console, *, as_json: boo
 def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
     """Redraw on the terminal's other screen, also when its size changes; leave the last status on the normal one."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGWINCH})
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # else the terminal would keep the other screen
     view = None
     try:
         with Live(console=console, screen=True, auto_refresh=False) as live:

@@ -110,7 +110,7 @@ class TokenOrders:
         _require_lifetime(request.seconds)
         if self._named(name, now):
             raise TokenRefusedError(
-                f"there is a token {name!r} already: revoke it first, or choose another name"
+                f"there is a token {name!r} already: rotate or revoke it, or choose another name"
             )
         self._require_room(now)
         try:
@@ -149,7 +149,8 @@ class TokenOrders:
             raise TokenRefusedError("the grace time is not a time: write 10m, 12h or 7d")
         if name in self._rotating:
             raise TokenRefusedError(f"another order rotates the token {name!r} now: rosrv token list")
-        self._require_room(now)
+        if request.grace:
+            self._require_room(now)
         row, text = make_token(name, last.role, now=now, seconds=seconds)
         until = now + request.grace
         ended = [

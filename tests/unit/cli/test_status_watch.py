@@ -89,7 +89,11 @@ class Terminal:
 
     def interrupted(self) -> int:
         """Press Ctrl-C, and return the exit status."""
-        self.process.send_signal(signal.SIGINT)
+        return self.ended_by(signal.SIGINT)
+
+    def ended_by(self, number: signal.Signals) -> int:
+        """End the command by a signal, and return its exit status."""
+        self.process.send_signal(number)
         status = self.process.wait(_LIMIT_SECONDS)
         self._reader.join(_LIMIT_SECONDS)
         os.close(self._ours)
@@ -128,6 +132,18 @@ def test_a_terminal_is_redrawn_in_place(
     assert all(frame.count("\n") < 30 for frame in frames.split("\x1b[H"))
     assert "7 nodes" in left
     assert "Ctrl-C" not in left
+
+
+def test_a_terminated_watch_restores_the_terminal(
+    serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
+) -> None:
+    """`timeout 60 rosrv status --watch` leaves the normal screen and its cursor."""
+    serving()
+    shown = terminal(80, 30)
+    shown.until("1.2.3")
+    assert shown.ended_by(signal.SIGTERM) == 0
+    assert "\x1b[?25h" in shown.shown
+    assert "1.2.3" in shown.shown.partition("\x1b[?1049l")[2]
 
 
 def test_a_narrower_terminal_is_redrawn_at_once(

@@ -15,6 +15,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import RotatedToken
+from appliance.control import token_orders
 from appliance.control.token_orders import TokenOrders, TokenRefusedError
 from appliance.signing.request_signing import keys_of
 from appliance.store.access_tokens import is_secret, parse_token
@@ -351,3 +352,17 @@ async def test_a_full_disk_keeps_no_use_and_harms_no_request(
         assert lives.store.token_uses() == {}
     tokens.used(alice.id)
     assert lives.store.token_uses().keys() == {alice.id}
+
+
+async def test_a_rotation_needs_room_only_for_a_further_token(
+    lives: Lives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With as many tokens as possible, each can be rotated, but not with a grace time."""
+    monkeypatch.setattr(token_orders, "_MOST", 2)
+    tokens = lives.next()
+    for name in ("alice", "bob"):
+        await tokens.add(TokenAdd(name, "viewer", 600))
+    with pytest.raises(TokenRefusedError, match="there are 2 tokens already"):
+        await tokens.rotate(TokenRotate("alice", grace=60))
+    await tokens.rotate(TokenRotate("alice"))
+    assert sorted(one.name for one in tokens.usable()) == ["alice", "bob"]
