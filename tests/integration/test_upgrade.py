@@ -110,6 +110,23 @@ def test_specifications_in_force_survive(upgraded: Upgraded) -> None:
     assert (row["name"], row["topics"], row["failing"]) == ("diary", ["/chatter"], False)
 
 
+def test_hosts_can_be_blocked(upgraded: Upgraded) -> None:
+    """The old state has no table of blocks."""
+    rest = upgraded.appliance.rest(upgraded.token)
+    assert rest.get("/v1/blocks").json == {"blocks": []}
+    made = rest.post("/v1/blocks", {"address": "::ffff:10.9.9.9", "for_seconds": 600, "note": "odd"}).json
+    assert (made["address"], made["who"], made["note"], made["replaced"]) == (
+        "10.9.9.9",
+        "first",
+        "odd",
+        None,
+    )
+    assert [row["address"] for row in rest.get("/v1/blocks").json["blocks"]] == ["10.9.9.9"]
+    assert rest.post("/v1/blocks", {"address": "127.0.0.1"}).status == 422
+    assert rest.request("DELETE", "/v1/blocks/10.9.9.9", None, {}).json["restored"] == 0
+    assert rest.request("DELETE", "/v1/blocks/10.9.9.9", None, {}).status == 404
+
+
 def test_registrations_and_parameters_survive(upgraded: Upgraded) -> None:
     """The new ROS master has the parameters and the nodes, which did not register again."""
     publishers, subscribers, services = call(upgraded.appliance, "getSystemState")[2]
