@@ -22,13 +22,13 @@ from appliance.audit.equality import plain_reason, times
 from appliance.audit.query import Filter
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import LogEntry, rfc3339, rule_text, without_contents
-from appliance.audit.repetition import ALL, ALL_UNKNOWN, OTHERS
+from appliance.audit.repetition import OTHERS
 from appliance.audit.search import search
 from appliance.base.varying_numbers import without_numbers
 
 LARGEST_SUMMARY = 1000
 MOST_RECORDS = 1_000_000
-_PAGE = 1000
+_PAGE = 5000
 _MOST_HOSTS = 10_000
 _MOST_NAMES = 256
 _SHOWN_REASONS = 3
@@ -130,7 +130,7 @@ def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
     """Yield the hosts of a record with their numbers of denials."""
     number = times(record)
     named = record.detail.get("hosts")
-    if record.host or record.detail.get("scope") not in (ALL, ALL_UNKNOWN) or not isinstance(named, dict):
+    if record.host or not isinstance(named, dict):
         yield record.host or _NO_HOST, number
         return
     for host, count in named.items():
