@@ -118,6 +118,9 @@ class LearntFacts:
         yield from proposer.of_orders()
 
 
+_WHOLE_NUMBERS = (-(1 << 63), (1 << 63) - 1), (-(1 << 63), (1 << 64) - 1)
+"""The least and greatest bound of a signed and of an unsigned field."""
+
 # Path, element and length of an array, and the statistics of its values
 _Place = tuple[str, int | None, int | None, Series]
 
@@ -302,8 +305,11 @@ class _Proposer:
         if top is None or bottom is None:
             return
         width = high - low
+        if not all(math.isfinite(2 * one) for one in (top, bottom, width)):
+            return  # a bound would be beyond the largest number
         if integer:
-            above, below = number(math.ceil(top)), number(-math.ceil(bottom))
+            least, most = _WHOLE_NUMBERS[content.types[path].startswith("u")]
+            above, below = number(min(math.ceil(top), most)), number(max(-math.ceil(bottom), least))
         else:
             above, below = rounded_up(top, width), rounded_down(-bottom, width)
         within = f"{{v}} >= {below} && {{v}} <= {above}"

@@ -14,6 +14,8 @@ CPP = {
     "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
 }  # fmt: skip
 """The language's type for each type of message fields."""
+WORDS = frozenset(FORBIDDEN) | RESERVED
+"""The words that are no names in the language."""
 
 
 def rounded_up(value: float, width: float) -> str:
@@ -32,6 +34,8 @@ def rounded_down(value: float, width: float) -> str:
 def number(value: float) -> str:
     """Return a number as the language reads it. An integer stays an integer."""
     text = repr(value)
+    if isinstance(value, int) and value >= 1 << 63:
+        return f"{text}u"  # only an unsigned type holds it
     return "0.0" if text == "-0.0" else text
 
 
@@ -71,7 +75,7 @@ def short_names(paths: Iterable[str]) -> dict[str, str]:
             others = (other for other in paths if other != path)
             if count == len(steps) or not any(other == end or other.endswith("." + end) for other in others):
                 name = "_".join(steps[-count:])
-                taken = name in FORBIDDEN or name in RESERVED or name in names.values() or name in _OWN
+                taken = name in WORDS or name in names.values() or name in _OWN
                 names[path] = f"{name}_field" if taken else name
                 break
     return names

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count, groupby
 
 from rosmop.learn.candidates import Candidate, CandidateSupport, LearntFacts
-from rosmop.learn.rv_text import CPP, formatted, identifier, number, short_names
+from rosmop.learn.rv_text import CPP, WORDS, formatted, identifier, number, short_names
 
 _TOLD_EVERY = "1.0"  # seconds
 _WIDTH = 104  # the maximum number of columns of a statement
@@ -29,6 +29,7 @@ def specifications(
 def _new_name(text: str, taken: set[str]) -> str:
     """Return a name made of the text, with a number if the name is taken."""
     name = identifier(text)
+    name = f"{name}_topic" if name in WORDS else name
     free = name if name not in taken else next(f"{name}_{n}" for n in count(2) if f"{name}_{n}" not in taken)
     taken.add(free)
     return free

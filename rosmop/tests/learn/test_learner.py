@@ -3,7 +3,7 @@
 import math
 import random
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pytest
@@ -208,3 +208,25 @@ def test_omitted_conditions_are_listed() -> None:
     assert (kinds.count("range"), kinds.count("length")) == (10, 4)
     assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
     assert "// Nothing was held out: it is untested." in learnt.text
+
+
+def test_numbers_of_any_size_give_a_valid_specification() -> None:
+    """Bounds stay within the type of the field; values near the largest number give none; names may be keywords."""
+    chance = random.Random(1)  # noqa: S311  no secret
+    topics: dict[str, tuple[str, Callable[[], float]]] = {
+        "/unsigned": ("std_msgs/UInt64", lambda: chance.getrandbits(64)),
+        "/signed": ("std_msgs/Int64", lambda: chance.getrandbits(64) - (1 << 63)),
+        "/few": ("std_msgs/UInt64", lambda: chance.choice([(1 << 64) - 1, 1 << 63, 5])),
+        "/real": ("std_msgs/Float64", lambda: chance.uniform(-1.7e308, 1.7e308)),
+        "/high": ("std_msgs/Float64", lambda: chance.uniform(1e308, 1.7e308)),
+    }
+    rows = tuple(
+        (topic, START + second * 10**9 + place, message(kind, data=value()))
+        for second in range(200)
+        for place, (topic, (kind, value)) in enumerate(topics.items())
+    )
+    recorded = Recorded("r", rows, {topic: kind for topic, (kind, _) in topics.items()})
+    learnt = learn([recorded], standard_definitions(), 0.2, lambda _: None)
+    assert MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions())).warnings == ()
+    assert {row.topic for row in learnt.candidates if row.kind == "range"} == {"/unsigned", "/signed"}
+    assert "data <= 18446744073709551615u" in learnt.text
