@@ -89,6 +89,17 @@ def test_drops_and_denials_of_the_last_minute_are_warnings(opened: Callable[...,
     assert page.evaluate(activity, []) == []
 
 
+def test_times_in_alarms_are_the_readers(opened: Callable[..., Reader]) -> None:
+    """The appliance writes them in UTC; everything else in the text stays."""
+    page = opened().go("now")
+    shown = """async (text) => {
+      const { inOwnZone } = await import("/console/static/js/moments.js");
+      return [inOwnZone(text), new Date("2020-02-03T04:05:06Z").getHours()];
+    }"""
+    found, hour = page.evaluate(shown, "12 hosts, until 2020-02-03T04:05:06+00:00: rosrv host blocks")
+    assert re.fullmatch(rf"12 hosts, until Feb 3, {hour:02}:05:06: rosrv host blocks", found), found
+
+
 def test_many_denials_turn_the_state_to_a_warning(
     opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:

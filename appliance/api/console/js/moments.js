@@ -26,6 +26,11 @@ function shown(/** @type {Date} */ date, /** @type {"day" | undefined} */ always
   return date.toDateString() === new Date().toDateString() ? CLOCK.format(date) : WITHIN.format(date);
 }
 
+/** A text of the appliance, its times in the user's zone. @param {string} text */
+export function inOwnZone(text) {
+  return text.replace(/\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|\+00:00)/g, (time) => shown(new Date(time), undefined));
+}
+
 /** Hours and minutes, for the axis of a plot. @param {number} seconds */
 export function minute(seconds) {
   return MINUTE.format(new Date(seconds * 1000));

@@ -10,6 +10,8 @@ import { Icon } from "../parts/icon.js";
 
 /** @typedef {{records: any[], first: any, last: any, count: number, value: string}} Row `records`: as listed; `value`: of the last record that has one */
 
+const SECOND = 19; // characters of a time, to its second
+
 /** The records of a page, each with its equality. @param {{records: any[], equality: any[]}} page */
 export function compared({ records, equality }) {
   return records.map((one, at) => ({ ...one, equality: equality[at] }));
@@ -55,7 +57,7 @@ export function Count({ row, open, toggle }) {
   return html`<button class="count-badge" aria-expanded=${String(open)} title=${open ? "Show one row" : "Show each record"} onClick=${press}>${counted(row.count, "time")}<${Icon} name=${open ? "minus" : "plus"} size=${12} /></button>`;
 }
 
-/** The time of the last record, and of the first if there are several. @param {{row: Row}} given */
+/** The time of the last record, and of the first if it was in another second. @param {{row: Row}} given */
 export function Range({ row: { first, last } }) {
-  return first === last ? html`<${Moment} at=${last.time} />` : html`<${Moment} at=${last.time} /> <span class="muted small nowrap">since <${Moment} at=${first.time} /></span>`;
+  return last.time.slice(0, SECOND) === first.time.slice(0, SECOND) ? html`<${Moment} at=${last.time} />` : html`<${Moment} at=${last.time} /> <span class="muted small nowrap">since <${Moment} at=${first.time} /></span>`;
 }

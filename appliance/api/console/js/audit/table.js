@@ -39,5 +39,5 @@ function Row(/** @type {{record: any, time: any, count?: any, reason: string, pa
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
-    <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${110} /></td></tr>`;
+    <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${240} /></td></tr>`;
 }

@@ -11,7 +11,7 @@ import { counted } from "../numbers.js";
 
 const RANGE = 64;
 
-/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[], within?: string[], brief?: string}} Shown `within`: the opened groups around it; `brief`: the first words of `sub` */
+/** @typedef {import("./model.js").Item & {members?: import("./model.js").Item[], within?: string[]}} Shown `within`: the opened groups around it */
 /** @typedef {{key: string, label: string, items: import("./model.js").Item[], parts: Branch[]}} Branch */
 
 /**

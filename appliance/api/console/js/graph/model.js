@@ -8,8 +8,8 @@
 
 /**
  * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
- *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, caller?: string | null, denied?: number, owners?: string[]}} Item
- *   of a denied host: the `caller` that it gave (none for a host with `owners`: the hosts whose nodes' names it used), and how often it was `denied`
+ *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, brief?: string, caller?: string | null, denied?: number, owners?: string[]}} Item
+ *   `brief`: in few words what `sub` is; of a denied host: the `caller` that it gave (none for a host with `owners`: the hosts whose nodes' names it used), and how often it was `denied`
  * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
  *   denials?: any[], would?: boolean}} Line
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
@@ -107,11 +107,11 @@ function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @typ
   const before = model.items.get(key);
   const denied = (before?.denied ?? 0) + times;
   if (owner === null) {
-    put(model, { key, kind: "party", name: caller || "no name", sub: `${host} · ${counted(denied, "denial")}`, host, caller, denied });
+    put(model, { key, kind: "party", name: caller || "no name", sub: `${host} · ${counted(denied, "denial")}`, brief: counted(denied, "denial"), host, caller, denied });
     return;
   }
   const owners = [...new Set([...(before?.owners ?? []), owner])];
-  put(model, { key, kind: "party", name: host || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, host, denied, owners });
+  put(model, { key, kind: "party", name: host || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, brief: "uses others' names", host, denied, owners });
 }
 
 function put(/** @type {Model} */ model, /** @type {Item} */ item) {

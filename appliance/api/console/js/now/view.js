@@ -2,7 +2,7 @@
 
 import { html } from "../html.js";
 import { live } from "../live.js";
-import { lasting, Moment, useNow } from "../moments.js";
+import { inOwnZone, lasting, Moment, useNow } from "../moments.js";
 import { notable } from "../notable.js";
 import { count, counted, growth } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
@@ -51,7 +51,7 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
   const isolation = status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`;
   const { policy, monitors, ipsec, audit } = status;
   return html`<section class="cards" aria-label="Health">
-    <${Card} name="Appliance" to=${first ? placeOf(first) : "/console/now"} tone=${state[0]} figure=${state[1]} words>${first ? html`<${Given} value=${first.text} most=${120} />` : isolation}</${Card}>
+    <${Card} name="Appliance" to=${first ? placeOf(first) : "/console/now"} tone=${state[0]} figure=${state[1]} words>${first ? html`<${Given} value=${inOwnZone(first.text)} most=${120} />` : isolation}</${Card}>
     <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "rolls back unless confirmed" : html`<${By} who=${policy.who} most=${30} />${policy.differs_from_file ? ", differs from the file" : ""}`}</${Card}>
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
     <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
