@@ -15,7 +15,7 @@ CPP = {
 }  # fmt: skip
 """The language's type for each type of message fields."""
 WORDS = frozenset(FORBIDDEN) | RESERVED
-"""The words that are no names in the language."""
+"""The words of the language that cannot be names."""
 
 
 def rounded_up(value: float, width: float) -> str:

@@ -40,13 +40,13 @@ def test_only_comments_and_indentation_are_removed() -> None:
     ],
 )  # fmt: skip
 def test_a_slash_is_read_as_its_place_demands(kept: str) -> None:
-    """A regular expression keeps its spaces and quotes, a division is none; an import of a separate file stays."""
+    """A regular expression keeps its spaces and quotes, and a division is left alone; an import of a separate file stays."""
     assert join_modules({"a.js": kept}, "a.js") == f"const $m0=(()=>{{{kept}\nreturn {{}};}})();\n"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028", "\u2029"])
 def test_a_comment_ends_with_its_line(end: str) -> None:
-    """Code after each line break of JavaScript is no part of a comment."""
+    """Code after each line break of JavaScript is kept."""
     assert "{a\nb;" in join_modules({"a.js": f"a // c{end}b;"}, "a.js")
 
 
