@@ -40,7 +40,7 @@ def test_only_comments_and_indentation_are_removed() -> None:
     ],
 )  # fmt: skip
 def test_a_slash_is_read_as_its_place_demands(kept: str) -> None:
-    """A regular expression keeps its spaces and quotes, and a division is left alone; an import of a separate file stays."""
+    """Regular expressions keep spaces and quotes, divisions and imports of separate files are left alone."""
     assert join_modules({"a.js": kept}, "a.js") == f"const $m0=(()=>{{{kept}\nreturn {{}};}})();\n"
 
 
