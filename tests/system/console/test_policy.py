@@ -26,6 +26,23 @@ cases:
 """
 
 
+_TYPE_AT_ONCE = """
+const attach = Element.prototype.attachShadow;
+Element.prototype.attachShadow = function (options) {
+  const root = attach.call(this, options);
+  const type = () => {
+    root.querySelector(".cm-content").focus();
+    document.execCommand("insertText", false, "# at once");
+  };
+  new MutationObserver((_records, observer) => {
+    observer.disconnect();
+    setTimeout(type);
+  }).observe(root, { childList: true });
+  return root;
+};
+"""
+
+
 @pytest.fixture(scope="module")
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     """Run an appliance whose policy has tests."""
@@ -84,6 +101,17 @@ def test_the_editor_has_exactly_the_typed_text(opened: Callable[..., Reader]) ->
     expect(page.get_by_text("as in force")).to_be_visible()
     expect(reader.editor()).not_to_contain_text("of a long remark")
     assert reader.editor().inner_text() == first
+
+
+def test_text_that_is_typed_at_once_stays(opened: Callable[..., Reader]) -> None:
+    """The editor takes text from the time it is there, also before the page has finished to draw it."""
+    reader = opened()
+    reader.context.add_init_script(_TYPE_AT_ONCE)
+    page = reader.go("policy")
+    expect(page.get_by_text("changed here, not loaded")).to_be_visible()
+    page.get_by_role("tab", name="Diff").click()
+    expect(page.locator(".diff-line.added")).to_contain_text("# at once")
+    expect(reader.editor()).to_contain_text("# at once")
 
 
 def test_the_editor_completes_by_keys(appliance: Appliance, opened: Callable[..., Reader]) -> None:

@@ -3,7 +3,7 @@
  * no control with `useKeys`. They act outside of fields, editors and dialogs, and can be turned off (WCAG 2.1.4).
  */
 
-import { html, useEffect, useRef } from "./html.js";
+import { html, useLayoutEffect, useRef } from "./html.js";
 import { Dialog } from "./parts/dialog.js";
 import { Check } from "./parts/field.js";
 import { createStore, useStore } from "./store.js";
@@ -53,7 +53,8 @@ export function useShortcuts() {
 export function useKeys(does) {
   const newest = useRef(does);
   newest.current = does;
-  useEffect(() => {
+  // Not an effect after the drawing: once a view is visible, its keys work.
+  useLayoutEffect(() => {
     const heard = (/** @type {KeyboardEvent} */ event) => {
       if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented || typing(event) || document.querySelector("dialog[open]")) return;
       if (event.key.length === 1 && !keys.get().on) return;

@@ -32,6 +32,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
     let gone = false;
     import(SOURCE).then((mirror) => {
       if (gone || !host.current) return;
+      newest.current.told.add(value); // it is no news to the editor, even if the user types before the next effect
       const root = host.current.shadowRoot ?? host.current.attachShadow({ mode: "open" });
       held.current = { mirror, view: build(mirror, root, { label, value, language, height, writable: Boolean(change), complete, newest }) };
       setReady(true);
