@@ -81,7 +81,8 @@ CALLS = {
     "GET /v1/monitors/revisions": "MonitorRevisionList", "GET /v1/monitors/revisions/1": "RevisionTexts",
     "POST /v1/monitors/reload": "Replaced", "POST /v1/monitors/confirm": "MonitorsConfirmed",
     "GET /v1/audit?deny=1&topic=/cmd_vel": "search_audit", "GET /v1/audit/verify": "Verification",
-    "GET /v1/audit/checkpoints": "LogCheckpoints", "GET /v1/recordings": "Recordings",
+    "GET /v1/audit/summary": "DenialSummary", "GET /v1/audit/checkpoints": "LogCheckpoints",
+    "GET /v1/recordings": "Recordings",
 }  # fmt: skip
 # The examples of bodies are sent unchanged, in this order.
 BODIES = (

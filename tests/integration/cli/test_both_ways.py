@@ -5,12 +5,15 @@ The output and the exit status are equal.
 
 import json
 import os
+import re
+import signal
 import subprocess
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -24,6 +27,7 @@ from tests.support.transcript import Section, Transcript, sections
 
 SPEED = "speed() { event said() /chatter std_msgs/String '{}' { } }\n"
 TRANSCRIPT = Path(__file__).with_name("both_ways.txt")
+_USE = re.compile(r' (?:never|last) used.*|, "last_used(?:_utc)?": [^,}]*')
 WITHOUT_PUBLISHERS = OPEN_POLICY.replace("[Publishers]\ndefault = *\n", "")
 Done = subprocess.CompletedProcess[str]
 
@@ -66,6 +70,7 @@ LOOKING = [
     ("audit", "search", "--text", "publish /a", "--json"), ("audit", "show", "1"), ("audit", "show", "1", "--json"),
     ("audit", "show", "999999"), ("audit", "show", "../x"),
     ("audit", "tail", "--no-follow", "--deny", "--lines", "2"), ("audit", "export", "--category", "publish"),
+    ("audit", "summary", "--until", "2026-01-01"), ("audit", "summary", "--since", "never"),
     ("audit", "why", "1"), ("audit", "why", "ffff"), ("policy", "grant", "1"), ("policy", "grant", "ffff"),
     ("policy", "grant", "nonsense"),
     ("monitor", "revisions"), ("monitor", "revisions", "--json"),
@@ -115,12 +120,12 @@ def test_an_unreachable_appliance_is_reported(verb: tuple[str, ...]) -> None:
 
 
 def comparable(done: Done) -> list[object]:
-    """Return the output without values that change over time: the uptimes of `status`, and its layout."""
+    """Return the output without what changes over time: uptimes and layout of `status`, uses of tokens."""
     lines = [
         " ".join(line.split())
         for line in takewhile(lambda one: not one.startswith("process "), done.stdout.splitlines())
     ]
-    still = [line for line in lines if not line.startswith(("appliance ", "audit log "))]
+    still = [_USE.sub("", line) for line in lines if not line.startswith(("appliance ", "audit log "))]
     return [
         done.returncode,
         [json.loads(line) if line.startswith("{") else line for line in still],
@@ -200,11 +205,13 @@ def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_pat
 
 
 def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Appliance) -> None:
-    """`token revoke` works both ways, at once; `token add` over REST says where to run it."""
-    refused = run(appliance, "api", "token", "add", "bob")
-    assert refused.returncode == 2
-    assert "on the appliance's machine" in refused.stderr
-    made = json.loads(run(appliance, "state", "token", "add", "bob", "--json").stdout)
+    """`token revoke` works both ways, at once; `token add` and `rotate` over REST say where to run them."""
+    for verb in ("add", "rotate"):
+        refused = run(appliance, "api", "token", verb, "bob")
+        assert refused.returncode == 2
+        assert "on the appliance's machine" in refused.stderr
+    run(appliance, "state", "token", "add", "bob", "--json")
+    made = json.loads(run(appliance, "state", "token", "rotate", "bob", "--json").stdout)
     bob = {"ROSRV_TOKEN": made["token"]}
     assert run(appliance, "api", "policy", "revisions", env=bob).returncode == 0
     assert "for admins" in run(appliance, "api", "token", "list", env=bob).stderr
@@ -216,6 +223,40 @@ def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Applian
     unknown = [run(appliance, way, "token", "revoke", "bob") for way in ("state", "api")]
     assert unknown[0].stderr == unknown[1].stderr
     assert [one.returncode for one in unknown] == [1, 1]
+
+
+def test_the_summary_of_denials_is_the_same(appliance: Appliance) -> None:
+    """It has the denied publications of the beginning, by host and caller."""
+
+    def summary(way: str) -> Any:
+        return json.loads(run(appliance, way, "audit", "summary", "--json").stdout)
+
+    before, over_rest, after = (summary(way) for way in ("state", "api", "state"))
+    assert before["denials"] <= over_rest["denials"] <= after["denials"]
+    assert over_rest["hosts"][0]["host"] == "127.0.0.1"
+    assert {"/node/a", "/node/b", "/node/c"} & {one["name"] for one in over_rest["hosts"][0]["callers"]}
+
+
+def test_watching_survives_a_restart_of_the_api(appliance: Appliance) -> None:
+    """After the api was killed, `status --watch --api` goes on with the status of the next one."""
+    certificate = str(appliance.state / "api" / "certificate.pem")
+    place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]
+    with subprocess.Popen(
+        [ROSRV, "status", "--watch", "1", "--json", *place],
+        env=os.environ | {"ROSRV_TOKEN": appliance.token}, stdout=subprocess.PIPE, text=True,
+    ) as watcher:  # fmt: skip
+        assert watcher.stdout is not None
+
+        def api_seen() -> int:
+            seen = json.loads(watcher.stdout.readline())  # type: ignore[union-attr]  # checked above
+            return next((one["pid"] for one in seen.get("processes", ()) if one["role"] == "api"), 0)
+
+        first = api_seen()
+        os.kill(first, signal.SIGKILL)
+        while api_seen() in (0, first):
+            pass
+        watcher.send_signal(signal.SIGINT)
+        assert watcher.wait(LIMIT) in (0, 1)
 
 
 def test_following_survives_a_restart_of_the_api(appliance: Appliance) -> None:
