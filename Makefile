@@ -20,7 +20,7 @@ LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integratio
 LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py)
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
-.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-nodes system-namespaces test-package prove wheel package image site release bench clean
+.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -87,7 +87,11 @@ test-package: ## what is installed: the package's life in a virtual machine, ima
 
 wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl, and the versions that were tested
 	$(BIN)/python -m hatchling build --target wheel
-	sed -n 's/^\([a-z0-9.-]*==[^ ]*\) .*/\1/p' requirements.lock > dist/rosrv_appliance-$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')-constraints.txt
+	$(MAKE) --silent --no-print-directory constraints > dist/rosrv_appliance-$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')-constraints.txt
+
+# pip also installs the two packages that requirements.lock leaves out.
+constraints:
+	@{ cat requirements.lock; grep -E '^(numpy|apsw)==' requirements-dev.lock; } | sed -n 's/^\([a-z0-9.-]*==[^ ]*\) .*/\1/p'
 
 package: setup ## the Debian package of this machine's architecture, or of ARCH="amd64 arm64": dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package

@@ -51,10 +51,11 @@ def run(rosrv: Path, *arguments: str, folder: Path, seconds: float = 60) -> subp
 
 
 def test_it_reports_its_version_and_packages(rosrv: Path, tmp_path: Path) -> None:
-    """Version and packages are those of the project and its lock; the verbs have their help."""
+    """Version and packages are those of the project and its constraints; the verbs have their help."""
     assert re.fullmatch(r"rosrv \d+\.\d+\.\d+\n", run(rosrv, "--version", folder=tmp_path).stdout)
     facts = json.loads(run(rosrv, "version", "--json", folder=tmp_path).stdout)
-    locked = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
+    constraints = ROOT / "dist" / f"rosrv_appliance-{__version__}-constraints.txt"
+    locked = dict(line.split("==") for line in constraints.read_text().splitlines())
     del locked["python-iptables"]  # an extra, which is compiled
     installed = {
         re.sub(r"[-_.]+", "-", part["name"]): part["version"]

@@ -7,6 +7,7 @@ import tomllib
 import zipfile
 from email import message_from_bytes
 from email.message import Message
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,23 @@ def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
     major, minor = locked.split(".")[:2]
     bounds = {one.operator: one.version for one in requirement.specifier}
     assert bounds == {">=": f"{major}.{minor}", "<": str(int(major) + 1)}
+
+
+def test_the_constraints_name_every_package_that_pip_installs() -> None:
+    """An installation with the constraints has the tested versions only, also of packages that the lock leaves out."""
+    made = subprocess.run(
+        ["make", "--silent", "constraints"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
+    pinned = dict(line.split("==") for line in made.splitlines())
+    assert pinned.items() >= LOCKED.items()
+    waiting, found = [*RUNS], set[str]()
+    while waiting:
+        name = waiting.pop().name.lower()
+        if name not in found:
+            found.add(name)
+            needed = map(Requirement, distribution(name).requires or ())
+            waiting += [one for one in needed if one.marker is None or one.marker.evaluate({"extra": ""})]
+    assert {re.sub(r"[-_.]+", "-", name) for name in found} <= pinned.keys()
 
 
 def test_it_says_what_it_is(wheel: Path) -> None:
