@@ -70,11 +70,13 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     parameter = request.category in PARAMETERS
     decision = decide_right(policy, right)
     atoms = policy.atoms_of(request.host)
-    matching = _matching(policy, request)
+    matching, blocked = _matching(policy, request), policy.blocked(request.host) is not None
     winner = next((rule for rule in matching if rule.rule == decision.rule), None)
     through = winner.granted_through(atoms) if winner is not None else ()
     lost = tuple(
-        OverruledRule(rule.rule, rule.grants(atoms), _why(rule, decision))
+        OverruledRule(
+            rule.rule, rule.grants(atoms), "the host is blocked" if blocked else _why(rule, decision)
+        )
         for rule in matching
         if rule is not winner
     )

@@ -107,7 +107,7 @@ class HostBlocked(BlockedHost, frozen=True, kw_only=True):
     replaced: Annotated[BlockedHost | None, doc("its earlier block; null: it was not blocked")]
     other_addresses: Annotated[
         list[str],
-        doc("addresses of the same machine with rights that are not blocked: of its tunnel, or outside it"),
+        doc("further addresses of the same machine that have rights: of its tunnel, or outside it"),
     ]
 
 

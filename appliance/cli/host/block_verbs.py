@@ -6,8 +6,10 @@ import typer
 
 from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock
 from appliance.channel.answers.host_answers import BlockedHost, BlockEnded
+from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
+from appliance.cli.host.private_output import usage_error
 from appliance.cli.output import moment, say_json
 from rosmop.tool.terminal import counted, say
 
@@ -38,6 +40,10 @@ def block(
     Example: rosrv host block 10.0.0.7 --for 1h --note "strange traffic"
     """
     seconds = None if time is None else span_given("--for", time, "30s, 10m, 1h or 2d", "rosrv host")
+    if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
+        raise usage_error(
+            f"--for {time}: a block lasts 1s to {LONGEST_BLOCK_SECONDS // 86_400}d; without --for it has no end"
+        )
     body = running.answer_or_exit(HostBlock(address, seconds, note, force))
     end = (
         f"until {moment(body.until)}"

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock, PolicyReload
 from appliance.channel.answers.host_answers import BlockEnded, HostBlocked
 from appliance.control import block_orders, host_blocks
@@ -17,12 +18,14 @@ from appliance.control.block_orders import BlockOrders
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.policies import Policies
 from appliance.hosts.host_table import HostRefusedError
+from appliance.master.caller import Answer
 from appliance.master.graph.registry import Kind
 from appliance.master.graph.revocation import revoked
 from appliance.policy.model import Category, Request, address_of
 from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
+from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -193,15 +196,37 @@ async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
 async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: Path) -> None:
     """The call was decided before the block, and the ROS master answers after it."""
     async with control(tmp_path, Clock()) as made:
+        begun, held, register = asyncio.Event(), asyncio.Event(), made.hidden.call
+
+        async def slow(method: str, *params: Value) -> Answer:
+            if method == "registerPublisher":
+                begun.set()
+                await held.wait()
+            return await register(method, *params)
+
+        cast(Any, made.hidden).call = slow
         call = asyncio.create_task(
             made.ask("registerPublisher", "/talker", "/scan", "t/T", f"http://{NODE}:4001/")
         )
-        await until(lambda: made.hidden.calls)
-        await made.block(NODE)
+        await begun.wait()
+        assert (await made.block(NODE)).ended.publications == 0
+        held.set()
         await call
         await made.settle()
         assert not made.hidden.has(Kind.PUBLICATION, "/scan")
         assert not [one for one in made.revocation.live() if str(one.host) == NODE]
+
+
+async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> None:
+    """An operator who interrupted the command may rely on that."""
+    async with control(tmp_path, Clock()) as made:
+        await made.block(OTHER)
+        with awaited(lambda: True):
+            with pytest.raises(WithdrawnError):
+                await made.block(NODE)
+            with pytest.raises(WithdrawnError):
+                await made.unblock(OTHER)
+        assert await made.blocked() == [OTHER]
 
 
 async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
