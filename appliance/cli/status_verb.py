@@ -46,6 +46,7 @@ def status(
     seconds: Annotated[
         float | None,
         typer.Argument(
+            metavar="SECONDS",
             min=LEAST_SECONDS,
             max=LONGEST_SECONDS,
             help="With --watch: the time between two statuses (default: 2)",

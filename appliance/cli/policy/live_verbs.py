@@ -41,7 +41,8 @@ def show(
             say(line)
         how = loaded_by(body.who, body.loaded)
         note = f": {body.note}" if body.note else ""
-        typer.echo(printable(f"rosrv: revision {body.revision}, {how}{note}"), err=True)
+        # A comment, because a terminal of a container mixes both outputs.
+        typer.echo(printable(f"# revision {body.revision}, {how}{note}"), err=True)
 
 
 @speaks
