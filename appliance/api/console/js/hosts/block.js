@@ -60,7 +60,7 @@ function Present({ host }) {
   const sum = (/** @type {"publishes" | "subscribes" | "offers"} */ field) => nodes.reduce((/** @type {number} */ total, /** @type {any} */ one) => total + one[field].length, 0);
   if (!nodes.length) return html`<p class="muted">No node of this host is registered now.</p>`;
   return html`<div><p>Would end: ${ended({ publications: sum("publishes"), subscriptions: sum("subscribes"), services: sum("offers") })} of ${counted(nodes.length, "node")}.</p>
-    <p class="muted"><${Given} value=${nodes.map((/** @type {any} */ one) => one.name).join(", ")} most=${300} mono /></p></div>`;
+    <p class="muted"><${Given} value=${nodes.map((/** @type {any} */ one) => one.name).join(", ")} most=${300} /></p></div>`;
 }
 
 /** @param {Record<string, number>} counts */
