@@ -233,7 +233,7 @@ def _return(scope: FunctionScope, node: tree.ReturnStatement) -> None:
         hint = "write `return;` to drop the message" if scope.role == "action" else "write `return;`"
         raise SpecificationError.at(node.value.position, f"there is no caller to return a value to; {hint}")
     if scope.role == "action":
-        scope.add(nodes.Drop(scope.lines.site, anyway=True))
+        scope.add(nodes.Drop(scope.lines.site))
     scope.add(nodes.Leave(scope.lines.site, True if scope.role in ("action", "timer") else None))
 
 
@@ -257,7 +257,7 @@ def _return_value(scope: FunctionScope, node: tree.ReturnStatement) -> None:
 def _drop(scope: FunctionScope, node: tree.Statement) -> None:
     if scope.drop_refused is not None:
         raise SpecificationError.at(node.position, f"`DROP;` is not allowed here: {scope.drop_refused}")
-    scope.add(nodes.Drop(scope.lines.site, anyway=scope.role != "handler"))  # a timeout has no message
+    scope.add(nodes.Drop(scope.lines.site))
 
 
 def _reset(scope: FunctionScope, node: tree.Statement) -> None:

@@ -413,10 +413,9 @@ class LimitDepth(FormNode, frozen=True):
 
 
 class Drop(FormNode, frozen=True):
-    """Drop the message. `anyway`: there always is a message. Otherwise there may be none, as at a deadline."""
+    """Drop the message, if there is one; at a deadline there is none."""
 
     site: int
-    anyway: bool
 
 
 class Reset(FormNode, frozen=True):

@@ -153,7 +153,6 @@ LONG = IntegerType(64, True, "long")
 ULONG = IntegerType(64, False, "unsigned long")
 FLOAT, DOUBLE = FloatingType(32), FloatingType(64)
 
-Number = BoolType | IntegerType | FloatingType
 NUMBERS = (BoolType, IntegerType, FloatingType)
 
 

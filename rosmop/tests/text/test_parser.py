@@ -6,7 +6,8 @@ import pytest
 
 from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
-from rosmop.text.parser import MAX_CHARACTERS, parse
+from rosmop.text.builder import TreeBuilder
+from rosmop.text.parser import MAX_CHARACTERS, _parser, parse
 
 
 def parsed(text: str) -> tree.Specification:
@@ -27,6 +28,15 @@ def refusal(text: str) -> tuple[int, int, str]:
         parse(text, "x.rv")
     finding = caught.value.findings[0]
     return finding.position.line, finding.position.column, finding.text
+
+
+def test_each_rule_of_the_grammar_has_a_method() -> None:
+    """lark finds the methods of the builder by the names of the rules, and builds nothing of a rule without one."""
+    rules = {str(rule.alias or rule.origin.name): rule for rule in _parser().rules}
+    methods = {name for name in vars(TreeBuilder) if not name.startswith("_")} - {"at", "refuse"}
+    assert methods - rules.keys() == set()
+    built = {name for name, rule in rules.items() if rule.alias or not rule.options.expand1}
+    assert {name for name in built if not name.startswith("_")} - methods == set()
 
 
 HEADS = [
