@@ -195,6 +195,11 @@ class FiniteRun(UntimedRun):
         self._automaton = automaton
         self.state = automaton.initial
 
+    def __copy__(self) -> "FiniteRun":
+        made = FiniteRun(self._automaton)
+        made.state = self.state
+        return made
+
     @property
     def as_new(self) -> bool:
         """Whether the run is in the initial state."""
@@ -264,6 +269,11 @@ class ClockedRun:
         self._tables = tables
         self.state = tables.initial
         self.now = self.since = time_ns
+
+    def __copy__(self) -> "ClockedRun":
+        made = ClockedRun(self._tables, self.now)
+        made.state, made.since = self.state, self.since
+        return made
 
     @property
     def deadline(self) -> int | None:
