@@ -30,7 +30,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import read_signature, signer
-from appliance.store.revisions import DISK, Revisions
+from appliance.store.revisions import DISK, Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -151,13 +151,13 @@ class Policies(Revisions[RevisionRow]):
     async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again: check, test and load it, and decide all live rights again.
 
-        The author of the revision is always `disk`; `who` is only recorded. Raises `PolicyRefusedError`. Raises
-        `RevisionChangedError` if another revision came into force in the meantime.
+        The author of the revision is always `disk`; `who` is recorded and in the note. Raises `PolicyRefusedError`.
+        Raises `RevisionChangedError` if another revision came into force in the meantime.
         """
-        by, within = DISK if who == "operator" else who, request.confirm_within
+        within, note = request.confirm_within, reloaded_by(who)
         async with self._changing(request.expected):
-            policy, signature = await self._prepared(self._read, str(self.file), by)
-            return self._keep(policy, signature, who=DISK, note="reloaded from disk", by=by, within=within)
+            policy, signature = await self._prepared(self._read, str(self.file), who)
+            return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force, as `reload` does with the file.

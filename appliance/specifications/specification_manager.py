@@ -56,7 +56,7 @@ from appliance.specifications.specification_revisions import (
 )
 from appliance.specifications.switches import Switches, require_whole
 from appliance.specifications.timed_disables import LONGEST, TimedDisables
-from appliance.store.revisions import DISK, Revisions
+from appliance.store.revisions import DISK, Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -292,7 +292,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             keeper = who if kept else DISK  # with `DISK`, the next start would read only the folder
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
-            within, note = request.confirm_within, "reloaded from disk"
+            within, note = request.confirm_within, reloaded_by(who)
             return await self._change(
                 sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
             )

@@ -20,6 +20,11 @@ DISK = "disk"
 """The `who` of a revision that was read from the disk."""
 
 
+def reloaded_by(who: str) -> str:
+    """Return the note of a revision that was read again; `DISK`: by a signal to the appliance."""
+    return "reloaded from disk" + (f" by {who}" if who != DISK else "")
+
+
 class Row(Protocol):
     """A stored revision."""
 

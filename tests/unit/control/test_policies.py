@@ -107,6 +107,23 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Pa
         assert (policies.revision, policies.confirm_by) == (3, None)
 
 
+async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The note and the record have the author, but a reload by a signal has none; the text is the disk's."""
+    with Appliance(tmp_path).started() as policies:
+        recorded: list[object] = []
+        monkeypatch.setattr(
+            policies._trail, "happened", lambda *_texts, **detail: recorded.append(detail["who"])
+        )
+        for who, note in (
+            ("operator", "reloaded from disk by operator"),
+            ("alice", "reloaded from disk by alice"),
+            ("disk", "reloaded from disk"),
+        ):
+            await policies.reload(PolicyReload(), who)
+            assert (policies.in_force.who, policies.in_force.note) == ("disk", note)
+        assert recorded == ["operator", "alice", "disk"]
+
+
 async def test_a_clock_set_back_does_not_extend_the_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
