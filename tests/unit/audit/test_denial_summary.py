@@ -145,8 +145,8 @@ def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     assert summary_of_log(log.path, Filter(since=time.time_ns() + 60 * _SECOND), 10).hosts == []
 
 
-def test_twenty_thousand_denials_take_less_than_a_second(make_log: MakeLog) -> None:
-    """The limit is four times the processor time of 2026: a hundred thousand then take a second."""
+def test_ten_thousand_denials_take_less_than_half_a_second(make_log: MakeLog) -> None:
+    """The limit is four times the processor time of 2026, in which a hundred thousand take a second."""
     log = make_log()
     assert log.close() is None
     connection = open_for_writing(log.path)
@@ -156,12 +156,12 @@ def test_twenty_thousand_denials_take_less_than_a_second(make_log: MakeLog) -> N
         f"INSERT INTO record ({', '.join(StoredColumns._fields)}, hash) VALUES ({marks})",  # noqa: S608  fixed names
         (
             (*to_columns(denial(number, f"10.0.{number % 1000 // 250}.{number % 250}"), number + 10), b"")
-            for number in range(20_000)
+            for number in range(10_000)
         ),
     )
     connection.execute("COMMIT")
     connection.close()
     before = time.process_time()
     found = summary_of_log(log.path, Filter(), 20)
-    assert time.process_time() - before < 0.8
-    assert (found.denials, found.more_hosts) == (20_000, 980)
+    assert time.process_time() - before < 0.4
+    assert (found.denials, found.more_hosts) == (10_000, 980)

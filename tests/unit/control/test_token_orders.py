@@ -250,7 +250,7 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
 
 
 async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
-    """Wherever the state file was cut off, exactly one of the two tokens is valid at the next start."""
+    """Wherever the file of queued statements was cut off, exactly one of the two tokens is valid at the next start."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     assert lives.store is not None
@@ -266,7 +266,7 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
     ahead = lives.home / "state.ahead"
     whole, seen = ahead.read_bytes(), set()
     state = {path: path.read_bytes() for path in lives.home.glob("state.db*")}
-    for length in range(len(whole) + 1):
+    for length in (*range(0, len(whole), 11), len(whole)):
         for path in lives.home.glob("state.db*"):
             path.unlink()
         for path, data in state.items():
