@@ -23,6 +23,7 @@ const COLUMN = 52;
 const GROUP = [206, 50];
 const ROOM = 80; // for the lines that go back, between the connected items and the others
 const MOST_BANDS = 4;
+const READABLE = 0.75; // a layout of at least this zoom is not folded
 const FOLD = 1.25; // how much larger the drawing must become for a band more
 const NARROW_COLUMNS = 3; // of items without lines
 const BETWEEN = 44; // distance of the two columns in a narrow frame, for the lines
@@ -101,7 +102,9 @@ export function afresh(items, lines, frame) {
 function folded(spots, frame) {
   const ranks = [...new Set([...spots.values()].map((one) => one.x))].sort((a, b) => a - b);
   const all = extent(spots.values());
-  let best = { zoom: FOLD * Math.min(frame.w / all.w, frame.h / all.h), bands: /** @type {[string, Spot][][]} */ ([]) };
+  const whole = Math.min(frame.w / all.w, frame.h / all.h);
+  if (whole > READABLE) return spots;
+  let best = { zoom: FOLD * whole, bands: /** @type {[string, Spot][][]} */ ([]) };
   for (let count = 2; count <= Math.min(MOST_BANDS, ranks.length); count += 1) {
     const size = Math.ceil(ranks.length / count);
     const bands = Array.from({ length: count }, (_, band) => [...spots].filter(([, { x }]) => Math.floor(ranks.indexOf(x) / size) === band)).filter((band) => band.length);
