@@ -1,0 +1,80 @@
+"""Tests of `appliance.api.audit_summary`."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import pytest
+from starlette.responses import Response
+
+from appliance.api import audit_summary
+from appliance.api.problems import ProblemError
+from appliance.api.services import Services
+from appliance.audit.denial_summary import DenialSummary
+from appliance.audit.query import Filter
+from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
+
+__all__ = ["key", "make_log", "notary", "path"]
+
+
+class _Log:
+    """The only part of `Services` that the route reads."""
+
+    def __init__(self, log: Path) -> None:
+        self.audit_log = log
+
+
+def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
+    """Return the route's function."""
+    [one] = audit_summary.routes(cast(Services, _Log(log))).routes
+    return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
+
+
+def asked(log: Path, since: str | None = None) -> DenialSummary | int:
+    """Return the summary, or the status of the problem."""
+    try:
+        body = asyncio.run(route(log)(since, None, 20)).body
+        return msgspec.json.decode(bytes(body), type=DenialSummary)
+    except ProblemError as problem:
+        return problem.status
+
+
+def test_the_summary_is_made_from_the_log(make_log: MakeLog) -> None:
+    """A time that makes no sense, and a missing log, are problems."""
+    log = make_log()
+    log.record(decision(log, decision="deny", host="10.0.0.9"))
+    settle(log)
+    found = asked(log.path)
+    assert isinstance(found, DenialSummary)
+    assert [row.host for row in found.hosts] == ["10.0.0.9"]
+    assert asked(log.path, "never") == 422
+    assert asked(log.path.with_name("none.db")) == 503
+
+
+def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each may read a million records; the others wait for it."""
+    running, most, lock = 0, 0, threading.Lock()
+    second = threading.Event()
+
+    def slow(_path: Path, _wanted: Filter, _limit: int) -> DenialSummary:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        second.wait(0.05)  # long enough for the other to begin, if it could
+        with lock:
+            running -= 1
+        return DenialSummary(0, [], 0, 0, None)
+
+    monkeypatch.setattr(audit_summary, "summary_of_log", slow)
+
+    async def both() -> None:
+        ask = route(tmp_path)
+        await asyncio.gather(ask(None, None, 20), ask(None, None, 20))
+
+    asyncio.run(both())
+    assert most == 1
