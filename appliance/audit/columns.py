@@ -24,7 +24,8 @@ _KINDS: tuple[tuple[type, ...], ...] = (
     (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE), (int, _NONE), (int, _NONE), (str,), (int, _NONE),
     (bytes,),
 )  # fmt: skip
-_encoder = msgspec.json.Encoder(order="deterministic")
+# The hash covers this text; an export and its verification must write it again, from dicts instead of structs.
+_encoder = msgspec.json.Encoder(order="sorted")
 _decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
 
 

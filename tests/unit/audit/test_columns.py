@@ -1,7 +1,9 @@
 """Tests of storing any value that an unknown host can put into a record."""
 
+from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.audit.columns import LARGEST_DETAIL, LONGEST_TEXT, from_columns, to_columns
@@ -22,6 +24,28 @@ def test_round_trip() -> None:
         detail={"list": [1, 2.5, None, {"deep": "ü"}]},
     )  # fmt: skip
     assert from_columns(to_columns(record, 1)) == record
+
+
+class Ended(msgspec.Struct):
+    """A struct whose fields are not in alphabetical order."""
+
+    publications: int = 1
+    connections: int = 2
+
+
+@dataclass
+class Row:
+    """The same as a dataclass."""
+
+    publications: int = 1
+    connections: int = 2
+
+
+@pytest.mark.parametrize("value", [Ended(), Row(), [Ended()], {"z": Row(), "a": 1}])
+def test_a_record_that_was_read_is_stored_as_the_same_text(value: object) -> None:
+    """An export has the record as it was read, and its verification computes the hash of the same text."""
+    columns = to_columns(make(detail={"ended": value}), 1)
+    assert to_columns(from_columns(columns), 1) == columns
 
 
 @pytest.mark.parametrize(
