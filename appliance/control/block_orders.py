@@ -33,6 +33,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 MOST = 1000
 _LONGEST_NOTE = 200
+_FEW = 10  # registrations: two nodes; a robot has more
 _LOOK_SECONDS = 10.0  # the timer does not count while the machine is suspended; the age clock does
 _REGISTERED = {
     "registerPublisher": "publications",
@@ -92,11 +93,8 @@ class BlockOrders:
         _require_possible(address)
         await self._read_clock()
         before = self._held_by(address)
-        if not request.force and any(address in network for network in self._policies.current.robot):
-            raise HostRefusedError(
-                f"{address} is the robot's own host: to block it would end {in_words(before)}; to do it all the same,"
-                " use --force (REST: `force`)"
-            )
+        if not request.force:
+            self._require_not_the_robot(address, before)
         earlier = self._blocks.rows().get(address)
         if earlier is None and len(self._blocks) >= MOST:
             raise HostRefusedError(f"{MOST} hosts are blocked, the limit: lift a block (rosrv host blocks)")
@@ -110,6 +108,7 @@ class BlockOrders:
         self._trail.happened(
             "host blocked",
             f"{address} is {self._blocks.reasons[address]}",
+            host=row.address,
             address=row.address,
             who=who,
             until=shown.until,
@@ -141,6 +140,7 @@ class BlockOrders:
         self._trail.happened(
             "host unblocked",
             f"the block of {address} by {earlier.who} was lifted",
+            host=earlier.address,
             address=earlier.address,
             who=who,
             restored=restored,
@@ -170,6 +170,7 @@ class BlockOrders:
             self._trail.happened(
                 "host block ended",
                 f"the block of {address} by {rows[address].who} is over",
+                host=rows[address].address,
                 address=rows[address].address,
                 note=rows[address].note,
             )
@@ -203,6 +204,20 @@ class BlockOrders:
                 f"{text[:80]!r} is neither an IPv4 or IPv6 address nor the name of an enrolled host{guess}"
             )
         return plain_address(enrolled[name])
+
+    def _require_not_the_robot(self, address: Address, held: answers.BlockEnded) -> None:
+        """Raise `HostRefusedError` for the robot's own host, and for a host with most of all registrations."""
+        own, whole = _registrations_of(held), self._registrations()
+        if any(address in network for network in self._policies.current.robot):
+            why = "is the robot's own host"
+        elif own > max(whole / 2, _FEW):
+            why = f"has {own} of {whole} registrations, so it may be the robot itself"
+        else:
+            return
+        raise HostRefusedError(
+            f"{address} {why}: to block it would end {in_words(held)}; to do it all the same, use --force"
+            " (REST: `force`)"
+        )
 
     def _same_machine(self, address: str) -> set[str]:
         """Return the other addresses of a host with a tunnel: its virtual address and its real address."""
@@ -268,5 +283,8 @@ def _difference(before: answers.BlockEnded, after: answers.BlockEnded) -> answer
 
 def in_words(held: answers.BlockEnded) -> str:
     """Return numbers of registrations and connections as text."""
-    registrations = held.publications + held.subscriptions + held.services + held.parameters
-    return f"{registrations} registrations and {held.connections} connections"
+    return f"{_registrations_of(held)} registrations and {held.connections} connections"
+
+
+def _registrations_of(held: answers.BlockEnded) -> int:
+    return held.publications + held.subscriptions + held.services + held.parameters

@@ -368,10 +368,10 @@ class ControlParts:
         """Return the state of each incarnation."""
         return [one.life for one in self.registry.all()]
 
-    def node(self, name: str, number: int = 1) -> Incarnation:
-        """Return a node on the robot that has registered nothing yet; `number` tells its incarnations apart."""
-        uri = f"http://10.0.0.5:{4000 + number}/"
-        node = Incarnation(new_key(), name, HOST, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+    def node(self, name: str, number: int = 1, host: Address = HOST) -> Incarnation:
+        """Return a node on a host that has registered nothing yet; `number` tells its incarnations apart."""
+        uri = f"http://{host}:{4000 + number}/"
+        node = Incarnation(new_key(), name, host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
         self.registry.add(node)
         return node
 

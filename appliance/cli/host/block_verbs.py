@@ -30,7 +30,12 @@ def block(
         ),
     ] = None,
     note: Annotated[str, typer.Option(help="The reason, for other operators")] = "",
-    force: Annotated[bool, typer.Option("--force", help="Block even the robot's own host")] = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Block even the robot's own host, or a host with most of all registrations"
+        ),
+    ] = False,
 ) -> None:
     """Block a host at once: deny all its calls, and end its registrations and connections.
 

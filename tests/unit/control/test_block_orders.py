@@ -370,6 +370,22 @@ async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
         assert made.denial(ROBOT) is not None
 
 
+async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path: Path) -> None:
+    """One wrong digit must not stop the robot, whose nodes may be on any host."""
+    async with control(tmp_path, Clock()) as made:
+        for host, name in ((NODE, "/driver"), (OTHER, "/console")):
+            node = made.node(name, host=address_of(host))
+            for number in range(11):
+                await made.register(node, Kind.PUBLICATION, f"{name}/{number}")
+            with pytest.raises(HostRefusedError, match=r"has 11 of 11 registrations, .* would end 11 regis"):
+                await made.block(host)
+            assert made.denial(host) is None
+            if host == NODE:
+                assert (await made.block(host, force=True)).ended.publications == 11
+        await made.unblock(NODE)
+        assert (await made.block(OTHER)).ended.publications == 11
+
+
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A blocked host may be blocked again at the limit, another may not."""
     monkeypatch.setattr(block_orders, "MOST", 2)
