@@ -43,9 +43,13 @@ _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 @speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object; with --watch one a line")])
 def status(
     appliance: Appliance,
-    seconds: Annotated[
+    *,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
+    ] = False,
+    every: Annotated[
         float | None,
-        typer.Argument(
+        typer.Option(
             metavar="SECONDS",
             min=LEAST_SECONDS,
             max=LONGEST_SECONDS,
@@ -53,22 +57,18 @@ def status(
             show_default=False,
         ),
     ] = None,
-    *,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
-    ] = False,
 ) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 
     Exit status: 0 in service, 1 needs attention, 2 not running; with --watch that of the last status.
 
-    Example: rosrv status --watch 5
+    Example: rosrv status --watch --every 5
     """
-    if seconds is not None and not watch:
-        raise usage_error("SECONDS needs --watch", "rosrv status")
+    if every is not None and not watch:
+        raise usage_error("--every needs --watch", "rosrv status")
     try:
         if watch:
-            each = seconds or _WATCH_SECONDS
+            each = every or _WATCH_SECONDS
             raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
         view = _view(appliance.body_or_exit(appliance.ask(StatusWanted())))
     except NotRunningError as error:

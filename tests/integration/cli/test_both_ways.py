@@ -83,6 +83,7 @@ LOOKING = [
     ("topic", "publishers", "/nowhere", "--at", "2026-01-01"),
     ("topic", "info", "/nowhere"), ("topic", "echo", "/nowhere"), ("topic", "echo", "/nowhere", "--json"),
     ("host", "list"), ("host", "revoke", "nobody"), ("host", "reload"),
+    ("host", "blocks"), ("host", "unblock", "10.9.9.9"), ("host", "block", "nobody"),
     ("record", "list"), ("record", "list", "--json"), ("record", "show", "a" * 20), ("record", "now"),
     ("record", "remove", "a" * 20), ("record", "timeline", "a" * 20), ("monitor", "rollback", "777"),
     ("monitor", "confirm"), ("monitor", "promote", "nobody"),
@@ -242,7 +243,7 @@ def test_watching_survives_a_restart_of_the_api(appliance: Appliance) -> None:
     certificate = str(appliance.state / "api" / "certificate.pem")
     place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]
     with subprocess.Popen(
-        [ROSRV, "status", "--watch", "1", "--json", *place],
+        [ROSRV, "status", "--watch", "--every", "1", "--json", *place],
         env=os.environ | {"ROSRV_TOKEN": appliance.token}, stdout=subprocess.PIPE, text=True,
     ) as watcher:  # fmt: skip
         assert watcher.stdout is not None
