@@ -32,6 +32,7 @@ from appliance.recorder.timeline import (
     MOST_COLUMNS,
     MOST_NEIGHBOURS,
     NEIGHBOURS,
+    is_record,
     messages_around,
     timeline,
 )
@@ -140,7 +141,7 @@ def _add_reading(router: Routes, services: Services) -> None:
             str,
             Query(
                 max_length=64,
-                description="RFC 3339, or the `place` of a message",
+                description="RFC 3339, the `place` of a message, or the id of an audit record",
                 examples=["2026-03-01T12:00:00.5Z"],
             ),
         ],
@@ -150,7 +151,7 @@ def _add_reading(router: Routes, services: Services) -> None:
         ] = NEIGHBOURS,
     ) -> RecordedMessages:
         """Messages of a recording around a moment, read as fields, for investigators; it is recorded who read."""
-        moment = MessagePosition.parsed(at) or _moment(at)
+        moment = at if is_record(at) else MessagePosition.parsed(at) or _moment(at)
         assert moment is not None  # noqa: S101  `_moment` returns None only for None
         return await read(
             admin.RecordingRead(recording_id, topic),

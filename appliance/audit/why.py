@@ -57,7 +57,7 @@ def _recorded(record: AuditRecord) -> Iterator[str]:
         yield f"not recorded: {detail['not_recorded']}"
     elif "recording" in detail and "charged_to" in detail and not record.event.startswith("recording "):
         recording = detail["recording"]
-        yield f"recorded: in {recording}; rosrv record messages {recording} --at {rfc3339(record.time)}"
+        yield f"recorded: in {recording}; rosrv record messages {recording} --at {record.id}"
     elif record.event in _ACTIONS:
         yield "not recorded: recorder.triggers did not list this kind of event"
 

@@ -25,7 +25,14 @@ from appliance.cli.output import say_json, usage_error
 from appliance.cli.topic_verbs import lines_of
 from appliance.recorder.bag_reader import MessagePosition
 from appliance.recorder.mcap import as_mcap
-from appliance.recorder.timeline import MOST_COLUMNS, MOST_NEIGHBOURS, NEIGHBOURS, messages_around, timeline
+from appliance.recorder.timeline import (
+    MOST_COLUMNS,
+    MOST_NEIGHBOURS,
+    NEIGHBOURS,
+    is_record,
+    messages_around,
+    timeline,
+)
 from rosmop.tool.terminal import counted, printable, refused, say
 
 if TYPE_CHECKING:
@@ -130,7 +137,7 @@ def messages(
     at: Annotated[
         str | None,
         typer.Option(
-            help="A time (RFC 3339), a record that triggered the recording, or a message's position"
+            help="A time (RFC 3339), a record in the recording, or a message's position"
             " (default: its first trigger)",
             show_default=False,
         ),
@@ -151,11 +158,10 @@ def messages(
     """
     topics = topic or []
     body = appliance.ask_or_exit(admin.RecordingWanted(recording))
-    moments = {trigger.record: rfc3339(trigger.time) for trigger in body.triggers}
-    text = next(iter(moments.values())) if at is None else moments.get(at, at)
+    text = body.triggers[0].record if at is None else at
     way = appliance.way
     if isinstance(way, AdminSocket):
-        place = MessagePosition.parsed(text) or _moment_given("--at", text)
+        place = text if is_record(text) else MessagePosition.parsed(text) or _moment_given("--at", text)
         assert place is not None  # noqa: S101  it is text
         appliance.ask_or_exit(admin.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))

@@ -7,8 +7,10 @@ Events come from the audit records in the bag, because retention may have remove
 publisher's header has a host, and the recorder's own header has none.
 """
 
+import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
 from itertools import islice
 from pathlib import Path
 from typing import Any, get_args
@@ -41,6 +43,9 @@ MOST_EVENTS = 500
 _MOST_BYTES = 1 << 20  # bytes read of a message; people are shown far fewer
 _LONGEST_RECORD = 1 << 22
 _SECOND = 1_000_000_000
+_ROUNDED = 1000  # nanoseconds by which a record's rounded time may differ from that of its message
+_RECORD_ID = re.compile("[0-9a-f]{20}")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
 
 
@@ -144,20 +149,13 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 
 def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent]:
     """Yield the events of a period, in order."""
-    records = {
-        number
-        for number, header in reader.connections.items()
-        if header["topic"] == RECORDS and "host" not in header
-    }
-    for place, _number in reader.messages(records, since):
-        if place.time > until:
+    for said, time in _records(reader, since):
+        if time > until:
             return
-        _size, body = reader.body(place, _LONGEST_RECORD)
-        said = msgspec.json.decode(body[4:], type=_Said)
         kind = _kind(said)
         if kind is not None:
             yield RecordedEvent(
-                time=place.time,
+                time=time,
                 kind=kind,
                 record=said.id,
                 event=said.event,
@@ -170,6 +168,18 @@ def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent
             )
 
 
+def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
+    """Yield the audit records in the bag from a time on, in order, each with its time."""
+    numbers = {
+        number
+        for number, header in reader.connections.items()
+        if header["topic"] == RECORDS and "host" not in header
+    }
+    for place, _number in reader.messages(numbers, since):
+        _size, body = reader.body(place, _LONGEST_RECORD)
+        yield msgspec.json.decode(body[4:], type=_Said), place.time
+
+
 def _kind(said: _Said) -> EventKind | None:
     """Return the kind of event that the timeline shows for a record; None if the record is not shown."""
     kinds = kinds_of(said.event, said.decision, said.severity)
@@ -180,24 +190,33 @@ def _kind(said: _Said) -> EventKind | None:
     return "notice" if said.severity in _NOTABLE else None
 
 
+def is_record(text: str) -> bool:
+    """Whether a text has the form of a record's id."""
+    return _RECORD_ID.fullmatch(text) is not None
+
+
 def messages_around(
     recording: Recording,
     bag: Path,
-    at: int | MessagePosition,
+    at: int | MessagePosition | str,
     topics: Collection[str] = (),
     neighbours: int = NEIGHBOURS,
 ) -> RecordedMessages:
-    """Return at most `neighbours` messages before a time or position, and at most one more from it on.
+    """Return the message of a time, position or audit record (its id), with at most `neighbours` on each side.
 
-    `topics` limits the result to these topics (empty: all). Raises `OSError`, and `ValueError` if the bag is invalid.
+    The message of a time is the last one at or before it; that of a record is the message that the record is about, or
+    else the message of its time. `topics` limits the result to these topics (empty: all). Raises `OSError`, and
+    `ValueError` if the recording has no such record or the bag is invalid.
     """
-    place = at if isinstance(at, MessagePosition) else MessagePosition(at, 0, 0)
     with BagReader.of(bag) as reader:
         wanted = {
             number
             for number in _of_nodes(reader)
             if not topics or reader.connections[number]["topic"] in topics
         }
+        place = _place_of_record(reader, recording, at, wanted) if isinstance(at, str) else at
+        if not isinstance(place, MessagePosition):
+            place = _last_until(reader, place, wanted)
         before = reader.before(place, wanted, neighbours)
         later = (found for found in reader.messages(wanted, place.time) if found[0] >= place)
         readers: dict[int, PublisherReader] = {}
@@ -221,6 +240,52 @@ def messages_around(
                 )
             )
     return RecordedMessages(recording.id, messages, len(before))
+
+
+def _last_until(reader: BagReader, time: int, wanted: Collection[int]) -> MessagePosition:
+    """Return the position of the last message at or before a time; without one, that of the time."""
+    for place, _number in reader.before(MessagePosition(time + 1, 0, 0), wanted, 1):
+        return place
+    return MessagePosition(time, 0, 0)
+
+
+def _place_of_record(
+    reader: BagReader, recording: Recording, record: str, wanted: Collection[int]
+) -> MessagePosition | int:
+    """Return the position of the message that a record is about; the record's time if the bag does not have it.
+
+    A record of a monitor has the time at which the monitor judged the message, and so has the message. Messages that
+    were received together have the same time, so their first bytes are compared as well.
+    """
+    said, time = next((found for found in _records(reader) if found[0].id == record), (None, 0))
+    if said is None:
+        times = [trigger.time for trigger in recording.triggers if trigger.record == record]
+        if not times:
+            raise ValueError(f"the recording has no record {record}")
+        return times[0]
+    happened = said.detail.get("happened")
+    if not isinstance(happened, str):
+        return time
+    time = (datetime.fromisoformat(happened) - _EPOCH) // timedelta(microseconds=1) * 1000
+    own = {number for number in wanted if _is_sender(reader.connections[number], said)}
+    start = bytes.fromhex(str(said.detail.get("before", "")))
+    chosen: MessagePosition | None = None
+    for place, _number in reader.messages(own, time - _ROUNDED):
+        if place.time > time + _ROUNDED:
+            break
+        if chosen is None or reader.body(place, len(start))[1] == start:
+            chosen = place
+    return time if chosen is None else chosen
+
+
+def _is_sender(header: Mapping[str, str], said: _Said) -> bool:
+    """Whether a publisher sent the message that a record is about."""
+    sender = _sender(header)
+    return (header["topic"], sender.host, sender.node) == (
+        said.resource,
+        said.host or "",
+        said.caller_id or "",
+    )
 
 
 def _of_nodes(reader: BagReader) -> Iterator[int]:

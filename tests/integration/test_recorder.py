@@ -172,6 +172,9 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     assert json.loads(lines[0])["fields"]["data"].startswith("bad")
     assert "data: bad" in appliance.rosrv("record", "messages", row["id"], "--topic", "/rude").stdout
     assert appliance.recorded(event="recording read")[0]["detail"]["topics"] == ["/rude"]
+    about = appliance.rosrv("record", "messages", row["id"], "--at", dropped["id"]).stdout
+    [marked] = [line for line in about.splitlines() if line.startswith("->")]
+    assert {"/rude", "/lout"} <= set(marked.split())
     folder = appliance.state / "recordings" / row["id"]
     if os.geteuid() == 0:
         assert (folder.stat().st_uid, folder.stat().st_gid) == (61019, 61014)

@@ -165,5 +165,5 @@ class RecordedMessages(msgspec.Struct, frozen=True):
     id: str
     messages: list[RecordedMessage]
     chosen: Annotated[
-        int, doc("index of the first message at that time or later; the number of messages if there is none")
+        int, doc("index of the message that the record is about, or the last one at or before the time; or 0")
     ]

@@ -74,8 +74,7 @@ def test_a_drop_says_whether_it_was_recorded() -> None:
     drop = AuditRecord(id="1", time=1_500_000_000, event="message dropped", reason="no", detail=planned)
     assert list(lines_of(drop)) == [
         "no",
-        "recorded: in 18e9aa02efc40abb0e51; rosrv record messages 18e9aa02efc40abb0e51"
-        " --at 1970-01-01T00:00:01.500000000Z",
+        "recorded: in 18e9aa02efc40abb0e51; rosrv record messages 18e9aa02efc40abb0e51 --at 1",
     ]
     off = AuditRecord(
         id="1", time=1, event="message dropped", reason="no", detail={"not_recorded": "it is off"}

@@ -1,12 +1,14 @@
 """A recording's time line, and its messages around a point in time, read from one of the recorder's bags."""
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
-from appliance.channel.answers.recording_answers import Recording, Sender
+from appliance.channel.answers.recording_answers import Recording, Sender, Trigger
 from appliance.recorder.bag_reader import BagReader, MessagePosition
 from appliance.recorder.bag_writer import BagMessage, BagWriter
 from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline
@@ -104,8 +106,52 @@ def test_messages_around_a_moment_are_read(bag: Path) -> None:
     assert [one.fields["data"] for one in following.messages[:2]] == ["1.0", "1.0"]
     assert messages_around(RECORDING, bag, 0, neighbours=3).chosen == 0
     end = messages_around(RECORDING, bag, 2**60, neighbours=3)
-    assert (end.chosen, len(end.messages)) == (3, 3)
+    assert (end.chosen, len(end.messages)) == (3, 4)
     assert messages_around(RECORDING, bag, BEGAN, ["/nothing"]).messages == []
+
+
+def test_the_chosen_message_of_a_time_is_the_last_until_then(bag: Path) -> None:
+    """A message after that time did not cause what happened then."""
+    found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND + SECOND // 50, neighbours=2)
+    chosen = found.messages[found.chosen]
+    assert (chosen.time - BEGAN, chosen.fields["data"]) == (2 * SECOND, "1.0")
+
+
+def test_the_chosen_message_of_a_record_is_the_one_that_it_is_about(tmp_path: Path) -> None:
+    """Neither a later message of its sender, nor one received together with it, nor another sender's is chosen."""
+    path, judged = tmp_path / "a.bag", BEGAN + SECOND + 1_234_567
+    happened = datetime.fromtimestamp(judged / 1e9, UTC).isoformat()
+    detail = {"happened": happened, "before": body(b"7.5").hex()}
+    about = {"event": "message dropped", "resource": "/chatter", "host": "10.0.0.1", "caller_id": "/talker"}
+    writer = BagWriter(path, {})
+    talker = writer.connect(HEADER)
+    other = writer.connect(HEADER | {"callerid": "/other", "host": "10.0.0.2"})
+    said = [(talker, judged - SECOND, b"0.1"), *((talker, judged, text) for text in (b"0.3", b"7.5", b"0.4"))]
+    said += [
+        (other, judged, b"7.5"),
+        (other, judged + SECOND // 50, b"9"),
+        (talker, judged + SECOND // 8, b"0.5"),
+    ]
+    writer.write([BagMessage(number, time, body(text)) for number, time, text in said])
+    records = writer.connect(RECORDS)
+    writer.write([
+        BagMessage(records, judged + SECOND // 10, record(1, **about, detail=detail)),
+        BagMessage(records, judged + SECOND // 10, record(2, event="decision")),
+    ])  # fmt: skip
+    writer.close()
+
+    def chosen(at: str, *topics: str) -> tuple[str, str]:
+        found = messages_around(RECORDING, path, at, topics)
+        message = found.messages[found.chosen]
+        return message.sender.node, message.fields["data"]
+
+    assert chosen(f"{1:020x}") == chosen(f"{1:020x}", "/chatter") == ("/talker", "7.5")
+    assert chosen(f"{2:020x}") == ("/other", "9")
+    with pytest.raises(ValueError, match="has no record 00000000000000000003"):
+        chosen(f"{3:020x}")
+    trigger = Trigger(BEGAN + SECOND // 2, "order", f"{3:020x}", "by hand")
+    found = messages_around(msgspec.structs.replace(RECORDING, triggers=[trigger]), path, trigger.record)
+    assert found.messages[found.chosen].fields["data"] == "0.1"
 
 
 def test_pages_of_one_moment_end(tmp_path: Path) -> None:

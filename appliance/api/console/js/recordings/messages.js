@@ -12,18 +12,18 @@ import { iso } from "./times.js";
 const PAUSE = 250; // milliseconds after the last step on the time line
 const EACH = 5;
 
-/** @param {{path: string, at: number, topics: string[], clear: () => void, span: number}} given `topics`: none: of all */
-export function Messages({ path, at, topics, clear, span }) {
+/** @param {{path: string, at: number, record: string | null, topics: string[], clear: () => void, span: number}} given `record`: the event at that time; `topics`: none: of all */
+export function Messages({ path, at, record, topics, clear, span }) {
   const [reading, setReading] = useState(false);
   const [page, setPage] = useState(""); // the place of a message, once the user has paged on from the selected time
   const [found, setFound] = useState(/** @type {any} */ (null));
   const [error, setError] = useState(/** @type {unknown} */ (null));
-  useEffect(() => setPage(""), [at, topics]);
+  useEffect(() => setPage(""), [at, record, topics]);
   useEffect(() => {
     if (!reading) return undefined;
     const controller = new AbortController();
     const timer = setTimeout(() => {
-      get(`${path}/messages`, { at: page || iso(at), topic: topics, neighbours: EACH }, controller.signal).then(
+      get(`${path}/messages`, { at: page || record || iso(at), topic: topics, neighbours: EACH }, controller.signal).then(
         (body) => {
           setFound(body);
           setError(null);
@@ -35,7 +35,7 @@ export function Messages({ path, at, topics, clear, span }) {
       clearTimeout(timer);
       controller.abort();
     };
-  }, [path, reading, at, page, topics]);
+  }, [path, reading, at, record, page, topics]);
   const messages = reading ? found?.messages ?? [] : [];
   return html`<section class="panel" aria-labelledby="said"><div class="panel-head"><h2 id="said">Messages</h2>${topics.length > 0 && html`<span class="small"><${Given} value=${topics.join(", ")} mono most=${80} /> <button class="link" onClick=${clear}>all topics</button></span>`}
       <span class="end">${reading && html`<button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[0].place)}>Earlier</button><button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[messages.length - 1].place)}>Later</button>`}

@@ -64,7 +64,7 @@ function Incident(/** @type {{row: any, path: string}} */ { row, path }) {
       ${line.error ? html`<div class="panel-body"><${Failure} error=${line.error} retry=${line.again} /></div>` : !line.value ? html`<${Loading} rows=${8} />`
         : html`<${Lanes} line=${line.value} at=${at} move=${setAt} zoom=${zoom} all=${() => setPart({ since: row.began, until: row.ended })} topics=${topics} choose=${setTopics} about=${chosen?.resource ?? null} />`}</section>
     <div class="incident-grid"><${Events} line=${line.value} chosen=${chosen} pick=${pick} row=${row} />
-      <div class="stack">${chosen && html`<${Event} event=${chosen} />`}<${Messages} path=${path} at=${at} topics=${topics} clear=${() => setTopics([])} span=${(part.until - part.since) / 1e9} /></div></div>`;
+      <div class="stack">${chosen && html`<${Event} event=${chosen} />`}<${Messages} path=${path} at=${at} record=${chosen?.record ?? null} topics=${topics} clear=${() => setTopics([])} span=${(part.until - part.since) / 1e9} /></div></div>`;
 }
 
 function Events(/** @type {any} */ { line, chosen, pick, row }) {
