@@ -35,7 +35,11 @@ _Question = messages.ContentsWanted | messages.PartsWanted
 def main(lifeline_fd: int) -> None:
     """Compile specifications until control is done, or the supervisor ends the process."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    asyncio.run(CompilerProcess(Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)).run())
+    compiler = CompilerProcess(Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline))
+    asyncio.run(compiler.run())
+    # The lifeline stays open until the process has ended: the supervisor kills a process that closes it and still runs,
+    # and would count that as a restart.
+    os._exit(0)
 
 
 class CompilerProcess:

@@ -220,3 +220,21 @@ def _until_working(pid: int) -> None:
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     eventually(lambda: used() > 3.0, "it works")
+
+
+def test_an_idle_compiler_ends_with_an_open_lifeline() -> None:
+    """The supervisor kills a process that closes its lifeline and still runs, and that would count as a restart."""
+    here, there = socket.socketpair()
+    code = (
+        "import signal, sys; from appliance.compiler import process as p; p._IDLE_SECONDS = 0.1;"
+        " p.main(int(sys.argv[1])); signal.pause()"  # it would still run
+    )
+    with here, there:
+        command = [sys.executable, "-c", code, str(there.fileno())]
+        with subprocess.Popen(command, pass_fds=(there.fileno(),)) as idle:
+            there.close()
+            here.settimeout(60)
+            while here.recv(4096):
+                pass
+            idle.kill()
+    assert idle.returncode == 0
