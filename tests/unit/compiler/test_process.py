@@ -234,7 +234,9 @@ def test_an_idle_compiler_ends_with_an_open_lifeline() -> None:
         with subprocess.Popen(command, pass_fds=(there.fileno(),)) as idle:
             there.close()
             here.settimeout(60)
-            while here.recv(4096):
-                pass
-            idle.kill()
+            try:
+                while here.recv(4096):
+                    pass
+            finally:
+                idle.kill()
     assert idle.returncode == 0
