@@ -117,14 +117,14 @@ def _counts(entry: LogEntry, topic: str, at: int) -> bool:
 def _unknown(past: list[LogEntry], first: LogEntry | None, at: int) -> Iterator[str]:
     if first is None or at < first.record.time:
         begins = "the log is empty" if first is None else f"the log begins at {rfc3339(first.record.time)}"
-        yield f"{begins}: registrations before are not known"
+        yield f"{begins}: earlier registrations are missing"
     elif first.record.event != "log begun":
         yield (
             f"records before {rfc3339(first.record.time)} were removed: nodes that registered earlier, and have not"
             " unregistered since, are missing"
         )
     elif first.record.detail.get("earlier_log_missing"):
-        yield f"an earlier log is missing: registrations before {rfc3339(first.record.time)} are not known"
+        yield f"an earlier log is missing, with the registrations before {rfc3339(first.record.time)}"
     if any(entry.record.event == "records lost" for entry in past):
         yield "records were lost before this time: rosrv audit search --event 'records lost'"
     runs = [

@@ -26,7 +26,13 @@ def moment(seconds: float) -> str:
 
 def loaded_by(who: str, seconds: float | None) -> str:
     """Return who loaded a policy or specifications, and when; those of the disk were read."""
-    how = "read from disk" if who == "disk" else f"loaded by {who}"
+    match who:
+        case "disk":
+            how = "read from disk"
+        case "not confirmed in time":
+            how = f"rolled back automatically ({who})"
+        case _:
+            how = f"loaded by {who}"
     return how if seconds is None else f"{how} {moment(seconds)}"
 
 

@@ -1,5 +1,6 @@
 """`rosrv topic echo|info|publishers`: a topic's messages, and its publishers and subscribers, now or in the past."""
 
+import re
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
@@ -82,12 +83,10 @@ def publishers(
     *,
     at: Annotated[
         str,
-        typer.Option(
-            metavar="TIME", help="10:32, 'yesterday 10:32', 1h (ago), a date, or RFC 3339", show_default=False
-        ),
-    ],
+        typer.Option(metavar="TIME", help="10:32, 'yesterday 10:32', 1h (ago), a date, RFC 3339, or now"),
+    ] = "now",
 ) -> None:
-    """Show the nodes that were registered as publishers of a topic at a time in the past, from the audit log.
+    """Show the nodes that were registered as publishers of a topic now or in the past, from the audit log.
 
     Print also what the log does not show. The appliance may be stopped. Exit status 1 if no publisher is found.
 
@@ -97,7 +96,7 @@ def publishers(
         raise usage_error(f"{topic!r} is not a resolved ROS name, such as /cmd_vel")
     with Errors():
         now = time.time_ns()
-        then = parse_timestamp(at, now)
+        then = now if at == "now" else parse_timestamp(at, now)
         if then > now:
             raise usage_error(f"--at {at} is in the future")
         log = appliance.audit()
@@ -109,15 +108,24 @@ def publishers(
     if appliance.as_json:
         say_json({"topic": topic, "at": rfc3339(then), "publishers": rows, "unknown": found.unknown})
     else:
-        say(f"{topic} at {rfc3339(then)}", "bold")
+        say(f"{topic} at {_to_seconds(rfc3339(then))}", "bold")
         for row in rows:
-            began = f"since {row['since']} (#{row['sequence']})" if row["since"] else "before the log begins"
+            began = (
+                f"since {_to_seconds(row['since'])} (#{row['sequence']})"
+                if row["since"]
+                else "before the log begins"
+            )
             say(f"  {row['node']} on {row['host']}, registered {began}")
         if not found.publishers:
             say("  no publisher is found")
         for line in found.unknown:
-            say(f"not known: {line}", "yellow")
+            say(f"not known: {_to_seconds(line)}", "yellow")
     raise typer.Exit(0 if found.publishers else 1)
+
+
+def _to_seconds(text: str) -> str:
+    """Leave out the fractions of a second of the times in a text."""
+    return re.sub(r"(T\d\d:\d\d:\d\d)\.\d+Z", r"\1Z", text)
 
 
 def _described(topic: Topic) -> Iterator[str]:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from appliance.cli.output import moment, say_json, usage_error
+from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from rosmop.tool.terminal import counted, printable, say
 
 
@@ -41,3 +41,16 @@ def test_an_object_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert out.count("\n") == 1
     assert json.loads(out) == {"name": "a\nb\x1b"}
+
+
+@pytest.mark.parametrize(
+    ("who", "shown"),
+    [
+        ("disk", "read from disk 1970-01-01 00:00Z"),
+        ("alice", "loaded by alice 1970-01-01 00:00Z"),
+        ("not confirmed in time", "rolled back automatically (not confirmed in time) 1970-01-01 00:00Z"),
+    ],
+)
+def test_a_revision_names_its_loader(who: str, shown: str) -> None:
+    """The rollback of an unconfirmed revision is called automatic."""
+    assert loaded_by(who, 0.0) == shown
