@@ -32,6 +32,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.MonitorTrial(["silent"], True),
     admin.MonitorResume(["silent"]),
     admin.TokenAdd("late", "viewer", 3600.0),
+    admin.TokenRotate("guest"),
     admin.HostToken("laptop", endpoint="192.0.2.1"),
     admin.HostAdd("laptop", REQUEST),
     admin.HostEnrol("rosrv-enrol_none", REQUEST, "192.0.2.2"),
@@ -40,9 +41,11 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.HostRenewed("laptop", "192.0.2.2"),
     admin.HostPorts("192.0.2.3", "closed"),
     admin.HostsReload(),
+    admin.HostUnblock("192.0.2.66"),
 )
 LOOKS = (
-    admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(), admin.HostList()
+    admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(), admin.HostList(),
+    admin.HostBlocks(),
 )  # fmt: skip
 
 

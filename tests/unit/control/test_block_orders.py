@@ -101,6 +101,10 @@ class Control(ControlParts):
             carried_out=at_once,
         )
 
+    def keep(self, task: asyncio.Task[None]) -> None:
+        """Let a task of the test go on while control settles."""
+        self._not_ours.add(task)
+
     def enrolled(self) -> Mapping[str, str]:
         """Return the addresses of enrolled hosts."""
         return {"ocu-1": "10.99.0.2"}
@@ -137,7 +141,7 @@ async def control(
     """Run control, with the timer of blocks, until the block ends."""
     made = Control(tmp_path / "state", clock, connected or [], text)
     timer = asyncio.create_task(made.orders.watch())
-    made._not_ours.add(timer)
+    made.keep(timer)
     await made.round()
     try:
         yield made

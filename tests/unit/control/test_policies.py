@@ -111,9 +111,7 @@ async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.Mon
     """The note and the record have the author, but a reload by a signal has none; the text is the disk's."""
     with Appliance(tmp_path).started() as policies:
         recorded: list[object] = []
-        monkeypatch.setattr(
-            policies._trail, "happened", lambda *_texts, **detail: recorded.append(detail["who"])
-        )
+        monkeypatch.setattr(Records, "happened", lambda *_texts, **detail: recorded.append(detail["who"]))
         for who, note in (
             ("operator", "reloaded from disk by operator"),
             ("alice", "reloaded from disk by alice"),

@@ -284,7 +284,8 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
 async def _rotate_and_die(lives: Lives) -> None:
     """Rotate in a new control that is killed before its writer writes."""
     store = StateStore(lives.home, failed=pytest.fail)
-    store.database._commit = lambda statements: None  # type: ignore[method-assign]  # the writer never gets to it
+    # The writer never gets to it.
+    pytest.MonkeyPatch().setattr(store.database, "_commit", lambda _statements: None)
 
     async def killed() -> None:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -131,11 +131,11 @@ def test_every_host_has_the_answer_of_its_network(text: str, action: tuple[Categ
 
 def test_many_addresses_are_not_compared_with_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     """The work grows with the number of addresses, not with its square."""
-    compared, within = [], module._within
+    compared = []
 
     def count(outer: Network, inner: Network) -> bool:
         compared.append(inner)
-        return within(outer, inner)
+        return inner.version == outer.version and inner.network_address in outer
 
     monkeypatch.setattr(module, "_within", count)
     many = " ".join(f"10.0.{number >> 8}.{number & 255}" for number in range(500))

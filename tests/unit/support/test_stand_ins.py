@@ -9,6 +9,7 @@ from tests.support.sources import ROOT, files_of_tests
 # Names with an underscore that are part of a published interface.
 PUBLISHED = {
     "_asdict": "of a named tuple",
+    "_fields": "of a named tuple",
     "_replace": "of a named tuple",
     "_exit": "of os: a process that ends as if it were killed",
     "_create_unverified_context": "of ssl: a browser's user who clicks the warning away",

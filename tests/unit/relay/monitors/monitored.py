@@ -2,7 +2,7 @@
 
 import struct
 from typing import Any, ClassVar
-from unittest.mock import patch
+from unittest import mock
 
 from appliance.channel.messages import (
     MonitorEvent,
@@ -195,7 +195,7 @@ class MonitoredDialogue(Dialogue):
     def _second(self, word: str) -> None:
         interceptor = self.world.engine.interceptor
         if word == "held":
-            self._tick = patch.object(interceptor, "tick")
+            self._tick = mock.patch.object(interceptor, "tick", lambda: None)
             self._tick.start()
         else:
             assert word == "ends"
