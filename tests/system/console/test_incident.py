@@ -177,12 +177,17 @@ def test_a_denial_is_granted_by_keys(
     expect(record.get_by_role("button", name="Open in the editor")).to_be_in_viewport()
     keys.press("g")
     expect(page.get_by_text("changed here, not loaded")).to_be_visible()
+    expect(page.locator(".cm-activeLine")).to_contain_text("/guarded")
     keys.press("l")
-    expect(page.get_by_role("dialog").get_by_label("Comment")).to_be_focused()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_label("Comment")).to_be_focused()
+    expect(dialog.get_by_label("Commit-confirm")).to_have_value("300")
     keys.press("Enter")
     expect(reader.toast("is in force")).to_be_visible()
     assert attempt(*arguments)[0] == 1
     assert keys.count <= MOST_KEYS
+    page.get_by_role("button", name="Keep it").click()
+    expect(reader.toast("The policy is kept")).to_be_visible()
 
 
 def test_the_time_line_moves_by_keys(

@@ -170,6 +170,22 @@ def test_the_first_view_does_not_load_the_editor(opened: Callable[..., Reader]) 
     assert not [url for url in reader.asked if url.endswith("/v1/graph")]
 
 
+def test_a_page_that_is_older_than_the_appliance_says_so(opened: Callable[..., Reader]) -> None:
+    """After an upgrade the files of an open page are gone: the views that need one name the remedy, which helps."""
+    reader = opened()
+    page = reader.go("now")
+    for view, file in (("policy", "codemirror"), ("graph", "dagre")):
+        page.route(f"**/vendor/{file}*", lambda route: route.fulfill(status=404))
+        reader.go(view)
+        failure = page.get_by_role("alert").filter(has_text="reload the page")
+        expect(failure).to_be_visible()
+        page.unroute(f"**/vendor/{file}*")
+        failure.get_by_role("button", name="Try again").click()
+        expect(failure).to_have_count(0)
+    reader.go("policy")
+    expect(reader.editor()).to_be_visible()
+
+
 def test_a_right_text_is_loaded_with_its_comment(appliance: Appliance, opened: Callable[..., Reader]) -> None:
     """A dry run shows the changes and the diff; loading makes a new revision with author and comment."""
     before = revision(appliance)

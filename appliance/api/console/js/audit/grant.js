@@ -31,7 +31,10 @@ export function Grant({ id }) {
     if (text !== base && text !== found.text && !unsaved) return setUnsaved(true);
     discard();
     write(found.text);
-    go("/console/policy");
+    draft.update({ granted: true });
+    const lines = live.text.split("\n");
+    const changed = found.text.split("\n").findIndex((/** @type {string} */ one, /** @type {number} */ number) => one !== lines[number]);
+    go(`/console/policy?line=${changed + 1}`);
   };
   if (error) return html`<${Failure} error=${error} retry=${ask} />`;
   if (!found) return html`<div class="row"><${Button} aria-keyshortcuts="g" onClick=${ask}>Grant this</${Button}><span class="muted small">Shows what would change; nothing is changed yet.</span></div>`;

@@ -5,12 +5,18 @@
  * they are connected to; in a narrow frame, below all other items.
  */
 
+import { OUTDATED } from "../outdated.js";
+
 const SOURCE = "/console/static/vendor/dagre.js";
 let dagre = /** @type {any} */ (null);
 
 /** Load the library for layouts, before the first use of `arrange` and `afresh`. */
 export async function loadLayout() {
-  dagre ??= await import(SOURCE);
+  try {
+    dagre ??= await import(SOURCE);
+  } catch {
+    throw new Error(OUTDATED);
+  }
 }
 
 /** @typedef {{x: number, y: number, w: number, h: number, alone?: boolean, band?: number}} Spot the middle and the size; `alone`: without lines; `band`: of a folded layout */

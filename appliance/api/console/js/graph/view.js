@@ -31,9 +31,8 @@ export function GraphView() {
   const [form, setForm] = useState("drawing");
   const [round, setRound] = useState(0);
   const [layout, setLayout] = useState({ loaded: false, error: /** @type {any} */ (null) });
-  const load = () => loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
   useEffect(() => {
-    load();
+    loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
   }, []);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
@@ -45,7 +44,7 @@ export function GraphView() {
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
-  if (layout.error) return html`${head}<${Failure} error=${layout.error} retry=${load} />`;
+  if (layout.error) return html`${head}<${Failure} error=${layout.error} retry=${() => location.reload()} />`;
   if (!graph || !shown || !model) return html`${head}<section class="panel"><${Loading} rows=${8} /></section>`;
   const choose = (/** @type {string | null} */ key) => setChosen(key === null ? null : shownKey(key, shown));
   const item = chosen ? shown.items.get(chosen) ?? model.items.get(chosen) : null;

@@ -6,8 +6,10 @@
  */
 
 import { html, useEffect, useRef, useState } from "../html.js";
+import { OUTDATED } from "../outdated.js";
 import { plain } from "../words.js";
 import { policyLanguage, rvLanguage } from "./languages.js";
+import { Failure } from "./notice.js";
 
 const SOURCE = "/console/static/vendor/codemirror.js";
 
@@ -27,6 +29,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
   const newest = useRef({ change, dry, told: /** @type {Set<string>} */ (new Set()) });
   Object.assign(newest.current, { change, dry });
   const [ready, setReady] = useState(false);
+  const [failed, setFailed] = useState(false);
 
   useEffect(() => {
     let gone = false;
@@ -36,7 +39,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
       const root = host.current.shadowRoot ?? host.current.attachShadow({ mode: "open" });
       held.current = { mirror, view: build(mirror, root, { label, value, language, height, writable: Boolean(change), complete, newest }) };
       setReady(true);
-    });
+    }, () => setFailed(true));
     return () => {
       gone = true;
       held.current?.view.destroy();
@@ -71,6 +74,7 @@ export function Editor({ label, value, change, language, findings = [], line = n
     if (line.count > 0) view.focus();
   }, [line?.number, line?.count, ready]);
 
+  if (failed) return html`<${Failure} error=${OUTDATED} retry=${() => location.reload()} />`;
   return html`<div class="editor" ref=${host} data-editor=${language} aria-keyshortcuts=${keys} data-ready=${String(ready)}></div>`;
 }
 

@@ -12,6 +12,7 @@ export const draft = createStore({
   signature: "", // the site's signature of the text
   error: /** @type {unknown} */ (null),
   findings: /** @type {any[]} */ ([]),
+  granted: false, // the text came from "Grant this" of a denial
   errors: 0, // in the text and its tests, as last checked; an error of the signature is not one of them
   report: /** @type {any} */ (null), // of the last dry run or load
   tested: /** @type {any} */ (null),
@@ -19,7 +20,7 @@ export const draft = createStore({
 
 session.subscribe(() => {
   const { current, locked } = session.get();
-  if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, findings: [], errors: 0, report: null, tested: null });
+  if (!current && !locked) draft.set({ live: null, etag: null, base: "", text: "", signature: "", error: null, granted: false, findings: [], errors: 0, report: null, tested: null });
 });
 
 /** Fetch the policy in force. An edited text stays, together with the revision that it started from. */
@@ -38,13 +39,13 @@ export function write(/** @type {string} */ text) {
   const { text: before, base } = draft.get();
   if (text === before) return;
   draft.update({ text, report: null });
-  if (text === base) draft.update({ error: null, findings: [], errors: 0 }); // it is not checked again
+  if (text === base) draft.update({ error: null, granted: false, findings: [], errors: 0 }); // it is not checked again
 }
 
 /** Discard the edited text and start again from the policy in force. */
 export function discard() {
   const { live } = draft.get();
-  draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, error: null, findings: [], errors: 0, report: null, tested: null });
+  draft.update({ text: live.text, base: live.text, etag: `"${live.revision}"`, error: null, granted: false, findings: [], errors: 0, report: null, tested: null });
 }
 
 /** Keep the edited text, but base it on the revision that is now in force. */
@@ -81,7 +82,7 @@ export async function load(note, within) {
   const { text, signature, etag } = draft.get();
   try {
     const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note, signature }, match: etag ?? "" });
-    draft.update({ report: body, findings: body.warnings, errors: 0, base: text, etag: next, error: null });
+    draft.update({ report: body, findings: body.warnings, errors: 0, base: text, etag: next, error: null, granted: false });
     await look();
     return body;
   } catch (error) {

@@ -13,20 +13,23 @@ import { useStore } from "../store.js";
 import { Report } from "./check.js";
 import { draft, dryRun, load, look } from "./draft.js";
 
-const MINUTES = "300"; // preselected if connections would end
+const MINUTES = "300"; // preselected if connections would end, or the text came from a denial
 const WITHIN = /** @type {[string, string][]} */ ([["", "Permanent"], ["60", "Roll back in 1 minute unless confirmed"], ["300", "Roll back in 5 minutes unless confirmed"], ["900", "Roll back in 15 minutes unless confirmed"]]);
 
-/** A policy that would end live connections rolls back unless it is confirmed. @param {any} report of a dry run */
-function preselected(report) {
-  return report?.ends.length ? MINUTES : "";
+/**
+ * A policy that would end live connections or grants a denied request rolls back unless it is confirmed.
+ * @param {any} report of a dry run @param {boolean} granted
+ */
+function preselected(report, granted) {
+  return granted || report?.ends.length ? MINUTES : "";
 }
 
 /** @param {{close: () => void}} given */
 export function LoadDialog({ close }) {
-  const { live, text, signature, etag, report, errors } = useStore(draft);
+  const { live, text, signature, etag, report, errors, granted } = useStore(draft);
   const [note, setNote] = useState("");
   const [chosen, setWithin] = useState(/** @type {string | null} */ (null));
-  const within = chosen ?? preselected(report);
+  const within = chosen ?? preselected(report, granted);
   const [error, setError] = useState(/** @type {any} */ (null));
   useEffect(() => {
     if (!report) dryRun().then(() => setError(null), setError);
@@ -35,7 +38,7 @@ export function LoadDialog({ close }) {
     setError(null);
     try {
       if (!report) await dryRun();
-      const seconds = chosen ?? preselected(draft.get().report);
+      const seconds = chosen ?? preselected(draft.get().report, granted);
       const body = await load(note, seconds ? Number(seconds) : null);
       done(`Revision ${body.revision} is in force`, body.confirm_by ? "Confirm it before it rolls back." : `${body.revoked} registrations and connections were revoked.`);
       close();
