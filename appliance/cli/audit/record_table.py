@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -22,14 +23,22 @@ from appliance.evidence.export_verification import ExportVerification
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
 _SECONDS, _MILLISECONDS = 19, 23  # characters of a time
 _DATE = 11
+_TABLE_WIDTH = 140  # a narrower terminal has no room for the reasons in a column
 
 
 def print_entries(entries: list[LogEntry], *, each: bool = False) -> None:
-    """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line."""
+    """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line.
+
+    The rows are a table, or on a narrow terminal a line each, with the reason below it.
+    """
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
         console = Console(highlight=False)
-        console.print(_table(rows))
+        if console.width < _TABLE_WIDTH:
+            for row in rows:
+                console.print(*_lines(row), sep="\n")
+        else:
+            console.print(_table(rows))
     else:
         for entry in entries:
             write(line(entry))
@@ -157,18 +166,30 @@ def _table(rows: list[EqualRecords]) -> Table:
     for name in ("event", "who", "what", "why"):
         table.add_column(name, overflow="fold")
     for row in rows:
-        record = row.first.record
-        alarming = record.severity is Severity.ALARM
-        table.add_row(
-            str(row.first.sequence),
-            _times(row),
-            Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
-            Text(printable(record.event), style="bold red" if alarming else ""),
-            Text(_joined(record.host, record.caller_id, _by(record))),
-            Text(_joined(record.category, _monitor(record), record.resource)),
-            Text(_why(record) if row.records == 1 else _why_of_several(row)),
-        )
+        table.add_row(str(row.first.sequence), _times(row), *_cells(row))
     return table
+
+
+def _lines(row: EqualRecords) -> Iterator[Text | Padding]:
+    """Yield a row for a narrow terminal: what happened, then the reason, indented."""
+    *cells, why = _cells(row)
+    head = Text("  ").join(cell for cell in cells if cell.plain)
+    yield Text.assemble((str(row.first.sequence), "bold"), "  ", _times(row), "  ", head)
+    if why.plain:
+        yield Padding(why, (0, 0, 0, 4))
+
+
+def _cells(row: EqualRecords) -> tuple[Text, ...]:
+    """Return decision, event, who, what and why."""
+    record = row.first.record
+    alarming = record.severity is Severity.ALARM
+    return (
+        Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
+        Text(printable(record.event), style="bold red" if alarming else ""),
+        Text(_joined(record.host, record.caller_id, _by(record))),
+        Text(_joined(record.category, _monitor(record), record.resource)),
+        Text(_why(record) if row.records == 1 else _why_of_several(row)),
+    )
 
 
 def _times(row: EqualRecords) -> str:

@@ -38,9 +38,10 @@ def test_a_table_of_records_has_their_numbers(
 ) -> None:
     """The table has the record numbers that `rosrv audit why` and `rosrv policy grant` take as arguments."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "200")
     print_entries([LogEntry(4711, AuditRecord(id="0" * 20, time=0, event="decision", decision="deny"))])
-    head, row = capsys.readouterr().out.splitlines()
+    head, row = _STYLE.sub("", capsys.readouterr().out).splitlines()
     assert (head.split()[0], row.split()[0]) == ("record", "4711")
 
 
@@ -49,7 +50,7 @@ def test_a_table_of_records_has_the_author_of_a_change(
 ) -> None:
     """It is in the column of hosts and callers; a damaged author is text too, and a missing one is not shown."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")
     authors = (
         ("policy loaded", "alice"),
@@ -59,9 +60,29 @@ def test_a_table_of_records_has_the_author_of_a_change(
     )
     records = [AuditRecord(id="0" * 20, time=0, event=event, detail={"who": who}) for event, who in authors]
     print_entries([LogEntry(number, record) for number, record in enumerate(records)], each=True)
-    head, *rows = capsys.readouterr().out.splitlines()
+    head, *rows = _STYLE.sub("", capsys.readouterr().out).splitlines()
     column = head.index("who")
     assert [row[column:].strip() for row in rows] == ["by alice", "by 7", "", ""]
+
+
+def test_a_narrow_terminal_has_the_reason_below(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 80 columns a column of reasons would be six characters wide; a missing reason takes no line."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", "80")
+    denied = AuditRecord(
+        id="0" * 20, time=0, event="decision", decision="deny", host="10.77.0.66", caller_id="/tablet",
+        category="publish", resource="/cmd_vel", reason="10.77.0.66 is not among the hosts that may publish /cmd_vel",
+    )  # fmt: skip
+    print_entries([LogEntry(12, denied), LogEntry(11, AuditRecord(id="1", time=0, event="log begun"))])
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
+        "12  1970-01-01 00:00:00.000  deny  decision  10.77.0.66 /tablet  publish",
+        "/cmd_vel",
+        "    10.77.0.66 is not among the hosts that may publish /cmd_vel",
+        "11  1970-01-01 00:00:00.000  log begun",
+    ]
 
 
 def test_equal_records_are_one_row(
