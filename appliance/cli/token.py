@@ -8,6 +8,7 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
+from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
@@ -74,7 +75,13 @@ def rotate(
         None if lifetime is None else span_given("--for", lifetime, forms),
         0.0 if grace is None else span_given("--grace", grace, "30s, 10m, 12h or 7d"),
     )
-    body = appliance.answer_or_exit(order)
+    body = appliance.ask_or_exit(order)
+    for row in body.earlier:
+        if row.revoked is not None:
+            _forget_first(appliance, row)
+    if appliance.as_json:
+        say_json(body)
+        return
     _say_new(body)
     for row in body.earlier:
         end = "has ended" if row.revoked is not None else f"is valid until {moment(row.expires)}"
@@ -87,6 +94,23 @@ def _say_new(body: NewToken) -> None:
         f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. It is not shown again.",
         err=True,
     )
+
+
+def _forget_first(appliance: Appliance, ended: Token) -> None:
+    """Remove the file with the text of the first token if this token, which has ended, is that one."""
+    if not isinstance(appliance.way, AdminSocket):
+        return
+    file = appliance.way.state / "first-token"
+    try:
+        if f"_{ended.id}_" not in file.read_text(encoding="ascii"):
+            return
+        file.unlink()
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        typer.echo(f"rosrv: {file} may have the text of a token that has ended: {error}", err=True)
+        return
+    typer.echo(f"rosrv: {file} is removed: its token has ended.", err=True)
 
 
 @speaks
@@ -127,5 +151,9 @@ def revoke(
 
     Example: rosrv token revoke alice
     """
-    body = appliance.answer_or_exit(TokenRevoke(name))
+    body = appliance.ask_or_exit(TokenRevoke(name))
+    _forget_first(appliance, body)
+    if appliance.as_json:
+        say_json(body)
+        return
     say(f"token {body.name} ({body.role}) is revoked")
