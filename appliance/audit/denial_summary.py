@@ -6,7 +6,8 @@ Invariants:
 2. A summary of repetitions that covers many hosts counts for the hosts that it names; the rest is `OTHERS`.
 3. Memory and time are bounded. The newest `MOST_RECORDS` records are read. The oldest hosts beyond `_MOST_HOSTS`, and
    the reasons and callers of a host beyond `_MOST_NAMES`, are counted together as `OTHERS`.
-4. No reason has contents of messages.
+4. No reason has contents of messages. Reasons that differ only in numbers are counted together, under the newest text.
+5. Rights that a new policy or a block revoked are not counted, because the host attempted nothing.
 """
 
 import functools
@@ -18,7 +19,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from appliance.audit.equality import plain_reason, times
+from appliance.audit.equality import FOLDED, plain_reason, times
 from appliance.audit.query import Filter
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import LogEntry, rfc3339, rule_text, without_contents
@@ -47,7 +48,7 @@ class CountedName(msgspec.Struct, frozen=True):
     name: Annotated[
         str,
         msgspec.Meta(
-            description="a rule with its line, a reason without numbers, or the name that a node gave"
+            description="a rule with its line, the newest of reasons that differ in numbers, or a node's name"
         ),
     ]
     count: Annotated[int, msgspec.Meta(description="number of denials")]
@@ -86,6 +87,8 @@ class _HostCounts:
     last: int
     count: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
+    texts: dict[str, str] = field(default_factory=dict)
+    """The newest text of each reason without numbers."""
     callers: Counter[str] = field(default_factory=Counter)
 
 
@@ -113,6 +116,8 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
             break
         record = without_contents(entry).record
         last = record.time
+        if _is_revocation(record):
+            continue
         for host, count in _hosts_of(record):
             _count(hosts, host, count, record)
     ranked = sorted(hosts.items(), key=lambda item: (-item[1].count, item[0]))
@@ -124,6 +129,10 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
         sum(counts.count for _host, counts in left),
         counted_since,
     )
+
+
+def _is_revocation(record: AuditRecord) -> bool:
+    return (record.detail.get("of") if record.event in FOLDED else record.event) == "revoked"
 
 
 def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
@@ -151,7 +160,10 @@ def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditR
     counts.count += number
     counts.first, counts.last = min(counts.first, first), max(counts.last, last)
     for reason, count in _reasons(record, number):
-        _tally(counts.reasons, reason, count)
+        key = _without_numbers(reason)
+        _tally(counts.reasons, key, count)
+        if key in counts.reasons:
+            counts.texts.setdefault(key, reason)
     for caller, count in _callers(record, number):
         _tally(counts.callers, caller, count)
 
@@ -168,7 +180,7 @@ def _reasons(record: AuditRecord, number: int) -> Iterable[tuple[str, int]]:
         return [(rule_text(record.rule) or "", number)]
     if record.host is None and "scope" in record.detail:
         return [(_TOGETHER, number)]
-    return _tallied(record.detail.get("reasons")) or [(_without_numbers(plain_reason(record)), number)]
+    return _tallied(record.detail.get("reasons")) or [(plain_reason(record), number)]
 
 
 def _callers(record: AuditRecord, number: int) -> Iterable[tuple[str, int]]:
@@ -181,7 +193,7 @@ def _tallied(names: Any) -> list[tuple[str, int]]:
     """Return the names that a summary of repetitions counts one by one."""
     if not isinstance(names, dict):
         return []
-    return [(_without_numbers(name), count) for name, count in names.items() if type(count) is int]
+    return [(name, count) for name, count in names.items() if type(count) is int]
 
 
 def _tally(counts: Counter[str], name: str, number: int) -> None:
@@ -194,7 +206,10 @@ def _shown(host: str, counts: _HostCounts) -> HostDenials:
         counts.count,
         rfc3339(counts.first),
         rfc3339(counts.last),
-        [CountedName(*one) for one in counts.reasons.most_common(_SHOWN_REASONS)],
+        [
+            CountedName(counts.texts.get(reason, reason), count)
+            for reason, count in counts.reasons.most_common(_SHOWN_REASONS)
+        ],
         [CountedName(*one) for one in counts.callers.most_common(_SHOWN_CALLERS)],
         max(0, len(counts.callers) - _SHOWN_CALLERS),
     )

@@ -66,9 +66,17 @@ def test_the_host_with_the_most_denials_is_first() -> None:
     assert (second.host, second.count, first.host, first.count) == ("10.0.0.2", 7, "10.0.0.1", 1)
     assert (second.first, second.last) == (rfc3339(BEGIN + 2 * _SECOND), rfc3339(BEGIN + 8 * _SECOND))
     assert {(one.name, one.count) for one in second.reasons} == {
-        ("[Publishers] /cmd_* robot.ini:12", 2), ("value # is wrong", 2), ("third", 2),
+        ("[Publishers] /cmd_* robot.ini:12", 2), ("value 8 is wrong", 2), ("third", 2),
     }  # fmt: skip
     assert second.callers == [CountedName("/a", 6), CountedName("/b", 1)]
+
+
+def test_revoked_rights_are_not_counted() -> None:
+    """A blocked robot is not listed as an attacker; that repetitions are counted together changes nothing."""
+    revoked = msgspec.structs.replace(denial(1), event="revoked")
+    counted = msgspec.structs.replace(folded(KIND, "10.0.0.1", 5), detail={"of": "revoked", "count": 5})
+    assert of(revoked, counted).hosts == []
+    assert of(denial(1), revoked, counted).denials == 1
 
 
 def test_counted_repetitions_count_as_their_number() -> None:
@@ -86,7 +94,7 @@ def test_counted_repetitions_count_as_their_number() -> None:
     assert {(row.first, row.last) for row in found.hosts} == {
         (rfc3339(BEGIN + 10 * _SECOND), rfc3339(BEGIN + 20 * _SECOND))
     }
-    assert found.hosts[0].reasons == [CountedName("busy #", 6), CountedName(OTHERS, 1)]
+    assert found.hosts[0].reasons == [CountedName("busy 3", 6), CountedName(OTHERS, 1)]
     assert found.hosts[0].callers == [CountedName("/y", 4), CountedName("/x", 3)]
 
 
