@@ -68,6 +68,15 @@ def _comma_separated(value: object) -> object:
     )
 
 
+def _all_or_names(value: str) -> str:
+    """Return the value. Raises `ValueError` if it has `all`, `none` or `shadow` beside names."""
+    names = [name.strip() for name in value.split(",")]
+    words = sorted({"all", "none", "shadow"}.intersection(names))
+    if words and len(names) > 1:
+        raise ValueError(f"{words[0]} applies to all monitors, so it cannot be combined with names: give one")
+    return value
+
+
 class Unasked(str):
     """A default string. Its class distinguishes it from a string that the user configured."""
 
@@ -443,7 +452,7 @@ class Settings:
     monitors: Path | None = key(
         default=None, description="folder of specifications (.rv) of monitors; read again on reload"
     )
-    enable: Annotated[str, BeforeValidator(_comma_separated)] = key(
+    enable: Annotated[str, BeforeValidator(_comma_separated), AfterValidator(_all_or_names)] = key(
         default="all",
         description="initial state of monitors that no operator has switched, including new ones: all enabled, none,"
         " NAME,… or a list of names, or all in shadow mode (shadow)",

@@ -105,6 +105,10 @@ def test_monitors_to_enable_as_a_list(file: Path) -> None:
     file.write_text("enable:\n  - speedLimit\n  - {zone: 1}\n")
     [mistake] = mistakes(file)
     assert mistake.startswith(f"{file}:1: enable: must be ")
+    file.write_text("enable: [speedLimit, all]\n")
+    assert mistakes(file) == [
+        f"{file}:1: enable: all applies to all monitors, so it cannot be combined with names: give one"
+    ]
 
 
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
