@@ -143,7 +143,7 @@ CALLS = {
     "search_audit": of(deny=True, topic="/cmd_vel"), "audit_record": Call(refusal), "why_of_record": Call(refusal),
     "grant_of_record": Call(refusal), "verify_audit": of(), "audit_checkpoints": of(), "export_audit": of(deny=True),
     "export_evidence": Call(lambda done: {"since": done["search_audit"]["records"][0]["time"]}),
-    "follow_audit": of(after=0),
+    "follow_audit": of(after=0), "summarise_audit": of(),
     "policy": of(), "policy_revisions": of(), "policy_revision": of(revision=1),
     "explain": of(host=ROBOT, category="publish", resource="/cmd_vel", node="/joy"), "explain_under": of(),
     "test_policy": of(),
@@ -157,7 +157,7 @@ CALLS = {
     "tell_host_ports": of(name=NAME), "reload_hosts": of(), "authority": of(), "revocations": of(),
     "renew_host": Call(lambda _done: {"name": NAME}, renewal, inside=True),
     "host_renewed": Call(lambda _done: {"name": NAME}, inside=True),
-    "revoke_host": of(name=NAME),
+    "revoke_host": of(name=NAME), "block_host": of(), "host_blocks": of(), "unblock_host": of(address="192.0.2.66"),
     "remove_recording": Call(lambda done: {"recording_id": done["record_now"]["id"]}),
 }  # fmt: skip
 FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag", "recording_evidence"}
