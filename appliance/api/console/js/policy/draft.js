@@ -12,7 +12,7 @@ export const draft = createStore({
   signature: "", // the site's signature of the text
   error: /** @type {unknown} */ (null),
   findings: /** @type {any[]} */ ([]),
-  granted: false, // the text came from "Grant this" of a denial
+  granted: false, // the text is what "Grant this" proposed for a denial
   errors: 0, // in the text and its tests, as last checked; an error of the signature is not one of them
   report: /** @type {any} */ (null), // of the last dry run or load
   tested: /** @type {any} */ (null),
