@@ -17,7 +17,19 @@ from appliance.audit.record import Severity
 from appliance.audit.repetition import ABOUT
 
 _FIELDS = frozenset(
-    {"severity", "host", "caller_id", "category", "resource", "rule", "decision", "more", "reads", "reason"}
+    {
+        "severity",
+        "host",
+        "caller_id",
+        "category",
+        "resource",
+        "rule",
+        "decision",
+        "more",
+        "reads",
+        "reason",
+        "whole",
+    }
 )
 _FOLDED = (
     "count", "of", "scope", "recorded_id", "first_id", "last_id", "first_time", "last_time", *ABOUT,

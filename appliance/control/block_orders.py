@@ -109,6 +109,7 @@ class BlockOrders:
             "host blocked",
             f"{address} is {self._blocks.reasons[address]}",
             host=row.address,
+            whole=True,
             address=row.address,
             who=who,
             until=shown.until,
@@ -141,6 +142,7 @@ class BlockOrders:
             "host unblocked",
             f"the block of {address} by {earlier.who} was lifted",
             host=earlier.address,
+            whole=True,
             address=earlier.address,
             who=who,
             restored=restored,
@@ -171,6 +173,7 @@ class BlockOrders:
                 "host block ended",
                 f"the block of {address} by {rows[address].who} is over",
                 host=rows[address].address,
+                whole=True,
                 address=rows[address].address,
                 note=rows[address].note,
             )

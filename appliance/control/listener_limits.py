@@ -124,10 +124,8 @@ class ListenerLimits:
         if peer.here or policy.knows(peer.host):
             return None
         denial = policy.blocked(peer.host)
-        if denial is None:
-            reason = told = f"no rule of the policy names {peer.text}"
-        else:
-            reason, told = denial.reason, text_for_caller(denial, policy.tell)
+        reason = f"no rule of the policy names {peer.text}" if denial is None else denial.reason
+        told = reason if denial is None else text_for_caller(denial, policy.tell)
         return partial(self._refuse_unknown, peer, reason, told)
 
     def _refuse_unknown(self, peer: Peer, reason: str, told: str, beginning: bytes) -> bytes:

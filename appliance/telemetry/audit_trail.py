@@ -137,12 +137,14 @@ class AuditTrail:
         decision: str | None = None,
         more: Mapping[str, Any] | None = None,
         reads: bool = False,
+        whole: bool = False,
         **detail: Any,
     ) -> str:
         """Record an event that is not a decision; return the record's id, as `decided` does. `more` adds details.
 
         `severity` overrides the default severity of the event (`audit/events.py`).
-        `reads`: the event changed nothing, so repetitions are only counted.
+        `reads`: the event changed nothing, so repetitions are only counted. `whole`: every record is kept, even if the
+        host is beyond its quota.
         """
         now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
@@ -163,7 +165,7 @@ class AuditTrail:
                 reason=reason,
                 detail=detail,
                 unknown=unknown,
-                folds=reads or (decision is None and host is not None and bool(self.owing(host))),
+                folds=reads or not (whole or decision or host is None or not self.owing(host)),
             )
         )
 

@@ -89,7 +89,7 @@ def test_an_event_has_the_severity_of_the_registry() -> None:
 
 
 def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
-    """The events of a host beyond its quota are marked to be folded, but decisions on its calls are not."""
+    """The events of a host beyond its quota are marked to be folded; decisions on its calls and orders are not."""
     log = Log()
     one = trail(log, deny=True)
     one.happened("connection opened", "", host=GUEST)
@@ -97,7 +97,8 @@ def test_events_of_a_host_beyond_its_quota_are_counted() -> None:
     one.happened("connection opened", "", host=GUEST)
     one.happened("limit exceeded", "", host=GUEST, decision="deny")
     one.happened("connection opened", "", host="10.0.0.1")
-    assert [record.folds for record in log.records] == [False, False, True, False, False]
+    one.happened("host blocked", "", host=GUEST, whole=True)
+    assert [record.folds for record in log.records] == [False, False, True, False, False, False]
     assert GUEST in one.owing(GUEST)
 
 
