@@ -118,3 +118,4 @@ prove: ## check what is proved: the proofs in Coq, the code of events, the model
 clean: ## remove what was built, .venv included
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -f appliance/relay/transport/*.abi3.so

@@ -24,7 +24,7 @@ GIGABYTES = 4  # the file is sparse
 # Packages that a booted machine needs besides those in packages.txt. It has no network, so it needs curl as well, which
 # a kit would install.
 _MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl")
-_COMPILERS = ("g++", "pkg-config")  # and every -dev package: nodes in the machine use rospy
+_COMPILERS = ("gcc", "g++", "pkg-config")  # and every -dev package: nodes in the machine use rospy
 # parts of the environment that are large and only for other tests
 _NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")
 _UNIT = """\
@@ -116,7 +116,7 @@ def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: 
 
 
 def checkout_archive(path: Path) -> None:
-    """Write the checkout with its uncommitted changes and compiled Python files as a tar archive to `path`."""
+    """Write the checkout with its uncommitted changes and compiled files as a tar archive to `path`."""
     for folder in ("appliance", "tests"):
         _compile(ROOT / folder, as_if_in=ROOT / folder)
     listed = subprocess.run(
@@ -136,9 +136,9 @@ def checkout_archive(path: Path) -> None:
         check=True,
     )
     names = {os.fsdecode(name) for name in listed.stdout.split(b"\0") if name}
-    names |= {
-        str(code.relative_to(ROOT)) for one in ("appliance", "tests") for code in (ROOT / one).rglob("*.pyc")
-    }
+    compiled = [*(ROOT / "appliance").rglob("*.so")]
+    compiled += [code for one in ("appliance", "tests") for code in (ROOT / one).rglob("*.pyc")]
+    names |= {str(code.relative_to(ROOT)) for code in compiled}
     with tarfile.open(path, "w") as tar:
         for name in sorted(names):
             if (ROOT / name).is_file():

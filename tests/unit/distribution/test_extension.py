@@ -1,0 +1,172 @@
+"""Tests of the compiled module's build: at most once for each source, whole or not at all, the same everywhere."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from distribution.checkout import ROOT
+from distribution.extension import IN_PLACE, SOURCE
+
+_TEXT = '''"""A small module."""
+
+from libc.string cimport memcpy
+
+
+def answer(unsigned char[::1] place):
+    """Return the last byte of four."""
+    cdef unsigned char[4] mine
+    memcpy(mine, &place[0], len(place))
+    return mine[3] + {}
+'''
+
+
+class Checkout:
+    """A small checkout with the program that builds, and a source of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.source = folder / SOURCE
+        self.made = folder / IN_PLACE.relative_to(ROOT)
+        self.source.parent.mkdir(parents=True)
+        self.program = folder / "distribution/extension.py"
+        self.program.parent.mkdir()
+        shutil.copyfile(ROOT / "distribution/extension.py", self.program)
+        self.write(_TEXT.format(1))
+
+    def write(self, text: str) -> None:
+        """Replace the source."""
+        self.source.write_text(text)
+
+    def start(self, **environment: str) -> subprocess.Popen[str]:
+        """Start the program."""
+        return subprocess.Popen(
+            [sys.executable, str(self.program)],
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def build(self, path: str = "/usr/bin:/bin") -> tuple[int, str]:
+        """Run the program; return its exit status and its output."""
+        process = self.start(PATH=path)
+        output, errors = process.communicate(timeout=120)
+        return process.returncode, output + errors
+
+    def answer(self) -> int:
+        """Return the result of the module's function in another interpreter."""
+        code = "import pump; print(pump.answer(bytearray(b'abcd')) - ord('d'))"
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, cwd=self.made.parent, capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    """Provide a checkout in which nothing is built."""
+    return Checkout(tmp_path / "one")
+
+
+BUILT = (0, f"extension: built {IN_PLACE.relative_to(ROOT)}\n")
+
+
+def test_it_is_built_when_something_changed(checkout: Checkout) -> None:
+    """The first build and one after a change write the file, without a warning; another build does nothing."""
+    assert (checkout.build(), checkout.answer()) == (BUILT, 1)
+    before = checkout.made.stat()
+    assert checkout.build() == (0, "")
+    assert checkout.made.stat() == before
+    checkout.write(_TEXT.format(2))
+    assert (checkout.build(), checkout.answer()) == (BUILT, 2)
+
+
+def test_the_module_compiles_without_a_warning(checkout: Checkout) -> None:
+    """Cython and gcc have nothing to say about the source."""
+    checkout.write((ROOT / SOURCE).read_text())
+    assert checkout.build() == BUILT
+
+
+def test_a_lost_or_damaged_file_is_replaced(checkout: Checkout) -> None:
+    """A file that differs from the built one is replaced, without being compiled again."""
+    checkout.build()
+    whole = checkout.made.read_bytes()
+    checkout.made.write_bytes(whole[:100])
+    assert (checkout.build(), checkout.made.read_bytes()) == (BUILT, whole)
+    checkout.made.unlink()
+    assert (checkout.build(), checkout.made.read_bytes()) == (BUILT, whole)
+
+
+def test_a_wrong_source_leaves_the_last_module(checkout: Checkout) -> None:
+    """The message names the line and the command; the last module stays, and the next build tries again."""
+    checkout.build()
+    checkout.write("def answer(:\n")
+    for _ in range(2):
+        status, output = checkout.build()
+        assert (status, checkout.answer()) == (1, 1)
+        assert f"{SOURCE}:1:11" in output
+        assert re.search(
+            rf"^extension: {SOURCE}: this command ended with status 1: \S+ -m cython", output, re.M
+        )
+
+
+def test_a_missing_compiler_is_named(checkout: Checkout, tmp_path: Path) -> None:
+    """The message has the command that installs what is missing."""
+    status, output = checkout.build(path=str(tmp_path))
+    assert status == 1
+    assert output.startswith("extension: gcc or ")
+    assert output.endswith("is missing: sudo apt-get install gcc libc6-dev python3-dev\n")
+
+
+def test_many_builds_at_once(checkout: Checkout) -> None:
+    """Programs that start at once do not disturb each other: one builds, the others find the result."""
+    several = [checkout.start(PATH="/usr/bin:/bin") for _ in range(6)]
+    said = {process.communicate(timeout=120)[1] for process in several}
+    assert said <= {BUILT[1], ""}
+    assert {process.returncode for process in several} == {0}
+    assert checkout.answer() == 1
+
+
+def test_two_folders_have_the_same_module(checkout: Checkout, tmp_path: Path) -> None:
+    """The file is equal byte by byte wherever it is built, and does not contain the folder."""
+    other = Checkout(tmp_path / "another, with a longer name")
+    checkout.build()
+    other.build()
+    assert checkout.made.read_bytes() == other.made.read_bytes()
+    assert str(tmp_path).encode() not in checkout.made.read_bytes()
+
+
+def test_it_is_hardened(checkout: Checkout) -> None:
+    """The addresses of functions are read-only after loading; an overflow of a buffer ends the process."""
+    checkout.build()
+    shown = subprocess.run(
+        ["readelf", "--wide", "--dynamic", "--program-headers", "--symbols", str(checkout.made)],
+        capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    assert all(word in shown for word in ("BIND_NOW", "GNU_RELRO", "__stack_chk_fail", "__memcpy_chk"))
+    assert re.search(r"GNU_STACK.* RW ", shown)
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import pump; pump.answer(bytearray(5))"],
+        cwd=checkout.made.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert b"buffer overflow detected" in process.communicate(timeout=60)[1]
+
+
+def pins() -> Iterator[str]:
+    """Yield what each file says of the version of Cython."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    yield from project["build-system"]["requires"]
+    yield from project["project"]["optional-dependencies"]["dev"]
+    for name in ("requirements-bootstrap.in", "requirements-bootstrap.lock", "requirements-dev.lock"):
+        yield from (line.removesuffix(" \\") for line in (ROOT / name).read_text().splitlines())
+
+
+def test_all_builds_have_the_same_cython() -> None:
+    """The wheel, the checkout, the package and the image are built with one version."""
+    found = [pin for pin in pins() if pin.startswith("cython==")]
+    assert (len(found), len(set(found))) == (5, 1)
