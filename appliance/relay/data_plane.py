@@ -245,7 +245,7 @@ class DataPlane:
         relayed, _publisher = self.topics[message.key, message.topic]
         own = self._flows.of(message.limit, message.topic, relayed.host, holder=message.key)
         together = self._flows.of(message.together, message.topic, holder=message.counted_as)
-        relayed.flow.set(own, together)
+        relayed.limit(own, together)
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
         """Apply a grant's rate limit to its present connections."""
@@ -253,7 +253,7 @@ class DataPlane:
         grant = ("topic", message.key, message.topic, message.host, message.caller_id)
         for subscriber in self._by_grant.get(grant, ()):
             if isinstance(subscriber, Subscriber):
-                subscriber.flow = flow
+                subscriber.limit(flow)
 
     def _make_room(self, host: str, size: int) -> None:
         """Free memory for a latched message: drop latched messages of hosts that hold more than this host would."""
@@ -269,11 +269,13 @@ class DataPlane:
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
         """Send a topic's messages through its monitors, if it has any."""
         interceptor, topic = self.interceptor, relayed.topic
-        through = None
+        wanted = interceptor.wants(topic)
         if interceptor.intercepts(topic):
             point = ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
-            through = TopicPipeline(interceptor, point).through
-        relayed.monitor(through, wanted=interceptor.wants(topic))
+            pipeline = TopicPipeline(interceptor, point)
+            relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call)
+        else:
+            relayed.monitor(None, wanted=wanted)
 
     def _holder(self, host: str) -> str:
         """Return the host if it is registered; all other hosts count as one holder, the empty string."""
@@ -495,7 +497,7 @@ class DataPlane:
         )
         stated = self._table.grant(incoming.key, relayed.topic, incoming.host, subscriber.caller_id)
         if stated is not None:
-            subscriber.flow = self._flows.of(stated.limit, relayed.topic, stated.host, stated.caller_id)
+            subscriber.limit(self._flows.of(stated.limit, relayed.topic, stated.host, stated.caller_id))
         self._by_grant.setdefault(subscriber.grant, set()).add(subscriber)
         relayed.join(subscriber)
 

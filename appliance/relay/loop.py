@@ -1,7 +1,8 @@
 """The relay's event loop: epoll and timers, single-threaded, nothing else.
 
 The loop does not use asyncio, which costs a callback, a transport and a future for each read. Raw epoll with one bound
-method per descriptor halves the delay of a relayed message.
+method per descriptor halves the delay of a relayed message. The pump waits (`transport/pump.pyx`), and serves armed
+connections that are ready alone without Python.
 
 Hosts share processor time by quota. Each descriptor has a *payer*: a host that the policy names, all other registered
 hosts together, all unregistered hosts together, or new connections. The relay's own descriptors (control, lifeline)
@@ -32,6 +33,7 @@ from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from appliance.quotas.table import RELAY_TURN
+from appliance.relay.transport.pump import CROWD, LITTLE, Pump, PumpedConnection
 
 READ = select.EPOLLIN
 WRITE = select.EPOLLOUT
@@ -55,9 +57,7 @@ QUANTUM = RELAY_TURN.bounds.host * 1000
 _DIRECT = 64  # a payer's descriptors in the loop's epoll; in its own epoll, each event costs 0.7 µs more
 _PAYERS = 512  # number of payers beyond which idle ones are forgotten
 _COSTLY = 3 * QUANTUM  # more than a payer uses if its handlers stop when the quantum is over
-_LITTLE = 1e-4  # seconds that are not charged while no other payer is ready
 
-# `epoll.poll` allocates memory for this number of events; Python's fast allocator serves no more
 _EVENTS_PER_TURN = 64
 _LONGEST_WAIT = 3600.0
 _UNKNOWN = -1
@@ -116,6 +116,7 @@ class EventLoop:
 
     def __init__(self, processor_time: Callable[[], int] = time.thread_time_ns) -> None:
         self._epoll = select.epoll()
+        self.pump = Pump(self._epoll.fileno())
         self._watched: dict[int, _Watched] = {}
         self._payers: dict[str, _Payer] = {}
         self._crowds: dict[int, _Payer] = {}  # by the descriptors of their epolls
@@ -131,8 +132,18 @@ class EventLoop:
         self._alone = False  # whether the running handler's descriptor is the only ready one
         self.clock = time.monotonic
 
-    def watch(self, descriptor: int, events: int, handler: Handler, payer: str = SYSTEM) -> None:
-        """Call `handler(events)` while any of `events` is ready (level-triggered), and charge its time to the payer."""
+    def watch(
+        self,
+        descriptor: int,
+        events: int,
+        handler: Handler,
+        payer: str = SYSTEM,
+        pumped: PumpedConnection | None = None,
+    ) -> None:
+        """Call `handler(events)` while any of `events` is ready (level-triggered), and charge its time to the payer.
+
+        While the descriptor is ready alone, steps of `pumped` precede the handler or replace it.
+        """
         epoll, found = self._epoll, None
         if payer != SYSTEM:
             found = self._payer(payer)
@@ -140,6 +151,8 @@ class EventLoop:
                 epoll = self._crowd(found)
         epoll.register(descriptor, events)
         self._watched[descriptor] = _Watched(handler, found, epoll)
+        if pumped is not None:
+            self.pump.put(descriptor, pumped)
         if found is not None:
             found.watched += 1
             found.direct += epoll is self._epoll
@@ -157,6 +170,7 @@ class EventLoop:
         if watched is None:
             return
         watched.epoll.unregister(descriptor)
+        self.pump.put(descriptor, None)
         payer = watched.payer
         if payer is not None:
             payer.events.pop(descriptor, None)
@@ -220,7 +234,7 @@ class EventLoop:
             if left < longest:
                 longest = left if left > 0 else 0
         waiting = self._waiting
-        found = self._epoll.poll(0 if waiting else longest, self._room)
+        found = self.pump.wait(0 if waiting else longest, self._room, not waiting)
         if len(found) == 1 and not waiting and found[0][0] in self._watched:
             self._serve_alone(*found[0])
         elif found or waiting:
@@ -252,6 +266,7 @@ class EventLoop:
         if payer.crowd is None:
             payer.crowd = select.epoll()
             self._crowds[payer.crowd.fileno()] = payer
+            self.pump.put(payer.crowd.fileno(), CROWD)
             self._epoll.register(payer.crowd.fileno(), READ)
         return payer.crowd
 
@@ -262,17 +277,18 @@ class EventLoop:
                 del self._payers[payer.name]
                 if payer.crowd is not None:
                     del self._crowds[payer.crowd.fileno()]
+                    self.pump.put(payer.crowd.fileno(), None)
                     payer.crowd.close()
 
     def _serve_alone(self, number: int, events: int) -> None:
         """Serve the only ready descriptor; do not charge a short handler."""
-        self._since, began = _UNKNOWN, self.clock()
+        self._since, began = _UNKNOWN, self.pump.began or self.clock()
         handler, payer, _ = self._watched[number]
         self._alone = True
         handler(events)
         self._alone = False
         took = self.clock() - began
-        if took > _LITTLE and payer is not None:
+        if took > LITTLE and payer is not None:
             used = int(took * 1e9)
             payer.spent = max(payer.spent, self._floor - QUANTUM) + used
             payer.costly = used > _COSTLY

@@ -73,6 +73,7 @@ class WasmInstance:
         store = _Store(engine, limit)
         self._store: _Store | None = store
         self._functions: dict[str | int, Call] = {}
+        self._natives: dict[str, tuple[int, int, int, object]] = {}
         self._memory: _Export | None = None
         self._view = memoryview(b"")
         module, instance, trap = ctypes.c_void_p(), (ctypes.c_uint64 * 2)(), ctypes.c_void_p()
@@ -93,6 +94,7 @@ class WasmInstance:
             if export.kind == _FUNCTION:
                 call = _bound(store, export)
                 if call is not None:
+                    self._natives[text] = _addresses(store, export)
                     self._functions[len(self._functions) // 2] = self._functions[text] = call
             elif export.kind == _MEMORY and text == "memory":
                 self._memory = _Export.from_buffer_copy(export)
@@ -140,6 +142,13 @@ class WasmInstance:
         except KeyError:
             self._asked()
             raise WasmError(f"the module has no function {name!r} of integers") from None
+
+    def native(self, name: str) -> tuple[int, int, int, object]:
+        """Return the addresses of `wasmtime_func_call_unchecked`, of the store and of an exported function of integers.
+
+        They are valid while the last item of the result is referenced.
+        """
+        return self._natives[name]
 
     def refuel(self, fuel: int) -> None:
         """Set the remaining fuel. Raises `WasmError` if closed."""
@@ -307,6 +316,21 @@ def _bound(store: _Store, export: _Export) -> Call | None:
         return read[0]
 
     return call
+
+
+def _addresses(store: _Store, export: _Export) -> tuple[int, int, int, object]:
+    native = _Export.from_buffer_copy(export)
+    invoke = ctypes.cast(load()["wasmtime_func_call_unchecked"], ctypes.c_void_p).value or 0
+    return invoke, store.context, ctypes.addressof(native) + _Export.of.offset, (store, native)
+
+
+def failure(error: int, trap: int) -> Exception:
+    """Return the exception for an error or a trap of a native call, and free it (0: there was no error, no trap)."""
+    try:
+        _check(error or None)
+    except WasmError as found:
+        return found
+    return _trapped(ctypes.c_void_p(trap))
 
 
 def _kinds(vector: Any) -> list[Any]:

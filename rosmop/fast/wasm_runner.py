@@ -37,11 +37,11 @@ from rosmop.fast.abi import (
     TopicCode,
 )
 from rosmop.fast.deferred_output import HEAD
-from rosmop.fast.wasm_instance import WasmInstance, WasmTrap
+from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, failure
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.run.explain import ClockedSteps, Exits
-from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NextDue
+from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, BatchResult, Lanes, NativeCall, NextDue
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, MonitorInstance, RunningProperty
 from rosmop.run.outcomes import FUEL_PER_SECOND, Outcome, Verdict
@@ -164,6 +164,13 @@ class ModuleState:
         for address in self._clocked:
             cells += memory[address : address + _CLOCK.size]
         return cells
+
+    @property
+    def parts(self) -> list[tuple[int, int]] | None:
+        """Return address and size of each part of the state; None if it is more than numbers."""
+        if not self.size:
+            return None if self._strings else []
+        return [(self._base, self._cells.size), *((address, _CLOCK.size) for address in self._clocked)]
 
     def hasten(self) -> None:
         """Compute the time of the next timer again, because there is an earlier deadline."""
@@ -302,6 +309,7 @@ class WasmLane:
         pieces: list[Any],
         time_ns: int,
         prepared: BatchOptions,
+        answer: int | Exception | None = None,
     ) -> BatchResult | None:
         """See `FastLane`."""
         if view.obj is not self._owner:
@@ -315,7 +323,10 @@ class WasmLane:
         paused = False
         while True:
             try:
-                answer = self._call(frames + position, end, time_ns) or 0
+                if answer is None:
+                    answer = self._call(frames + position, end, time_ns) or 0
+                elif isinstance(answer, Exception):
+                    raise answer
             except WasmTrap as trap:
                 paused = trap.reason == _NO_FUEL
                 answer = self._stopped(frames + position, end, time_ns)
@@ -343,6 +354,29 @@ class WasmLane:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
                 return BatchResult(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
+            answer = None
+
+    def native(self) -> NativeCall | None:
+        """See `FastLane`."""
+        cells = self._home.parts
+        if cells is None:
+            return None
+        invoke, context, function, keeps = self._machine.native(self._feed.name)
+        output = self._said if self._lines else 0
+        return NativeCall(
+            invoke,
+            context,
+            function,
+            self._memory,
+            self._frames,
+            self._effects,
+            output,
+            SURE,
+            cells,
+            self._home,
+            failure,
+            keeps,
+        )
 
     def process_one(  # noqa: PLR0917  as `process_batch`
         self,

@@ -4,7 +4,7 @@ The caller that makes a `MonitorSet` also makes the implementation (`rosmop/fast
 set.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -51,6 +51,43 @@ class BatchOptions(NamedTuple):
     enabled: int
     counted: int
     changed: dict[int, int]
+
+
+class PreparedState(Protocol):
+    """The state of specifications that share topics or variables, as the caller of `NativeCall` uses it."""
+
+    prepared: BatchOptions | None
+    """The options of the last batch; None while the state is not in the module."""
+
+    def prepare(self, prepared: BatchOptions) -> None:
+        """Move the state into the module, and set the options of the next batch."""
+
+
+class NativeCall(NamedTuple):
+    """The addresses with which compiled code passes frames through a lane without Python.
+
+    `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three slots of 16
+    bytes: the address of the first frame in the module, the address after the last one, and the time (ns). Its result
+    is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap, `failure(error, trap)` frees them and
+    returns the exception that a lane raises for it. Before a call, `home.prepared` must be the batch's options.
+
+    The other fields are offsets in `memory`, which does not grow: of the frames, of the first effect, of the lines of
+    output (0: the lane prints nothing) and of the word with their end, and offset and size of each part of the state.
+    """
+
+    invoke: int
+    context: int
+    function: int
+    memory: memoryview
+    frames: int
+    effects: int
+    output: int
+    sure: int
+    cells: Sequence[tuple[int, int]]
+    home: PreparedState
+    failure: Callable[[int, int], Exception]
+    keeps: object
+    """Keeps what the addresses refer to."""
 
 
 class NextDue(Protocol):
@@ -110,9 +147,12 @@ class FastLane(Protocol):
         pieces: list[Any],
         time_ns: int,
         prepared: BatchOptions,
+        answer: int | Exception | None = None,
     ) -> BatchResult | None:
         """Process messages from `position` on, up to the first message that needs the engine. Return None if all
         messages were processed and all stay in their buffer.
+
+        `answer` is the module's answer, or the exception, if it was already called for these messages (`native`).
 
         Call this only while the lane is `ready` and nothing in the set is due. `view` has whole frames and is writable.
         It is the beginning of `Lanes.area`, or other memory. Bytes before a dropped message are appended to `pieces`.
@@ -132,6 +172,9 @@ class FastLane(Protocol):
 
         `paused` in the result means that the fuel was not enough.
         """
+
+    def native(self) -> NativeCall | None:
+        """Return how to call the module for batches in `Lanes.area`; None if its state is more than numbers."""
 
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL

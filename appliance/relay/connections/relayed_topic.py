@@ -24,18 +24,18 @@ slow subscriber reaches its bounds, its oldest messages are dropped. A slow subs
 publisher is read as long as one subscriber keeps up.
 """
 
-from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from appliance.channel.messages import DELAY_BOUNDS, LatchRefused, TopicTraffic
+from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
-from appliance.relay.transport.rate_limit import Part, PublicationRateLimit
+from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic
+from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 
 _ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
@@ -61,6 +61,17 @@ class TopicSubscriber(Protocol):
 
     def deliver(self, batch: Batch) -> int:
         """Send or queue the batch; return how many messages are dropped."""
+
+    def accepted(self, batch: Batch, sent: int) -> int:
+        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
+
+    @property
+    def descriptor(self) -> int:
+        """The socket to which the next batch is just sent; -1 if it needs other work (a limit, a queue)."""
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more data should be kept for its host."""
 
     @property
     def full(self) -> bool:
@@ -114,6 +125,10 @@ class Upstream:
 
     def close(self) -> None:
         """Close everything, because the publication is withdrawn."""
+
+
+def _no_call() -> ModuleCall | None:
+    return None
 
 
 Through = Callable[[Batch], Batch | None]
@@ -182,9 +197,11 @@ class RelayedTopic:
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
-        self._next = 1
-        self._messages = self._bytes = self._dropped = 0
-        self._delays = DelayCounts()
+        self.plain: object = object()
+        """Another object whenever the pump may have to leave the next frames to Python (see `simple`)."""
+        self.counters = Traffic()
+        self._call: Callable[[], ModuleCall | None] = _no_call
+        self._dropped = 0
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -205,6 +222,7 @@ class RelayedTopic:
         self._waiting.pop(member, None)
         self._served.pop(member, None)
         self._row = None
+        self.differs()
         self._announce()
         self._reported = False
         self._forget_header()
@@ -222,6 +240,7 @@ class RelayedTopic:
         The tap must not keep a batch.
         """
         self._taps += (tap,)
+        self.differs()
         if latched and self._latched is not None:
             tap(self._latched)
         if self.upstream is not None:
@@ -230,7 +249,39 @@ class RelayedTopic:
     def untap(self, tap: Callable[[Batch], None]) -> None:
         """Remove a tap."""
         self._taps = tuple(other for other in self._taps if other != tap)
+        self.differs()
         self._spare_unwanted()
+
+    def differs(self) -> None:
+        """Make the pump ask again whether the next frames are `simple`."""
+        self.plain = object()
+
+    def simple(self) -> tuple[list[int], ModuleCall | None] | None:
+        """Return the subscribers' descriptors and the monitors' call if the next small frames need no other work.
+
+        The answer holds while `plain` and the monitors' preparation stay.
+        """
+        if self._latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
+            return None
+        if self._recording is not None or self._startup_replay is not None or self._waits is not None:
+            return None
+        call = None
+        if self.through is not None:
+            call = self._call()
+            if call is None:
+                return None
+        descriptors = [member.descriptor for member in self._each()]
+        return None if -1 in descriptors else (descriptors, call)
+
+    @property
+    def keeps_large(self) -> bool:
+        """Whether the rest of a large batch can be kept for each subscriber that does not accept all of it."""
+        return not any(member.exhausted for member in self._served)
+
+    def limit(self, own: RateAllowance | None, together: RateAllowance | None) -> None:
+        """Set the limit of the publication's host, and the limit of its topic."""
+        self.flow.set(own, together)
+        self.differs()
 
     @property
     def _is_wanted(self) -> bool:
@@ -240,12 +291,21 @@ class RelayedTopic:
         if not self._is_wanted and self.upstream is not None:
             self.upstream.release()
 
-    def monitor(self, through: Through | None, *, wanted: bool) -> None:
+    def monitor(
+        self,
+        through: Through | None,
+        *,
+        wanted: bool,
+        call: Callable[[], ModuleCall | None] = _no_call,
+    ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected for monitors even without a subscriber.
+        With `wanted`, the topic stays connected for monitors even without a subscriber. `call` returns how the pump
+        passes small frames through them (None: it cannot now).
         """
         self.through = through
+        self._call = call
+        self.differs()
         if wanted == self._wanted:
             return
         self._wanted = wanted
@@ -260,6 +320,7 @@ class RelayedTopic:
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
         self._latching = header.get("latching", "0") == "1"
+        self.differs()
         self._connected = True
         self._end_recording()
         if self._recorder is not None:
@@ -296,21 +357,36 @@ class RelayedTopic:
         if self._recording is not None:
             self._recording.close()
             self._recording = None
+            self.differs()
 
     def received(self, batch: Batch, since: float) -> Batch | None:
         """Pass frames of the publisher, received at `since`, through monitors to the subscribers.
 
         Return the frames that monitors leave for the publisher's next turn (`go_on`).
         """
-        self._messages += batch.messages
-        self._bytes += len(batch.view)
+        batch.first = self.counters.following
+        self.counters.add(batch.messages, len(batch.view))
         self._reported = False
-        batch.first = self._next
-        self._next += batch.messages
         passing: Batch | None = batch
         if self.flow.limits:
             passing = self.flow.passing(batch, self._clock(), latching=self._latching)
         return self._take(batch, passing, since)
+
+    def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
+        """Go on behind the pump, which has passed a batch to the first `number` subscribers.
+
+        The next one has accepted `sent` bytes (negative: the number of an error).
+        """
+        self.counters.add(batch.messages, len(batch.view))
+        self._reported = False
+        members = self._each()
+        self._waits = batch, members[number + 1 :]
+        self._dropped += members[number].accepted(batch, sent)
+        behind = members[number].behind_since is not None
+        self.hand_out()
+        if behind:
+            self._pause_or_trim()
+        self.counters.delayed(self._clock() - since, batch.messages)
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         """Like `received`, for frames that were left for later."""
@@ -349,17 +425,16 @@ class RelayedTopic:
         else:
             self._pass_on(left, divided=divided)
             if self._served:
-                self._delays.add(self._clock() - since, left.messages)
+                self.counters.delayed(self._clock() - since, left.messages)
         return rest
 
     def published(self, batch: Batch) -> None:
         """Send a message of a monitor to the subscribers, past all monitors."""
-        self._messages += batch.messages
-        self._bytes += len(batch.view)
+        first = self.counters.following
+        self.counters.add(batch.messages, len(batch.view))
         self._reported = False
         if self._recording is not None:
-            self._recording.write(batch.view, batch.messages, self._next)
-        self._next += batch.messages
+            self._recording.write(batch.view, batch.messages, first)
         self._pass_on(batch, divided=False)
 
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
@@ -447,19 +522,21 @@ class RelayedTopic:
 
     def traffic(self) -> TopicTraffic | None:
         """Return the counters since the last call; None if nothing has changed."""
-        if self._reported:
+        if self._reported and not self.counters.messages:
             return None
+        messages, size, counts, seconds = self.counters.take()
         row = TopicTraffic(
             self.key,
             self.topic,
-            self._messages,
-            self._bytes,
+            messages,
+            size,
             self._dropped,
             len(self._served),
-            *self._delays.take(),
+            counts,
+            seconds,
             "" if self._header is None else self._header.get("md5sum", ""),
         )
-        self._messages = self._bytes = self._dropped = 0
+        self._dropped = 0
         self._reported = True
         return row
 
@@ -467,6 +544,7 @@ class RelayedTopic:
         if not member.greet(header):
             return
         self._served[member] = self._row = None
+        self.differs()
         self._announce()
         self._reported = False
         if self._latched is not None:
@@ -559,28 +637,3 @@ class RelayedTopic:
 
 def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:
     return tuple(header.get(field) for field in ("type", "md5sum", "message_definition", "latching"))
-
-
-class DelayCounts:
-    """Counts of messages by their delay in the relay, since the last `take`.
-
-    The delay of a batch runs from its receipt until it is handed to the subscribers' sockets; each message of the batch
-    counts. Time in the queue of a slow subscriber does not count.
-    """
-
-    __slots__ = ("_counts", "_seconds")
-
-    def __init__(self) -> None:
-        self._counts = [0] * (len(DELAY_BOUNDS) + 1)
-        self._seconds = 0.0
-
-    def add(self, seconds: float, messages: int) -> None:
-        """Count messages with this delay."""
-        self._counts[bisect_left(DELAY_BOUNDS, seconds)] += messages
-        self._seconds += seconds * messages
-
-    def take(self) -> tuple[list[int], float]:
-        """Return the counts (none if nothing was counted) and the sum in seconds, and reset them."""
-        counts, seconds = self._counts, self._seconds
-        self._counts, self._seconds = [0] * len(counts), 0.0
-        return (counts if any(counts) else []), seconds

@@ -5,6 +5,8 @@ Invariants:
 - A subscriber that sends anything after its header is cut: its connection is for the one topic of its grant.
 """
 
+import errno
+import os
 import socket
 from collections.abc import Callable, Mapping
 
@@ -42,7 +44,7 @@ class Subscriber:
         self.topic = topic
         self.host = host
         self.caller_id = fields["callerid"]
-        self.flow: RateAllowance | None = None
+        self._flow: RateAllowance | None = None
         self.missed = False
         self.behind_since: float | None = None
         self._loop = context.loop
@@ -95,8 +97,8 @@ class Subscriber:
 
         A large batch is dropped while the host's memory is exhausted, because its unsent rest could not be kept.
         """
-        if self.flow is not None:
-            passing = self._limited(self.flow, batch)
+        if self._flow is not None:
+            passing = self._limited(self._flow, batch)
             if passing is None:
                 return 0
             batch = passing
@@ -105,7 +107,7 @@ class Subscriber:
             queue.append(batch.keep(), batch.messages)
         else:
             view = batch.view
-            if len(view) > LARGE and self._share.exhausted:
+            if len(view) > LARGE and self.exhausted:
                 return batch.messages
             try:
                 sent = self._send(view)
@@ -116,14 +118,40 @@ class Subscriber:
                 return 0
             if sent == len(view):
                 return 0
-            if sent:
-                queue.append(view, batch.messages, sent, batch.rest(sent))
-            else:
-                queue.append(batch.keep(), batch.messages)
-            self._write(True)
-        if self.behind_since is None and queue.behind:
-            self.behind_since = self._loop.clock()
+            self._queue_rest(batch, sent)
+        self._note_behind()
         return 0
+
+    def accepted(self, batch: Batch, sent: int) -> int:
+        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
+        if sent < 0 and -sent not in {errno.EAGAIN, errno.EWOULDBLOCK}:
+            self._cut_by(OSError(-sent, os.strerror(-sent)), "cannot be written to")
+            return 0
+        self._queue_rest(batch, max(sent, 0))
+        self._note_behind()
+        return 0
+
+    @property
+    def descriptor(self) -> int:
+        """The socket to which the next batch is just sent; -1 if it needs other work."""
+        return -1 if self._writing or self._flow is not None else self._socket.fileno()
+
+    def limit(self, flow: RateAllowance | None) -> None:
+        """Set the rate limit of this subscriber."""
+        self._flow = flow
+        self.topic.differs()
+
+    def _queue_rest(self, batch: Batch, sent: int) -> None:
+        """Queue what the socket did not accept."""
+        if sent:
+            self._queue.append(batch.view, batch.messages, sent, batch.rest(sent))
+        else:
+            self._queue.append(batch.keep(), batch.messages)
+        self._write(True)
+
+    def _note_behind(self) -> None:
+        if self.behind_since is None and self._queue.behind:
+            self.behind_since = self._loop.clock()
 
     def _limited(self, flow: RateAllowance, batch: Batch) -> Batch | None:
         """Return the first messages, up to the limit, and report the others as dropped."""
@@ -142,6 +170,11 @@ class Subscriber:
             return None
         flow.take(batch)
         return batch
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more data should be kept for its host."""
+        return self._share.exhausted
 
     @property
     def full(self) -> bool:
@@ -198,6 +231,7 @@ class Subscriber:
     def _write(self, on: bool) -> None:
         """Start or stop waiting for space in the socket's buffer."""
         self._writing = on
+        self.topic.differs()
         self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
 
     def _listen(self) -> None:

@@ -9,6 +9,7 @@ publisher that sends its header and then closes the connection or breaks the pro
 than `retry_longest` seconds resets the wait.
 """
 
+import os
 import socket
 from collections.abc import Callable
 
@@ -21,6 +22,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, LoopTimer
 from appliance.relay.transport.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.transport.memory import HeldBytes, StallDetector
+from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
 from roswire.errors import LimitExceededError, PeerError
 from roswire.tcpros import HeaderParser, encode_header
@@ -50,6 +52,7 @@ class PublisherConnection(Upstream):
             context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
         )
         self._stall = StallDetector(limits.stall_seconds)
+        self._pumped = context.loop.pump.connection(context.scratch)
         self._buffer = self._receiver.buffer
         self._received = self._receiver.received
         self._wanted = False
@@ -156,7 +159,7 @@ class PublisherConnection(Upstream):
             if self._left:
                 self._go_on_later()
             elif self._socket is not None:
-                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
+                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer, self._pumped)
 
     def check_stall(self) -> None:
         """Cut a publisher that holds memory for a message and sends nothing of it; called once a second."""
@@ -249,24 +252,63 @@ class PublisherConnection(Upstream):
         self._objected = ""
         self._flowing = self._clock()
         self._set_timer(0, None)
-        self._loop.watch(sock.fileno(), READ, self._ready, self._payer)
+        self._loop.watch(sock.fileno(), READ, self._ready, self._payer, self._pumped)
         self._recv_into = sock.recv_into
         self._topic.upstream_opened(header)
         self._early = rest
         self._take_early()
 
     def _ready(self, _events: int) -> None:
-        try:
-            count = self._recv_into(self._buffer())
-        except BlockingIOError:
+        left = self._pumped.step()
+        if left is None:
             return
-        except OSError as error:
-            self._lose(f"the connection to the publisher broke: {error.strerror}")
-            return
-        if count:
+        torn = self._pumped.disarm()
+        if torn:
+            self._receiver.resume(torn)
+        if left.kind == UNARMED:
+            try:
+                count = self._recv_into(self._buffer())
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._received_count(-(error.errno or 0))
+            else:
+                self._received_count(count)
+        elif left.kind == RECEIVED:
+            self._received_count(left.end)
+        else:
+            self._go_on_behind(left)
+        self._arm()
+
+    def _received_count(self, count: int) -> None:
+        """Take received bytes; 0 is the end of the connection, a negative number the number of an error."""
+        if count > 0:
             self._take(count)
+        elif count:
+            self._lose(f"the connection to the publisher broke: {os.strerror(-count)}")
         else:
             self._lose("the publisher closed the connection")
+
+    def _go_on_behind(self, left: Left) -> None:
+        """Process whole frames further than the pump has done."""
+        batch = self._receiver.found(left.size, left.end, left.messages)
+        batch.judged, batch.answer = left.judged, left.answer
+        if left.kind == JUDGED:
+            rest = self._topic.received(batch, left.since)
+        else:
+            rest = None
+            self._topic.sent(batch, left.since, left.number, left.sent)
+        self._since = left.since
+        self._continue(rest)
+
+    def _arm(self) -> None:
+        """Leave the next frames to the pump if they need only the common work."""
+        if self._socket is None or self._left or self._early or not self._receiver.small:
+            return
+        simple = self._topic.simple()
+        if simple is not None:
+            torn = self._receiver.hand_over()
+            self._pumped.arm(self._socket.fileno(), self._topic, *simple, torn=torn)
 
     def _take(self, count: int) -> None:
         since = self._clock()
@@ -335,7 +377,7 @@ class PublisherConnection(Upstream):
         if self._left and self._socket is not None:
             self._left = False
             if self._pause is None:
-                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
+                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer, self._pumped)
             self._take_early()
 
     def _take_early(self) -> None:
@@ -390,6 +432,7 @@ class PublisherConnection(Upstream):
             self._rest, self._left, self._early = None, False, b""
             self._rest_weight.set(0)
             self._weight.set(0)
+            self._pumped.disarm()
             self._receiver.abandon()
             self._topic.upstream_closed()
 

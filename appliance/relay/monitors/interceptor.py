@@ -34,6 +34,7 @@ from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, dropped, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
 from appliance.relay.monitors.state_keeper import StateKeeper
+from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
 from rosmop.run.outcomes import MessageSender
@@ -79,7 +80,7 @@ class Interceptor:
         self.budget = budget
         self.over = loop.over
         self._reporter = reporter
-        self._offset = time.time_ns() - time.monotonic_ns()
+        self.offset = time.time_ns() - time.monotonic_ns()
         self.monitors: MonitorSet | None = None
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
@@ -110,7 +111,7 @@ class Interceptor:
     def remember(self, keeper: StateKeeper) -> None:
         """Keep the monitors' state in `keeper`, and start from the state in it; call this before any statement."""
         self._keeper = keeper
-        self._offset = keeper.offset
+        self.offset = keeper.offset
 
     # --- control's statements ---
 
@@ -280,13 +281,17 @@ class Interceptor:
 
     def keep(self, way: str) -> None:
         """Keep the state of the monitors on a channel (`way`); call this before passing its messages on."""
-        if self._keeper is not None:
-            self._keeper.keep(way)
+        if self._keeper is not None and not self._keeper.keep(way):
+            self.invalidate_prepared()
 
     def keep_all(self) -> None:
         """Keep the state of all monitors."""
-        if self._keeper is not None:
-            self._keeper.keep_all()
+        if self._keeper is not None and not self._keeper.keep_all():
+            self.invalidate_prepared()
+
+    def cells_place(self, way: str) -> CellsPlace | None:
+        """Return where the pump keeps the state of the monitors on a channel; None if it cannot."""
+        return NOT_KEPT if self._keeper is None else self._keeper.cells_place(way)
 
     def _published(self, topic: str, data: bytes) -> None:
         self.keep_all()
@@ -401,7 +406,7 @@ class Interceptor:
 
     def now(self) -> int:
         """Return the time of monitors, in nanoseconds."""
-        return self._offset + time.monotonic_ns()
+        return self.offset + time.monotonic_ns()
 
     def schedule(self) -> None:
         """Schedule `_advance` for the next tick or deadline, or earlier."""

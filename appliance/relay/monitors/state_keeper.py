@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from appliance.channel.messages import StateGiven
-from appliance.relay.monitors.state_memory import Memory, StateMemory, read
+from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, read
 
 if TYPE_CHECKING:
     from rosmop.run.engine import KeptGroup, MonitorSet
@@ -57,12 +57,11 @@ class RecoveredState:
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """A group of monitors and its section; `base` and `cells` hold the bytes last written."""
+    """A group of monitors and its section; `base` holds the bytes last written."""
 
     group: "KeptGroup"
     section: int = 0
     base: bytes = b""
-    cells: bytes | None = None
     refused: bool = False
     """Whether the memory has no space for the state; the state is then lost when the process ends."""
     parts: list[bytes] = field(default_factory=list)
@@ -135,34 +134,43 @@ class StateKeeper:
         self._entries, self._by_channel = [], {}
         self._lay_out()
 
-    def keep(self, channel: str) -> None:
-        """Keep the state of the monitors that have judged messages on a topic (`EventCode.channel`)."""
+    def keep(self, channel: str) -> bool:
+        """Keep the state of the monitors that have judged messages on a topic (`EventCode.channel`).
+
+        Return False if states are now at other places (see `cells_place`).
+        """
         entry = self._by_channel.get(channel)
-        if entry is not None:
-            self._keep(entry)
+        return entry is None or self._keep(entry)
 
-    def keep_all(self) -> None:
-        """Keep the state of all monitors."""
-        for entry in self._entries:
-            self._keep(entry)
+    def keep_all(self) -> bool:
+        """Keep the state of all monitors; return False if states are now at other places."""
+        return all([self._keep(entry) for entry in self._entries])
 
-    def _keep(self, entry: _Entry) -> None:
+    def cells_place(self, channel: str) -> CellsPlace | None:
+        """Return where the cells of the monitors on a topic are kept; None if their state must be kept from Python."""
+        entry = self._by_channel.get(channel)
+        if entry is None or entry.refused:
+            return NOT_KEPT
+        return None if entry.group.cells() is None else self._memory.cells_place(entry.section)
+
+    def _keep(self, entry: _Entry) -> bool:
         if entry.refused:
-            return
+            return True
         cells = entry.group.cells()
         if cells is not None:
-            if cells and cells != entry.cells:
-                entry.cells = cells
+            if cells:
                 self._memory.write_cells(entry.section, cells)
-            return
+            return True
         if not self._keep_slices(entry):
             self._lay_out()
-            return
+            return False
         base = entry.group.base()
-        if base != entry.base or entry.cells is not None:
-            entry.base, entry.cells = base, None
+        if base != entry.base or self._memory.has_cells(entry.section):
+            entry.base = base
             if not self._memory.write_base(entry.section, base):
                 self._lay_out()
+                return False
+        return True
 
     def _keep_slices(self, entry: _Entry) -> bool:
         """Write the parts of slices that have changed; return False if one does not fit."""
@@ -175,7 +183,7 @@ class StateKeeper:
     def _lay_out(self) -> None:
         for entry in self._entries:
             if not entry.refused:
-                entry.base, entry.cells = entry.group.base(), None
+                entry.base = entry.group.base()
                 for number, data in entry.group.changed_parts().items():
                     entry.parts[number] = data
         while not self._memory.lay_out(

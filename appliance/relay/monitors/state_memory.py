@@ -38,6 +38,20 @@ class StoredState(NamedTuple):
     sections: list[tuple[bytes, bytes | None]]
 
 
+class CellsPlace(NamedTuple):
+    """Where the cells of a section are in its memory, for the pump, which writes them as `write_cells` does.
+
+    `flags` is the position of the section's byte (negative: nothing is kept), and `cells` has both places.
+    """
+
+    memory: Memory
+    flags: int
+    cells: tuple[int, int]
+
+
+NOT_KEPT = CellsPlace(memoryview(bytearray(1)), -1, (0, 0))
+
+
 class StateMemory:
     """Writes into a memory; its old content stays valid until the first `lay_out` is complete."""
 
@@ -75,8 +89,16 @@ class StateMemory:
         return self._sections[section].write_base(base)
 
     def write_cells(self, section: int, cells: bytes) -> None:
-        """Keep the cells of a section, which have changed since its base was written."""
+        """Keep the cells of a section if they have changed; they are newer than its base."""
         self._sections[section].write_cells(cells)
+
+    def has_cells(self, section: int) -> bool:
+        """Whether cells of a section are kept that are newer than its base."""
+        return self._sections[section].has_cells
+
+    def cells_place(self, section: int) -> CellsPlace:
+        """Return where the cells of a section are, until the next `lay_out`."""
+        return self._sections[section].cells_place
 
 
 class _Section:
@@ -84,7 +106,6 @@ class _Section:
         self._memory = memory
         self._at = at
         self._room = room
-        self._flags = 0
         first = at + _FLAGS
         self._bases = first, first + room
         self._cells = first + 2 * room, first + 2 * room + _even(cells)
@@ -93,21 +114,33 @@ class _Section:
     def begin(self, base: bytes) -> None:
         """Write the first base while the half is still invalid."""
         self._put(0, base)
-        self._memory[self._at] = self._flags = 0
+        self._memory[self._at] = 0
+
+    @property
+    def has_cells(self) -> bool:
+        return bool(self._memory[self._at] & _HAS_CELLS)
+
+    @property
+    def cells_place(self) -> CellsPlace:
+        return CellsPlace(self._memory, self._at, self._cells)
 
     def write_base(self, base: bytes) -> bool:
         if len(base) > self._room:
             return False
-        into = self._flags & _BASE ^ _BASE
+        into = self._memory[self._at] & _BASE ^ _BASE
         self._put(into, base)
-        self._memory[self._at] = self._flags = into
+        self._memory[self._at] = into
         return True
 
     def write_cells(self, cells: bytes) -> None:
-        into = self._flags & _CELLS ^ _CELLS
+        flags = self._memory[self._at]  # the pump writes it as well
+        valid = self._cells[(flags & _CELLS) >> 1]
+        if flags & _HAS_CELLS and self._memory[valid : valid + self._size] == cells:
+            return
+        into = flags & _CELLS ^ _CELLS
         at = self._cells[into >> 1]
         self._memory[at : at + self._size] = cells
-        self._memory[self._at] = self._flags = self._flags & _BASE | into | _HAS_CELLS
+        self._memory[self._at] = flags & _BASE | into | _HAS_CELLS
 
     def _put(self, place: int, base: bytes) -> None:
         memory, at = self._memory, self._bases[place]

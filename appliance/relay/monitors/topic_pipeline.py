@@ -20,7 +20,9 @@ from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import HEAD, ObservationPoint, ObservedMessage
 from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.observer import dropped
+from appliance.relay.monitors.state_memory import NOT_KEPT
 from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.pump import ModuleCall
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
@@ -42,6 +44,7 @@ class TopicPipeline:
         self._prepared: BatchOptions | None = None
         self._counts: FastPathCounts | None = None
         self._defect: FastLane | None = None
+        self._called: tuple[object, ModuleCall] | None = None
         self._source = interceptor.senders.number(point)
 
     def through(self, batch: Batch) -> Batch | None:
@@ -52,7 +55,7 @@ class TopicPipeline:
 
     def _judged(self, batch: Batch) -> Batch | None:
         interceptor = self._interceptor
-        now = batch.judged = interceptor.now()
+        now = batch.judged = batch.judged or interceptor.now()
         if self._preparation is not interceptor.preparation or now >= self._until:
             return self._through(batch, BatchProgress(batch, now))
         assert self._lane is not None  # noqa: S101  `_prepare` has found one
@@ -60,7 +63,7 @@ class TopicPipeline:
         assert self._counts is not None  # noqa: S101  and counts for it
         pieces: list[memoryview | bytes | bytearray] = []
         try:
-            walked = self._lane.process_batch(batch.view, 0, 0, pieces, now, self._prepared)
+            walked = self._lane.process_batch(batch.view, 0, 0, pieces, now, self._prepared, batch.answer)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, self._lane, now)
             return self._through(batch, BatchProgress(batch, now))
@@ -72,6 +75,26 @@ class TopicPipeline:
         progress.pieces = pieces
         self._account(walked, progress, self._counts)
         return self._through(batch, progress)
+
+    def module_call(self) -> ModuleCall | None:
+        """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
+        interceptor = self._interceptor
+        if self._preparation is not interceptor.preparation or self._lane is None:
+            return None
+        assert self._prepared is not None  # noqa: S101  prepared with the lane
+        assert self._counts is not None  # noqa: S101  as well
+        if not self._counts.begun:
+            interceptor.observer.collect_later(self._counts)
+        if self._called is None or self._called[0] is not self._preparation:
+            native = self._lane.native()
+            if native is None:
+                return None
+            place = interceptor.cells_place(self._point[1]) if native.cells else NOT_KEPT
+            if place is None:
+                return None
+            call = ModuleCall(interceptor, native, self._prepared, place, until=self._until)
+            self._called = self._preparation, call
+        return self._called[1]
 
     def _account(self, walked: BatchResult, progress: BatchProgress, counts: FastPathCounts) -> None:
         """Report and count the actions of the fast path."""

@@ -49,11 +49,12 @@ class Batch:
 
     `messages` is the number of frames, and `last` the offset of the last frame (None: not known yet). `stride` is the
     size of each frame if all are known to be equally long, else 0. `first` is the number of the first frame in its
-    publication. `judged` is the time when monitors got the frames, by the monitors' clock (0: never). `left` is the
-    number of messages at the end that monitors had no time for.
+    publication. `judged` is the time when monitors got the frames, by the monitors' clock (0: never), and `answer` the
+    result of their module if the pump has called it. `left` is the number of messages at the end that monitors had no
+    time for.
     """
 
-    __slots__ = ("_kept", "_owned", "first", "judged", "last", "left", "messages", "stride", "view")
+    __slots__ = ("_kept", "_owned", "answer", "first", "judged", "last", "left", "messages", "stride", "view")
 
     def __init__(
         self, view: memoryview, messages: int, last: int | None, *, owned: bool = False, stride: int = 0
@@ -64,6 +65,7 @@ class Batch:
         self.stride = stride
         self.first = 1
         self.judged = 0
+        self.answer: int | Exception | None = None
         self.left = 0
         self._owned = owned
         self._kept: memoryview | None = None
@@ -199,6 +201,23 @@ class FrameReceiver:
             return self._received_in_area(self._area, count)
         return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
 
+    def hand_over(self) -> bytes:
+        """Return the incomplete frame, which the pump continues."""
+        torn, self._torn = self._torn, b""
+        self._count(0)
+        return torn
+
+    def resume(self, torn: bytes) -> None:
+        """Continue the incomplete frame that the pump has received."""
+        self._torn = torn
+
+    def found(self, size: int, end: int, messages: int) -> Batch:
+        """Return the whole frames that the pump has found at the start of the buffer; keep the incomplete one."""
+        area = self._scratch.area
+        self._idle, self._torn = False, bytes(area[size:end])
+        self._count(len(self._torn))
+        return Batch(area[:size], messages, None)
+
     @property
     def more(self) -> bool:
         """Whether received frames are left; take them with `following` before calling `buffer`."""
@@ -224,6 +243,11 @@ class FrameReceiver:
             self._unwalked = memoryview(bytearray(self._unwalked))
             self._aside = len(self._unwalked)
             self._share.add(self._aside)
+
+    @property
+    def small(self) -> bool:
+        """Whether the next bytes begin a frame or continue a small one, and no received frames are left."""
+        return self._area is None and self._unwalked is None and len(self._torn) <= SMALL
 
     @property
     def unfinished(self) -> int:

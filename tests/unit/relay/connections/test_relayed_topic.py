@@ -79,6 +79,21 @@ class RecordedMember:
         self.received += bytes(batch.view)
         return 0
 
+    def accepted(self, batch: Batch, sent: int) -> int:
+        """Record the frames that the pump has sent in part."""
+        self.received += bytes(batch.view[sent:])
+        return 0
+
+    @property
+    def descriptor(self) -> int:
+        """Return no socket."""
+        return -1
+
+    @property
+    def exhausted(self) -> bool:
+        """Return False: there is always memory."""
+        return False
+
     @property
     def full(self) -> bool:
         """Whether the test made it slow."""

@@ -1,0 +1,500 @@
+# cython: language_level=3, boundscheck=True, wraparound=False, initializedcheck=True, freethreading_compatible=False
+"""Take whole small frames from a publisher to its subscribers while only the common work has to be done for them.
+
+Theory of operation:
+
+On a robot most messages come alone and find cold caches, where Python between `recv` and `send` costs twice what the
+two calls cost. So the event loop waits in `Pump.wait`. If one descriptor is ready, and it is a publisher's connection
+that is *armed*, `PumpedConnection` performs one step without Python code: receive into the scratch area, check that
+it contains whole small frames, call the monitors' module, keep the monitors' state, send to each subscriber, count.
+Then it waits again. In every other case `wait` returns the ready descriptors to Python.
+
+Python remains the definition of what happens. It arms a connection when it has found that the next frames need no
+other work, and names the objects for which this holds: the topic's `plain` and the interceptor's `preparation`. Both
+are replaced when something changes, so a step begins by comparing them. A step that meets anything else stops where it
+is: its handler gets a `Left` from `take_left` and goes on from there. A frame is never judged or sent twice.
+
+What a step leaves to Python, with what it has done so far:
+- `RECEIVED`: an error or end of the connection, a large frame, too many frames, a long incomplete frame, monitors that
+  are not prepared. The bytes are in the scratch area, unread.
+- `JUDGED`: the module was called and wants more than changes in place. Its answer, or its trap, is passed on.
+- `SENT`: a subscriber did not accept everything. It and the later subscribers are left.
+
+Bounds: a step makes one `recv` of at most the scratch area and at most `MOST_SUBSCRIBERS` sends; the module's work is
+bounded by its fuel. `wait` returns when a step took longer than `LITTLE`, so that its payer is charged, and when the
+deadline of a timer has passed. If several descriptors are ready, Python divides the processor time among their payers.
+
+Memory safety: the scratch area, the module's memory and the state's memory are typed memoryviews, whose indices are
+checked. Addresses passed to the system lie in a range that was checked just before. Descriptors are never closed here.
+The only addresses from outside are those of the module's function (`rosmop.run.fast_path.NativeCall`).
+"""
+
+from cpython.exc cimport PyErr_CheckSignals
+from libc.errno cimport EAGAIN, EINTR, errno
+from libc.math cimport ceil
+from libc.stdint cimport int64_t, uint8_t, uint32_t, uint64_t, uintptr_t
+from libc.string cimport memcmp, memcpy
+from libc.time cimport time_t
+
+from typing import NamedTuple
+
+from appliance.channel.messages import DELAY_BOUNDS
+
+cdef extern from "<sys/epoll.h>" nogil:
+    ctypedef struct epoll_data_t:  # in C a union: only one member is used
+        int fd
+    cdef struct epoll_event:
+        uint32_t events
+        epoll_data_t data
+    int epoll_wait(int epoll, epoll_event *events, int most, int milliseconds)
+    enum: EPOLLIN
+
+cdef extern from "<sys/socket.h>" nogil:
+    ssize_t recv(int descriptor, void *buffer, size_t size, int flags)
+    ssize_t send(int descriptor, const void *buffer, size_t size, int flags)
+    enum: MSG_DONTWAIT, MSG_NOSIGNAL
+
+cdef extern from "<time.h>" nogil:
+    cdef struct timespec:
+        time_t tv_sec
+        long tv_nsec
+    int clock_gettime(int clock, timespec *now)
+    enum: CLOCK_MONOTONIC
+
+cdef extern from *:
+    """#define keep_order() __atomic_signal_fence(__ATOMIC_SEQ_CST)"""
+    void keep_order() noexcept nogil  # the process may be killed between any two stores
+
+# wasmtime_func_call_unchecked(store, function, slots, number of slots, trap)
+ctypedef void *(*invoke_t)(void *, void *, uint64_t *, size_t, void **)
+
+cdef enum:
+    _SUBSCRIBERS = 16
+    _FRAMES = 4096
+    _LARGE = 128 << 10
+    _SMALL = 4 << 10
+    _EVENTS = 1024
+    _BOUNDS = 10
+    _BASE = 1  # these are bits of state_memory.py
+    _CELLS = 2
+    _HAS_CELLS = 4
+    _UNARMED = 0
+    _RECEIVED = 1
+    _JUDGED = 2
+    _SENT = 3
+
+SUBSCRIBERS = _SUBSCRIBERS
+UNARMED, RECEIVED, JUDGED, SENT = _UNARMED, _RECEIVED, _JUDGED, _SENT
+CROWD = "an epoll of other connections"
+
+LITTLE = 1e-4
+"""Seconds of a step that are not charged, because no other descriptor was ready when it began."""
+
+cdef int64_t _LITTLE = 100_000
+cdef int64_t _NEVER = (1 << 63) - 1
+cdef int64_t _TOLD = 1 << 60  # this bit and the higher ones of an answer want more work (rosmop/fast/abi.py)
+cdef int64_t _ADDRESS = 0xFFFFFFFF
+cdef int64_t _BOUND[_BOUNDS]
+for _number, _seconds in enumerate(DELAY_BOUNDS):
+    _BOUND[_number] = int(_seconds * 1e9)
+
+
+cdef inline int64_t _now() noexcept nogil:
+    cdef timespec now
+    clock_gettime(CLOCK_MONOTONIC, &now)
+    return <int64_t>now.tv_sec * 1_000_000_000 + now.tv_nsec
+
+
+cdef class Traffic:
+    """The messages of one topic: how many passed since the last `take`, and the number of the next one.
+
+    The delay of a batch runs from its receipt until it is handed to the subscribers' sockets; each message of the batch
+    counts. Time in the queue of a slow subscriber does not count.
+    """
+
+    cdef readonly int64_t messages, size, following
+    cdef int64_t _counts[_BOUNDS + 1]
+    cdef int64_t _nanoseconds
+
+    def __cinit__(self):
+        self.following = 1
+
+    def add(self, messages: int, size: int) -> None:
+        """Count messages, and their bytes."""
+        self._add(messages, size)
+
+    cdef void _add(self, int64_t messages, int64_t size) noexcept:
+        self.messages += messages
+        self.size += size
+        self.following += messages
+
+    def delayed(self, seconds: float, messages: int) -> None:
+        """Count messages with this delay."""
+        self._delay(<int64_t>(<double>seconds * 1e9), messages)
+
+    cdef void _delay(self, int64_t nanoseconds, int64_t messages) noexcept:
+        cdef int number = 0
+        while number < _BOUNDS and _BOUND[number] < nanoseconds:
+            number += 1
+        self._counts[number] += messages
+        self._nanoseconds += nanoseconds * messages
+
+    def take(self) -> tuple[int, int, list[int], float]:
+        """Return and reset the messages, their bytes, the counts of delays (empty: none) and their sum in seconds."""
+        counts = [self._counts[number] for number in range(_BOUNDS + 1)]
+        taken = self.messages, self.size, counts if any(counts) else [], self._nanoseconds / 1e9
+        self.messages = self.size = self._nanoseconds = 0
+        for number in range(_BOUNDS + 1):
+            self._counts[number] = 0
+        return taken
+
+
+cdef class ModuleCall:
+    """The call of a monitors' module for the frames of one topic, and the place of the monitors' state.
+
+    `native` is the lane's `NativeCall`, `options` its `BatchOptions`, and `place` the `CellsPlace` of its state. The call
+    is valid before the time `until` (ns), and while `interceptor.preparation` is the present object.
+    """
+
+    cdef object _interceptor, _preparation, _options, _changed, _home, _native, _answer
+    cdef int64_t _offset, _until
+    cdef invoke_t _invoke
+    cdef void *_context
+    cdef void *_function
+    cdef uint8_t[::1] _memory, _kept
+    cdef Py_ssize_t _frames, _effects, _output, _sure, _flags, _first, _second
+    cdef list _cells
+    cdef uint64_t _slots[6]
+
+    def __init__(self, interceptor, native, options, place, *, until: int) -> None:
+        self._interceptor, self._preparation = interceptor, interceptor.preparation
+        self._offset, self._until = interceptor.offset, min(until, _NEVER)
+        self._options, self._changed = options, options.changed
+        self._native, self._home = native, native.home
+        self._invoke = <invoke_t><uintptr_t>native.invoke
+        self._context, self._function = <void *><uintptr_t>native.context, <void *><uintptr_t>native.function
+        self._memory, self._frames, self._effects = native.memory, native.frames, native.effects
+        self._output, self._sure = native.output, native.sure
+        self._kept, self._flags, (self._first, self._second) = place.memory, place.flags, place.cells
+        self._cells = list(native.cells)
+
+    cdef bint _ready(self, uint8_t[::1] area, int64_t received) except -1:
+        """Whether the module may judge frames at the start of this area at this time."""
+        return received + self._offset < self._until and &area[0] == &self._memory[self._frames]
+
+    cdef bint _judge(self, Py_ssize_t size, int64_t received) except -1:
+        """Judge `size` bytes of frames; return whether all pass and only counts are left to do. Else see `_answer`."""
+        cdef void *trap = NULL
+        cdef void *error
+        cdef int64_t result
+        if self._home.prepared is not self._options:
+            self._home.prepare(self._options)
+        self._slots[0], self._slots[2], self._slots[4] = self._frames, self._frames + size, received + self._offset
+        error = self._invoke(self._context, self._function, self._slots, 3, &trap)
+        if error != NULL or trap != NULL:
+            self._answer = self._native.failure(<uintptr_t>error, <uintptr_t>trap)
+            return False
+        result = <int64_t>self._slots[0]
+        self._answer = result
+        if result < 0 or result >= _TOLD or (result & _ADDRESS) != self._frames + size:
+            return False
+        if self._output and _word(self._memory, self._sure) > self._output:
+            return False
+        return self._count(result >> 32)  # no higher bit is set
+
+    cdef bint _count(self, Py_ssize_t effects) except -1:
+        """Count the changed messages; return False, with nothing counted, if one of the effects is a drop."""
+        cdef int64_t effect[2]
+        cdef Py_ssize_t number
+        if not effects:
+            return True
+        cdef uint8_t *found = _part(self._memory, self._effects, 16 * effects)
+        for number in range(effects):
+            memcpy(effect, found + 16 * number, 16)
+            if effect[0] == -1:
+                return False
+        for number in range(effects):
+            memcpy(effect, found + 16 * number, 16)
+            self._changed[effect[0]] = self._changed.get(effect[0], 0) + effect[1]
+        return True
+
+    cdef int _keep(self) except -1:
+        """Keep the monitors' state if it has changed, in the order of writes of `state_memory.py`."""
+        cdef Py_ssize_t at, size, place
+        cdef uint8_t flags
+        cdef bint same
+        if self._flags < 0:
+            return 0
+        flags = self._kept[self._flags]
+        same = flags & _HAS_CELLS
+        place = self._second if flags & _CELLS else self._first
+        for at, size in self._cells:
+            same = same and not memcmp(_part(self._memory, at, size), _part(self._kept, place, size), size)
+            place += size
+        if same:
+            return 0
+        place = self._first if flags & _CELLS else self._second
+        for at, size in self._cells:
+            memcpy(_part(self._kept, place, size), _part(self._memory, at, size), size)
+            place += size
+        keep_order()
+        self._kept[self._flags] = flags & _BASE | (flags & _CELLS ^ _CELLS) | _HAS_CELLS
+        keep_order()
+        return 0
+
+
+cdef uint8_t *_part(uint8_t[::1] memory, Py_ssize_t at, Py_ssize_t size) except NULL:
+    if at < 0 or size < 1 or at + size > memory.shape[0]:
+        raise IndexError(f"{size} bytes at {at} are outside a memory of {memory.shape[0]}")
+    return &memory[at]
+
+
+cdef int64_t _word(uint8_t[::1] memory, Py_ssize_t at) except -1:
+    cdef uint32_t word = 0
+    memcpy(&word, _part(memory, at, 4), 4)  # little-endian, as the machine is (see `setup`)
+    return word
+
+
+class Left(NamedTuple):
+    """The work that a step leaves to Python.
+
+    `kind` says how far it came. `end` is the number of bytes at the start of the scratch area (`RECEIVED`: 0 for the end
+    of the connection, less than 0 for an error number). The first `size` bytes are `messages` whole frames. They were
+    received at `since` (seconds, `time.monotonic`) and judged at `judged` (ns, the monitors' clock; 0: no monitors) with
+    `answer`. Subscriber `number` accepted `sent` bytes (less than 0: an error number).
+    """
+
+    kind: int
+    end: int = 0
+    size: int = 0
+    messages: int = 0
+    since: float = 0.0
+    judged: int = 0
+    answer: object = None
+    number: int = 0
+    sent: int = 0
+
+
+_UNARMED_LEFT = Left(_UNARMED)
+
+
+cdef class PumpedConnection:
+    """One publisher's connection, as the pump sees it; made by `Pump.connection`."""
+
+    cdef readonly Pump pump
+    cdef Traffic _traffic
+    cdef object _topic, _plain, _left
+    cdef ModuleCall _module
+    cdef int _descriptor, _subscribers
+    cdef int _to[_SUBSCRIBERS]
+    cdef uint8_t _torn[_SMALL]
+    cdef Py_ssize_t _kept
+    cdef bint _stepped
+
+    def arm(self, int descriptor, topic, subscribers, ModuleCall module, bytes torn) -> None:
+        """Let steps take the frames of `descriptor` to these subscribers' descriptors while `topic.plain` stays.
+
+        The frames continue the incomplete frame `torn`.
+        """
+        if len(subscribers) > _SUBSCRIBERS or len(torn) > _SMALL:
+            raise ValueError(f"too much for a step: {len(subscribers)} subscribers, {len(torn)} bytes")
+        self._kept = len(torn)
+        memcpy(self._torn, <const char *>torn, self._kept)
+        self._subscribers = 0
+        for one in subscribers:
+            self._to[self._subscribers] = one
+            self._subscribers += 1
+        self._descriptor, self._topic, self._plain, self._module = descriptor, topic, topic.plain, module
+        self._traffic = topic.counters
+
+    def disarm(self) -> bytes:
+        """Leave all frames to Python; return the incomplete frame that was received so far."""
+        self._topic = self._plain = self._module = self._left = None
+        self._stepped = False
+        torn, self._kept = self._torn[: self._kept], 0
+        return torn
+
+    @property
+    def armed(self) -> bool:
+        """Whether a step is possible now."""
+        return self._is_armed()
+
+    cdef bint _is_armed(self) except -1:
+        if self._topic is None or self._topic.plain is not self._plain:
+            return False
+        return self._module is None or self._module._interceptor.preparation is self._module._preparation
+
+    def step(self) -> Left | None:
+        """Perform a step, unless `Pump.wait` has just done so; return what is left to do (None: nothing)."""
+        if not self._stepped and (not self._is_armed() or self._step() < 0):
+            return _UNARMED_LEFT
+        self._stepped = False
+        left, self._left = self._left, None
+        return left
+
+    cdef int64_t _step(self) except -1:
+        """Perform a step; return the nanoseconds that it took. `_left` is what is left to do."""
+        cdef uint8_t[::1] area = self.pump._scratch()
+        cdef Py_ssize_t room = area.shape[0] - self._kept, got, end, size = 0, messages = 0, sent
+        cdef int64_t since
+        cdef int number
+        self._stepped = True
+        got = recv(self._descriptor, _part(area, self._kept, room), room, MSG_DONTWAIT)
+        since = _now()
+        if got <= 0:
+            if got == 0 or errno != EAGAIN:
+                self._left = Left(_RECEIVED, 0 if got == 0 else -errno)
+            return 0
+        if self._kept:
+            memcpy(&area[0], self._torn, self._kept)
+        end, self._kept = self._kept + got, 0
+        if (
+            not _whole(area, end, &size, &messages)
+            or size > _LARGE and not self._topic.keeps_large
+            or self._module is not None and not self._module._ready(area, since)
+        ):
+            self._left = Left(_RECEIVED, end)
+            return 0
+        judged = 0
+        if self._module is not None and size:
+            judged = self._module._offset + since
+            if not self._judged(size, since):
+                self._left = Left(_JUDGED, end, size, messages, since / 1e9, judged, self._module._answer)
+                return 0
+            self._module._keep()
+        for number in range(self._subscribers if size else 0):
+            sent = send(self._to[number], &area[0], size, MSG_DONTWAIT | MSG_NOSIGNAL)
+            if sent != size:
+                sent = sent if sent >= 0 else -errno
+                self._left = Left(_SENT, end, size, messages, since / 1e9, judged, None, number, sent)
+                return 0
+        if end > size:
+            memcpy(self._torn, &area[size], end - size)
+            self._kept = end - size
+        cdef int64_t took = _now() - since
+        self._traffic._add(messages, size)
+        if self._subscribers and messages:
+            self._traffic._delay(took, messages)
+        return took
+
+    cdef bint _judged(self, Py_ssize_t size, int64_t since) except -1:
+        """Judge the frames; a defect of the module's code is left to Python, which reports it."""
+        try:
+            return self._module._judge(size, since)
+        except Exception as error:
+            self._module._answer = error
+            return False
+
+
+cdef bint _whole(uint8_t[::1] area, Py_ssize_t end, Py_ssize_t *size, Py_ssize_t *messages) except -1:
+    """Find the whole frames in `area[:end]`; return whether they, and the rest, are small and not too many."""
+    cdef Py_ssize_t need, at = 0
+    while end - at >= 4:
+        need = 4 + _word(area, at)
+        if need > _LARGE:
+            return False
+        if need > end - at:
+            break
+        at += need
+        messages[0] += 1
+    size[0] = at
+    return messages[0] <= _FRAMES and end - at <= _SMALL
+
+
+cdef class Pump:
+    """Waits for events of an epoll (`epoll`: its descriptor), and performs the steps of armed connections."""
+
+    cdef int _epoll
+    cdef object _scratch_of, _area
+    cdef uint8_t[::1] _memory
+    cdef list _connections
+    cdef epoll_event _events[_EVENTS]
+    cdef readonly double began
+    """When the step began to which the last result of `wait` belongs (seconds, `time.monotonic`); 0 without a step."""
+
+    def __init__(self, int epoll) -> None:
+        self._epoll, self._connections = epoll, []
+
+    def connection(self, scratch) -> PumpedConnection:
+        """Return an unarmed connection that receives into `scratch.area`; all connections have the same scratch."""
+        cdef PumpedConnection made = PumpedConnection()
+        made.pump, self._scratch_of = self, scratch
+        return made
+
+    def put(self, int descriptor, entry) -> None:
+        """Set the connection whose events have this descriptor; `CROWD` for an epoll of others, None for no steps."""
+        if descriptor >= len(self._connections):
+            if entry is None:
+                return
+            self._connections += [None] * (descriptor + 1 - len(self._connections))
+        self._connections[descriptor] = entry
+
+    def wait(self, double longest, int most, bint steps) -> list:
+        """Wait for at most `longest` seconds; return up to `most` ready descriptors with their events.
+
+        With `steps`, perform the steps of connections that are ready alone. A connection whose step left work, or took
+        long, is in the result.
+        """
+        cdef int64_t now = _now(), deadline = now + <int64_t>(longest * 1e9)
+        cdef int found
+        cdef PumpedConnection connection
+        self.began = 0.0
+        while True:
+            found = self._poll(min(most, _EVENTS), deadline - now)
+            if found == 1 and steps:
+                connection = self._alone()
+                if connection is not None:
+                    now = _now()
+                    if connection._step() > _LITTLE or connection._left is not None:
+                        self.began = now / 1e9
+                        return [(connection._descriptor, EPOLLIN)]
+                    connection._stepped = False
+                    now = _now()
+                    if now >= deadline:
+                        return []
+                    continue
+            return [(self._events[number].data.fd, self._events[number].events) for number in range(found)]
+
+    cdef PumpedConnection _alone(self):
+        """Return the armed connection of the only event, if it is one."""
+        cdef epoll_event inner[2]
+        cdef epoll_event event = self._events[0]
+        entry = self._entry(event.data.fd)
+        if entry is CROWD and epoll_wait(event.data.fd, inner, 2, 0) == 1:
+            event = inner[0]
+            entry = self._entry(event.data.fd)
+        if event.events == EPOLLIN and isinstance(entry, PumpedConnection):
+            if (<PumpedConnection>entry)._is_armed():
+                return entry
+        return None
+
+    cdef object _entry(self, Py_ssize_t descriptor):
+        return self._connections[descriptor] if descriptor < len(self._connections) else None
+
+    cdef int _poll(self, int most, int64_t nanoseconds) except -1:
+        """Wait for events, and return their number; 0 also after a signal."""
+        cdef int found, milliseconds = 0, error
+        cdef int epoll = self._epoll
+        cdef epoll_event *events = self._events
+        if nanoseconds <= 0:
+            found = epoll_wait(epoll, events, most, 0)
+            error = errno
+        else:
+            milliseconds = (nanoseconds + 999_999) // 1_000_000
+            with nogil:
+                found = epoll_wait(epoll, events, most, milliseconds)
+                error = errno
+        if found < 0:
+            if error != EINTR:
+                raise OSError(error, "epoll_wait failed")
+            PyErr_CheckSignals()
+            return 0
+        return found
+
+    cdef uint8_t[::1] _scratch(self):
+        area = self._scratch_of.area
+        if area is not self._area:
+            if len(area) < 2 * _SMALL:
+                raise ValueError(f"a scratch area of {len(area)} bytes is too small")
+            self._memory, self._area = area, area
+        return self._memory
