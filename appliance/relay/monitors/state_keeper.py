@@ -144,7 +144,8 @@ class StateKeeper:
 
     def keep_all(self) -> bool:
         """Keep the state of all monitors; return False if states are now at other places."""
-        return all([self._keep(entry) for entry in self._entries])
+        stayed = [self._keep(entry) for entry in self._entries]
+        return all(stayed)
 
     def cells_place(self, channel: str) -> CellsPlace | None:
         """Return where the cells of the monitors on a topic are kept; None if their state must be kept from Python."""
