@@ -1,9 +1,10 @@
 // What a relay costs at least: one connection in, one out, no grants, no control, nothing recorded.
 //
-//   copying_relay PORT [epoll]
+//   copying_relay [epoll] PORT
 //
-// `epoll`: it asks before each read whether there is something, as one must that has more than two connections. Prints the port it listens on, takes one subscriber, connects to the publisher at PORT, passes on both connection
-// headers and then the messages. Each is looked at as a monitor would: of the fixed part of relay_load/Sample it reads
+// `epoll`: it asks before each read whether there is something, as one must that has more than two connections. Prints
+// the port it listens on, takes one subscriber, connects to the publisher at PORT, passes on both connection headers
+// and then the messages. Each is looked at as a monitor would: of the fixed part of relay_load/Sample it reads
 // `number` and `value`, writes `value` and steps a machine of two states; the rest is streamed, as it arrives.
 #include <arpa/inet.h>
 #include <netinet/tcp.h>
@@ -109,7 +110,7 @@ int main(int argc, char **argv) {
   printf("%d\n", ntohs(here.sin_port));
   fflush(stdout);
   int subscriber = accept(listening, NULL, NULL), publisher = socket(AF_INET, SOCK_STREAM, 0);
-  here.sin_port = htons(atoi(argv[1]));
+  here.sin_port = htons(atoi(argv[argc - 1]));
   if (connect(publisher, (struct sockaddr *)&here, sizeof here)) fail("connect");
   tune(subscriber);
   tune(publisher);

@@ -67,24 +67,20 @@ WHOLE = {"window": SIZES, "flat": SIZES[:-1], "paced": SIZES[:4]}
 Results = dict[tuple[str, int, str], list[Result]]
 
 
-class CopyingRelay:
-    """The relay in C, a new process for each run; with `epoll` it waits for data like a relay with many connections."""
+class MinimalRelay:
+    """A program with one connection in and one out, a new process for each run."""
 
-    def __init__(self, *, epoll: bool = False) -> None:
-        self.name = "C with epoll" if epoll else "C relay"
-        self._options = ["epoll"] if epoll else []
-        source = HERE / "copying_relay.c"
-        if not COPYING.exists() or COPYING.stat().st_mtime < source.stat().st_mtime:
-            COPYING.parent.mkdir(parents=True, exist_ok=True)
-            subprocess.run(["gcc", "-O2", "-o", str(COPYING), str(source)], check=True)
+    def __init__(self, name: str, *command: str) -> None:
+        """`command` is called with the publisher's port, and prints the port for the subscriber."""
+        self.name = name
+        self._command = command
         self.pid: int | None = None
         self._process: subprocess.Popen[str] | None = None
 
     def target(self, publisher: int) -> tuple[int, str]:
         """Start a relay in front of this publisher."""
         self.close()
-        command = [str(COPYING), str(publisher), *self._options]
-        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen([*self._command, str(publisher)], stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         self.pid = self._process.pid
         return int(self._process.stdout.readline()), "-"
@@ -94,6 +90,17 @@ class CopyingRelay:
         if self._process is not None:
             self._process.kill()
             self._process.wait()
+
+
+class CopyingRelay(MinimalRelay):
+    """The relay in C; with `epoll` it waits for data like a relay with many connections."""
+
+    def __init__(self, *, epoll: bool = False) -> None:
+        source = HERE / "copying_relay.c"
+        if not COPYING.exists() or COPYING.stat().st_mtime < source.stat().st_mtime:
+            COPYING.parent.mkdir(parents=True, exist_ok=True)
+            subprocess.run(["gcc", "-O2", "-o", str(COPYING), str(source)], check=True)
+        super().__init__("C with epoll" if epoll else "C relay", str(COPYING), *(["epoll"] if epoll else []))
 
 
 def specification(name: str, topic: str) -> str:

@@ -1,16 +1,17 @@
 // A TCPROS publisher of relay_load/Sample and a subscriber in one program, for measuring what is between them (no ROS
 // needed).
 //
-//   relay_load BYTES SECONDS flat|window|paced [MD5SUM]
+//   relay_load BYTES SECONDS flat|window|paced|pacedN [MD5SUM]
 //
-// Prints the publisher's port. Reads one line, "PORT TOPIC": where the subscriber connects. The publisher
-// sends markers until one has come through, then runs: as fast as it can, with at most 64 messages on their
-// way, or 1,000 messages a second. Prints one JSON object: messages a second, lost, out of order, and the
-// delay in microseconds (median and 99th percentile).
+// Prints the publisher's port. Reads one line, "PORT TOPIC [PID]": where the subscriber connects, and the process in
+// the middle. The publisher sends markers until one has come through, then runs: as fast as it can, with at most 64
+// messages on their way, 1,000 messages a second, or N. Prints one JSON object: messages a second, lost, out of order,
+// the delay in microseconds (median and 99th percentile), and the processor time of all threads of PID meanwhile.
 #include <arpa/inet.h>
 #include <netinet/tcp.h>
 #include <poll.h>
 #include <sys/socket.h>
+#include <time.h>
 #include <unistd.h>
 
 #include <algorithm>
@@ -22,6 +23,7 @@
 #include <cstring>
 #include <iostream>
 #include <map>
+#include <sstream>
 #include <stdexcept>
 #include <string>
 #include <thread>
@@ -34,6 +36,13 @@ constexpr size_t FIXED = 32;  // of a frame of relay_load/Sample (nodes/msg), wi
 
 int64_t now() {
   return std::chrono::duration_cast<std::chrono::nanoseconds>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
+
+double cpu_us(pid_t pid) {
+  clockid_t clock;
+  timespec used{};
+  if (pid && (clock_getcpuclockid(pid, &clock) || clock_gettime(clock, &used))) throw std::runtime_error("no such PID");
+  return used.tv_sec * 1e6 + used.tv_nsec / 1e3;
 }
 
 void write_all(int fd, const char* data, size_t size) {
@@ -94,6 +103,8 @@ struct Load {
   std::atomic<uint64_t> received{0};
   uint64_t sent = 0, lost = 0, disordered = 0;
   int64_t first = 0, last = 0;
+  pid_t pid = 0;
+  double hertz = 0, cpu_before = 0, cpu_after = 0;
   std::vector<int64_t> delays;
 
   void publish(int listening) {
@@ -103,7 +114,7 @@ struct Load {
     write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", md5sum},
                       {"message_definition", "uint64 number\nint64 sent\nfloat64 value\nuint8[] data\n"},
                       {"topic", asked.at("topic")}, {"type", "relay_load/Sample"}});
-    const size_t batch = mode == "paced" ? 1 : std::max<size_t>(1, 262144 / frame);
+    const size_t batch = hertz ? 1 : std::max<size_t>(1, 262144 / frame);
     std::vector<char> buffer(batch * frame);
     const auto stamp = [&](size_t slot, uint64_t number) {
       const uint32_t length = frame - 4, rest = frame - FIXED;
@@ -121,6 +132,7 @@ struct Load {
       }
     };
     mark_until(primed);
+    cpu_before = cpu_us(pid);
     const int64_t start = now(), end = start + int64_t(seconds * 1e9);
     uint64_t given_up = 0, seen = 0;
     int64_t progress = start;
@@ -136,8 +148,8 @@ struct Load {
           continue;
         }
         count = std::min<size_t>(count, WINDOW - flying);
-      } else if (mode == "paced") {
-        std::this_thread::sleep_until(std::chrono::steady_clock::time_point(std::chrono::nanoseconds(start + int64_t(sent) * 1'000'000)));
+      } else if (hertz) {
+        std::this_thread::sleep_until(std::chrono::steady_clock::time_point(std::chrono::nanoseconds(start + int64_t(sent * 1e9 / hertz))));
       }
       for (size_t slot = 0; slot < count; ++slot) stamp(slot, sent + slot);
       write_all(fd, buffer.data(), count * frame);
@@ -156,6 +168,7 @@ struct Load {
     int64_t time;
     std::memcpy(&number, at + 4, 8), std::memcpy(&time, at + 12, 8);
     if (number == MARKER) {
+      if (received) cpu_after = cpu_us(pid);
       (received ? ended : primed) = true;
       return;
     }
@@ -165,7 +178,7 @@ struct Load {
     if (number < next) ++disordered;
     next = std::max(next, number + 1);
     last = t;
-    if ((received & 63) == 0 || mode == "paced") delays.push_back(t - time);
+    if ((received & 63) == 0 || hertz) delays.push_back(t - time);
     received.store(received + 1, std::memory_order_release);
   }
 
@@ -195,11 +208,12 @@ struct Load {
 };
 
 int main(int argc, char** argv) try {
-  if (argc != 4 && argc != 5) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced [MD5SUM]");
+  if (argc != 4 && argc != 5) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced|pacedN [MD5SUM]");
   Load load;
   load.frame = std::max<size_t>(FIXED, std::atoi(argv[1]));
   load.seconds = std::atof(argv[2]);
   load.mode = argv[3];
+  if (load.mode.rfind("paced", 0) == 0) load.hertz = load.mode == "paced" ? 1000 : std::stod(load.mode.substr(5));
   if (argc == 5) load.md5sum = argv[4];
   int listening = socket(AF_INET, SOCK_STREAM, 0);
   sockaddr_in where{};
@@ -211,14 +225,16 @@ int main(int argc, char** argv) try {
   std::thread publisher([&] { load.publish(listening); });
   int port;
   std::string topic;
-  std::cin >> port >> topic;
+  std::string line;
+  std::getline(std::cin, line);
+  std::istringstream(line) >> port >> topic >> load.pid;
   load.subscribe(port, topic == "-" ? "/load" : topic);
   publisher.join();
   std::sort(load.delays.begin(), load.delays.end());
   const auto delay = [&](double part) { return load.delays.empty() ? 0.0 : load.delays[size_t(part * (load.delays.size() - 1))] / 1e3; };
-  std::printf("{\"messages_per_s\": %.0f, \"sent\": %llu, \"lost\": %llu, \"disordered\": %llu, \"p50_us\": %.1f, \"p99_us\": %.1f}\n",
+  std::printf("{\"messages_per_s\": %.0f, \"sent\": %llu, \"lost\": %llu, \"disordered\": %llu, \"p50_us\": %.1f, \"p99_us\": %.1f, \"cpu_us\": %.1f}\n",
               load.last > load.first ? load.received / ((load.last - load.first) / 1e9) : 0.0, (unsigned long long)load.sent,
-              (unsigned long long)(load.sent - load.received), (unsigned long long)load.disordered, delay(.5), delay(.99));
+              (unsigned long long)(load.sent - load.received), (unsigned long long)load.disordered, delay(.5), delay(.99), load.cpu_after - load.cpu_before);
 } catch (const std::exception& error) {
   std::cerr << "relay_load: " << error.what() << std::endl;
   std::_Exit(1);

@@ -46,11 +46,13 @@ TYPE = "relay_load/Sample"
 
 @dataclass
 class Result:
-    """One run: messages a second, fraction lost, delay in microseconds, the relay's CPU microseconds a message."""
+    """One run: messages a second, lost fraction and number, delays in microseconds, the relay's CPU time a message."""
 
     rate: float
     loss: float
+    lost: int
     p50: float
+    p99: float
     cpu: float
 
 
@@ -72,10 +74,15 @@ def cpu_seconds(pid: int | None) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) -> Result:
-    """Run the load once through a system; `md5sum` replaces the md5sum of the message type."""
+def run(
+    mode: str, size: int, seconds: float, system: "System", *md5sum: str, prefix: Sequence[str] = ()
+) -> Result:
+    """Run the load once through a system, with this prefix of its command.
+
+    `md5sum` replaces the md5sum of the message type.
+    """
     with subprocess.Popen(
-        [str(compiled()), str(size), str(seconds), mode, *md5sum],
+        [*prefix, str(compiled()), str(size), str(seconds), mode, *md5sum],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -83,16 +90,17 @@ def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) ->
         assert load.stdin is not None
         assert load.stdout is not None
         port, topic = system.target(int(load.stdout.readline()))
-        before = cpu_seconds(system.pid)
-        load.stdin.write(f"{port} {topic}\n")
+        load.stdin.write(f"{port} {topic} {system.pid or 0}\n")
         load.stdin.close()
         answer = json.loads(load.stdout.read())
     received = answer["sent"] - answer["lost"]
     return Result(
         answer["messages_per_s"],
         answer["lost"] / max(1, answer["sent"]),
+        answer["lost"],
         answer["p50_us"],
-        (cpu_seconds(system.pid) - before) / max(1, received) * 1e6,
+        answer["p99_us"],
+        answer["cpu_us"] / max(1, received),
     )
 
 
@@ -172,8 +180,29 @@ class Relay:
             )
 
 
+class LoadApi:
+    """The node API of the load's nodes; `publisher` is the port of this run's publisher."""
+
+    def __init__(self) -> None:
+        self.publisher = 0
+        self._server = SimpleXMLRPCServer((LOOPBACK, 0), logRequests=False)
+        self._server.register_instance(self)
+        self.uri = f"http://{LOOPBACK}:{self._server.server_address[1]}/"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def close(self) -> None:
+        """End the server."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _dispatch(self, method: str, _parameters: tuple[Any, ...]) -> Any:
+        if method == "requestTopic":
+            return [1, "", ["TCPROS", LOOPBACK, self.publisher]]
+        return [1, "", 0]
+
+
 class RosRelay:
-    """A ROS node that relays, at a rosmaster, started again for each run; the publisher's node API is served here."""
+    """A ROS node that relays, at a rosmaster, started again for each run."""
 
     def __init__(self, name: str = "topic_tools", command: Sequence[str] = (TOPIC_TOOLS,)) -> None:
         """`command` is called with the two topics."""
@@ -189,11 +218,7 @@ class RosRelay:
             stderr=subprocess.DEVNULL,
         )
         eventually(self._answers, "rosmaster answers")
-        self._api = SimpleXMLRPCServer((LOOPBACK, 0), logRequests=False)
-        self._api.register_instance(self)
-        self._api_uri = f"http://{LOOPBACK}:{self._api.server_address[1]}/"
-        threading.Thread(target=self._api.serve_forever, daemon=True).start()
-        self._publisher = 0
+        self._api = LoadApi()
         self._runs = 0
         self._relay: subprocess.Popen[bytes] | None = None
         self.pid: int | None = None
@@ -201,10 +226,10 @@ class RosRelay:
     def target(self, publisher: int) -> tuple[int, str]:
         """Start a relay between two new topics and find the port it publishes on."""
         self.stop_relay()
-        self._publisher = publisher
+        self._api.publisher = publisher
         self._runs += 1
         given, taken = f"/in{self._runs}", f"/out{self._runs}"
-        call(self._uri, "registerPublisher", "/load", given, TYPE, self._api_uri)
+        call(self._uri, "registerPublisher", "/load", given, TYPE, self._api.uri)
         self._relay = subprocess.Popen(
             [*self._command, given, taken, f"__name:=relay{self._runs}"],
             env=self._environment,
@@ -231,15 +256,9 @@ class RosRelay:
     def close(self) -> None:
         """End everything that this object started."""
         self.stop_relay()
-        self._api.shutdown()
-        self._api.server_close()
+        self._api.close()
         self._master.terminate()
         self._master.wait(10)
-
-    def _dispatch(self, method: str, _parameters: tuple[Any, ...]) -> Any:
-        if method == "requestTopic":
-            return [1, "", ["TCPROS", LOOPBACK, self._publisher]]
-        return [1, "", 0]
 
     def _answers(self) -> bool:
         try:
