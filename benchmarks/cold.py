@@ -1,0 +1,202 @@
+"""The cost of a message as users pay it: `python -m benchmarks.cold [--busy]` (under two minutes).
+
+On a robot most messages come alone, 20 to 1,000 times a second, and find the caches cold. Here the relay is the one of
+an appliance that `rosrv up` has started: as its own user, with a policy that grants the load's nodes, once without a
+monitor and once with one (it reads two fields, writes one and steps one FSM). Beside it: nothing, `copying_relay.c`
+with epoll, and five lines of Python. They take turns in every round. Cells are medians of the rounds; in parentheses
+are the median, the least and the greatest ratio to the C relay of the same round.
+
+*paced100*, *paced1000* (or any other number): messages a second. The load then has real-time priority if permitted, so
+that the delay is that of the process in the middle. *window*: 64 messages on their way. `--busy` adds other programs
+that use half of each core and walk through their memory. Processor time is that of the process in the middle, all
+threads. Needs g++, rosmaster and chrt.
+"""
+
+import argparse
+import os
+import re
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.monitors import CopyingRelay, MinimalRelay, specification
+from benchmarks.relay_throughput import HERE, TYPE, Direct, LoadApi, Result, System, run
+from tests.support.appliance import Appliance
+from tests.support.relay_driver import call
+
+POLICY = """
+[Nodes]
+/load          = 127.0.0.1
+/load_listener = 127.0.0.1
+[Publishers]
+/load = 127.0.0.1
+[Subscribers]
+/load = 127.0.0.1
+[Commands]
+default = 127.0.0.1
+"""
+BASE = "C with epoll"
+SECONDS = {"paced": 2.0, "window": 0.4}
+SIZES = {"paced": (200,), "window": (200, 4096, 65536, 1048576, 4194304)}
+MODES = ("paced100", "paced1000", "window")
+REALTIME = ("chrt", "--fifo", "10")
+OTHER_PROGRAM = """
+import threading, time
+memory, part, at, pause = bytearray(8 << 20), 1 << 16, 0, threading.Event()
+while True:
+    began, used = time.monotonic(), time.thread_time()
+    while time.thread_time() - used < 0.0025:
+        memory.count(1, at, at + part)
+        at = (at + part) % len(memory)
+    pause.wait(max(0, began + 0.005 - time.monotonic()))
+"""
+"""A robot's other program: every 5 ms it walks through its memory for 2.5 ms."""
+
+
+class DeployedRelay:
+    """The relay of a running appliance, at which the load's nodes register for each run."""
+
+    def __init__(self, name: str, *specifications: str) -> None:
+        self.name = name
+        monitors = {str(number): text for number, text in enumerate(specifications)}
+        self._appliance = Appliance(policy=POLICY, monitors=monitors, options=("--api", "127.0.0.1:0"))
+        definition = self._appliance.directory / "monitors" / "msg" / f"{TYPE}.msg"
+        definition.parent.mkdir(parents=True)
+        definition.write_text((HERE / "nodes" / "msg" / f"{TYPE}.msg").read_text())
+        self._api = LoadApi()
+        self.pid: int | None = None
+        try:
+            self._appliance.start()
+            [self.pid] = self._appliance.pids("relay")
+        except BaseException:
+            self.close()
+            raise
+
+    def target(self, publisher: int) -> tuple[int, str]:
+        """Register this run's nodes in place of those of the last run; return port and topic for the subscriber."""
+        self._call("unregisterSubscriber", "/load_listener", "/load", self._api.uri)
+        self._call("unregisterPublisher", "/load", "/load", self._api.uri)
+        self._api.publisher = publisher
+        self._call("registerPublisher", "/load", "/load", TYPE, self._api.uri)
+        [node] = self._call("registerSubscriber", "/load_listener", "/load", TYPE, self._api.uri)
+        _code, _text, (_protocol, _host, port) = call(
+            node, "requestTopic", "/load_listener", "/load", [["TCPROS"]]
+        )
+        return port, "/load"
+
+    def close(self) -> None:
+        """Stop the appliance."""
+        self._appliance.close()
+        self._api.close()
+
+    def _call(self, method: str, *arguments: str) -> Any:
+        code, text, value = call(self._appliance.master_uri, method, *arguments)
+        if code != 1:
+            raise SystemExit(f"{method} of the appliance: {text}\n{self._appliance.story()}")
+        return value
+
+
+SYSTEMS: tuple[Callable[[], System], ...] = (
+    Direct,
+    lambda: CopyingRelay(epoll=True),
+    lambda: MinimalRelay("five lines of Python", sys.executable, str(HERE / "nodes" / "copying_relay.py")),
+    lambda: DeployedRelay("deployed, no monitor"),
+    lambda: DeployedRelay("deployed, one monitor", specification("load", "/load")),
+)
+
+
+@contextmanager
+def other_programs(number: int) -> Iterator[None]:
+    """Run this number of other programs."""
+    programs = [subprocess.Popen([sys.executable, "-c", OTHER_PROGRAM]) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+def realtime() -> tuple[str, ...]:
+    """Return the prefix of a command that has real-time priority, or nothing if that is not permitted."""
+    permitted = subprocess.run([*REALTIME, "true"], check=False, stderr=subprocess.DEVNULL).returncode == 0
+    return REALTIME if permitted else ()
+
+
+def cell(runs: list[Result], base: list[Result], value: Callable[[Result], float]) -> str:
+    """Return the median, and the median, least and greatest ratio to the base of the same round."""
+    middle = statistics.median(map(value, runs))
+    if not middle:
+        return "-"
+    ratios = [value(one) / value(other) for one, other in zip(runs, base, strict=True)]
+    digits = 2 if middle < 10 else 0
+    return f"{middle:,.{digits}f} ({statistics.median(ratios):.2f}, {min(ratios):.2f}-{max(ratios):.2f})"
+
+
+def show(mode: str, size: int, results: dict[str, list[Result]]) -> None:
+    """Print the table of one mode and size."""
+    columns: dict[str, Callable[[Result], float]] = {"processor µs": lambda one: one.cpu}
+    if mode == "window":
+        title, columns = "64 messages on their way", {"messages/s": lambda one: one.rate} | columns
+    else:
+        title = f"{int(mode.removeprefix('paced')):,} messages a second"
+        columns = {"p50 µs": lambda one: one.p50, "p99 µs": lambda one: one.p99} | columns
+    table = Table("in the middle", *columns, "lost", title=f"{title}, {size:,} bytes")
+    for name, runs in results.items():
+        cells = [cell(runs, results[BASE], value) for value in columns.values()]
+        table.add_row(name, *cells, f"{sum(one.lost for one in runs):,}")
+    Console(width=130).print(table)
+
+
+def modes(text: str) -> list[str]:
+    """Return the modes in this argument."""
+    found = text.split(",")
+    wrong = [one for one in found if not re.fullmatch(r"window|paced[1-9]\d*", one)]
+    if wrong:
+        raise argparse.ArgumentTypeError(
+            f"no mode {wrong[0]!r}: give window, paced100, paced1000 or the like"
+        )
+    return found
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, help="of each run (2; window: 0.4)")
+    parser.add_argument("--sizes", type=lambda text: tuple(int(one) for one in text.split(",")))
+    parser.add_argument(
+        "--modes", type=modes, default=list(MODES), help=f"{','.join(MODES)}, or another pace"
+    )
+    parser.add_argument("--busy", action="store_true", help="with other programs on half of each core")
+    options = parser.parse_args()
+    prefix, cores = realtime(), len(os.sched_getaffinity(0))
+    print(f"real-time priority of the load, if paced: {'yes' if prefix else 'not permitted'}")
+    print(f"other programs: {f'one on each of {cores} cores, half of the time' if options.busy else 'none'}")
+    results: dict[tuple[str, int], dict[str, list[Result]]] = {}
+    with ExitStack() as running:
+        systems: list[System] = []
+        for start in SYSTEMS:
+            systems.append(start())
+            running.callback(systems[-1].close)
+        running.enter_context(other_programs(cores if options.busy else 0))
+        for _round in range(options.rounds):
+            for mode in options.modes:
+                kind = mode.rstrip("0123456789")
+                for size in options.sizes or SIZES[kind]:
+                    for system in systems:
+                        given = options.seconds or SECONDS[kind]
+                        result = run(mode, size, given, system, prefix=prefix if kind == "paced" else ())
+                        results.setdefault((mode, size), {}).setdefault(system.name, []).append(result)
+    for (mode, size), found in results.items():
+        show(mode, size, found)
+
+
+if __name__ == "__main__":
+    main()
