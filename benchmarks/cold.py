@@ -114,7 +114,9 @@ SYSTEMS: tuple[Callable[[], System], ...] = (
 @contextmanager
 def other_programs(number: int) -> Iterator[None]:
     """Run this number of other programs."""
-    programs = [subprocess.Popen([sys.executable, "-c", OTHER_PROGRAM]) for _ in range(number)]
+    programs = [
+        subprocess.Popen([sys.executable, "-c", OTHER_PROGRAM], start_new_session=True) for _ in range(number)
+    ]
     try:
         yield
     finally:

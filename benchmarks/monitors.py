@@ -80,7 +80,9 @@ class MinimalRelay:
     def target(self, publisher: int) -> tuple[int, str]:
         """Start a relay in front of this publisher."""
         self.close()
-        self._process = subprocess.Popen([*self._command, str(publisher)], stdout=subprocess.PIPE, text=True)
+        self._process = subprocess.Popen(
+            [*self._command, str(publisher)], stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
         assert self._process.stdout is not None
         self.pid = self._process.pid
         return int(self._process.stdout.readline()), "-"

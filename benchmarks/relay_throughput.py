@@ -79,13 +79,15 @@ def run(
 ) -> Result:
     """Run the load once through a system, with this prefix of its command.
 
-    `md5sum` replaces the md5sum of the message type.
+    `md5sum` replaces the md5sum of the message type. Sessions share the cores equally (`sched_autogroup_enabled`), so
+    the load has its own, like a node of roslaunch.
     """
     with subprocess.Popen(
         [*prefix, str(compiled()), str(size), str(seconds), mode, *md5sum],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        start_new_session=True,
     ) as load:
         assert load.stdin is not None
         assert load.stdout is not None
