@@ -36,4 +36,4 @@ class RelayContext:
     ) -> "RelayContext":
         """Return the context of a new relay with this table."""
         memory = RelayMemory.of(limits, table.quota_class)
-        return cls(loop, limits, reporter, memory, Scratch(), interceptor, table.payer)
+        return cls(loop, limits, reporter, memory, Scratch(loop.pump), interceptor, table.payer)

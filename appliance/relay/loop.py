@@ -33,7 +33,7 @@ from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from appliance.quotas.table import RELAY_TURN
-from appliance.relay.transport.pump import CROWD, LITTLE, Pump, PumpedConnection
+from appliance.relay.transport.pump import LITTLE, Pump, PumpedConnection
 
 READ = select.EPOLLIN
 WRITE = select.EPOLLOUT
@@ -266,7 +266,7 @@ class EventLoop:
         if payer.crowd is None:
             payer.crowd = select.epoll()
             self._crowds[payer.crowd.fileno()] = payer
-            self.pump.put(payer.crowd.fileno(), CROWD)
+            self.pump.crowd(payer.crowd.fileno())
             self._epoll.register(payer.crowd.fileno(), READ)
         return payer.crowd
 

@@ -123,6 +123,7 @@ class ModuleState:
         self._inside = False
         self.prepared: BatchOptions | None = None
         """The options that the module was prepared with last; None while the state is in Python."""
+        self._unprepare()
 
     def prepare(self, prepared: BatchOptions) -> None:
         """Move the state into the module, and set the options of the next batch."""
@@ -130,7 +131,12 @@ class ModuleState:
             self._enter()
         self.prepared = prepared
         self.machine.refuel(FUEL)
-        _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:4])
+        self._memory[self._source : self._source + _PREPARED.size] = packed(prepared)
+
+    def _unprepare(self) -> None:
+        """Forget the options: memory then differs from the `packed` form of all options."""
+        self.prepared = None
+        _PREPARED.pack_into(self._memory, self._source, *[-1] * 4)
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
@@ -172,6 +178,11 @@ class ModuleState:
             return None if self._strings else []
         return [(self._base, self._cells.size), *((address, _CLOCK.size) for address in self._clocked)]
 
+    @property
+    def options(self) -> int:
+        """Return the address of the packed options of the next batch."""
+        return self._source
+
     def hasten(self) -> None:
         """Compute the time of the next timer again, because there is an earlier deadline."""
         self.leave()
@@ -185,7 +196,8 @@ class ModuleState:
         """Move the state back to Python."""
         if self._inside:
             self.show()
-            self._inside, self.prepared, self.left = False, None, True
+            self._inside, self.left = False, True
+            self._unprepare()
 
     def show(self) -> None:
         """Copy the state from the module's memory to Python."""
@@ -202,6 +214,11 @@ class ModuleState:
             name = self._names[place]
             found[name] = _left(self._memory, found[name], self._values[name])
         self._values.update(found)
+
+
+def packed(prepared: BatchOptions) -> bytes:
+    """Return the options as the module reads them."""
+    return _PREPARED.pack(prepared.source << 32, *prepared[1:4])
 
 
 def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
@@ -372,8 +389,10 @@ class WasmLane:
             self._effects,
             output,
             SURE,
+            self._home.options,
             cells,
             self._home,
+            packed,
             failure,
             keeps,
         )

@@ -56,9 +56,6 @@ class BatchOptions(NamedTuple):
 class PreparedState(Protocol):
     """The state of specifications that share topics or variables, as the caller of `NativeCall` uses it."""
 
-    prepared: BatchOptions | None
-    """The options of the last batch; None while the state is not in the module."""
-
     def prepare(self, prepared: BatchOptions) -> None:
         """Move the state into the module, and set the options of the next batch."""
 
@@ -69,7 +66,8 @@ class NativeCall(NamedTuple):
     `invoke` is wasmtime's `wasmtime_func_call_unchecked`, to be called with `context`, `function` and three slots of 16
     bytes: the address of the first frame in the module, the address after the last one, and the time (ns). Its result
     is the module's answer (`rosmop.fast.abi`). If it returns an error, or a trap, `failure(error, trap)` frees them and
-    returns the exception that a lane raises for it. Before a call, `home.prepared` must be the batch's options.
+    returns the exception that a lane raises for it. If the bytes at `options` are not `packed(options)` of the batch's
+    options, call `home.prepare` first.
 
     The other fields are offsets in `memory`, which does not grow: of the frames, of the first effect, of the lines of
     output (0: the lane prints nothing) and of the word with their end, and offset and size of each part of the state.
@@ -83,8 +81,10 @@ class NativeCall(NamedTuple):
     effects: int
     output: int
     sure: int
+    options: int
     cells: Sequence[tuple[int, int]]
     home: PreparedState
+    packed: Callable[[BatchOptions], bytes]
     failure: Callable[[int, int], Exception]
     keeps: object
     """Keeps what the addresses refer to."""

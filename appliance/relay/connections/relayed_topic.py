@@ -34,7 +34,7 @@ from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
-from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic
+from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 
 _ROW = 16  # subscribers between two readings of the processor time
@@ -197,8 +197,8 @@ class RelayedTopic:
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
-        self.plain: object = object()
-        """Another object whenever the pump may have to leave the next frames to Python (see `simple`)."""
+        self.plain = Version()
+        """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
         self.counters = Traffic()
         self._call: Callable[[], ModuleCall | None] = _no_call
         self._dropped = 0
@@ -254,12 +254,12 @@ class RelayedTopic:
 
     def differs(self) -> None:
         """Make the pump ask again whether the next frames are `simple`."""
-        self.plain = object()
+        self.plain.change()
 
     def simple(self) -> tuple[list[int], ModuleCall | None] | None:
         """Return the subscribers' descriptors and the monitors' call if the next small frames need no other work.
 
-        The answer holds while `plain` and the monitors' preparation stay.
+        The answer holds until `plain` or the monitors' preparation changes.
         """
         if self._latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None

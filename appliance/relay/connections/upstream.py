@@ -52,7 +52,7 @@ class PublisherConnection(Upstream):
             context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
         )
         self._stall = StallDetector(limits.stall_seconds)
-        self._pumped = context.loop.pump.connection(context.scratch)
+        self._pumped = context.loop.pump.connection()
         self._buffer = self._receiver.buffer
         self._received = self._receiver.received
         self._wanted = False

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.transport.pump import ModuleCall
 
 if TYPE_CHECKING:
     from rosmop.run.fast_path import BatchResult, FastLane
@@ -26,7 +27,14 @@ class FastPathCounts:
         """Whether counting has begun and the observer collects these counts."""
         self.changed: dict[int, int] = {}
         """The number of changed messages by writers, added up by walks (`BatchOptions`)."""
+        self._call: ModuleCall | None = None
         self._clear()
+
+    def count_in(self, call: ModuleCall) -> None:
+        """Collect the changes that the pump counts in this call from now on."""
+        if self._call is not None:
+            self._call.settle()
+        self._call = call
 
     def add(self, walked: BatchResult, time: int) -> int:
         """Count the messages that a walk dropped; return their number."""
@@ -40,6 +48,8 @@ class FastPathCounts:
 
     def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
         """Return and reset three counts: drops by event, changed messages by the events that changed them, verdicts."""
+        if self._call is not None:
+            self._call.settle()
         changed = {self.lane.writers(who): count for who, count in self.changed.items()}
         dropped, told = self._dropped, self._told
         self._clear()

@@ -37,6 +37,7 @@ from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
+from appliance.relay.transport.pump import Version
 from rosmop.run.outcomes import MessageSender
 
 if TYPE_CHECKING:
@@ -86,7 +87,8 @@ class Interceptor:
         self._switches: dict[str, bool] = {}
         self.blocked = ""
         self._awaited: SpecificationsStated | None = None
-        self.preparation = object()
+        self.preparation = Version()
+        """The version of all options that pipelines and services have prepared."""
         self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
         """The time budgets of points; `tick` removes those that have recovered."""
         self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
@@ -309,7 +311,7 @@ class Interceptor:
 
     def invalidate_prepared(self) -> None:
         """Invalidate all options that pipelines and services have prepared."""
-        self.preparation = object()
+        self.preparation.change()
         self._prepared.clear()
 
     def judge(self, point: ObservationPoint, part: str, body: bytes) -> ServiceVerdict:

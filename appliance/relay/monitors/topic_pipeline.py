@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63
+_UNPREPARED = -1
 
 
 class TopicPipeline:
@@ -38,13 +39,13 @@ class TopicPipeline:
     def __init__(self, interceptor: Interceptor, point: ObservationPoint) -> None:
         self._interceptor = interceptor
         self._point = point
-        self._preparation: object = None
+        self._preparation = _UNPREPARED
         self._until = 0
         self._lane: FastLane | None = None
         self._prepared: BatchOptions | None = None
         self._counts: FastPathCounts | None = None
         self._defect: FastLane | None = None
-        self._called: tuple[object, ModuleCall] | None = None
+        self._called: tuple[int, ModuleCall] | None = None
         self._source = interceptor.senders.number(point)
 
     def through(self, batch: Batch) -> Batch | None:
@@ -56,7 +57,7 @@ class TopicPipeline:
     def _judged(self, batch: Batch) -> Batch | None:
         interceptor = self._interceptor
         now = batch.judged = batch.judged or interceptor.now()
-        if self._preparation is not interceptor.preparation or now >= self._until:
+        if self._preparation != interceptor.preparation.number or now >= self._until:
             return self._through(batch, BatchProgress(batch, now))
         assert self._lane is not None  # noqa: S101  `_prepare` has found one
         assert self._prepared is not None  # noqa: S101  and prepared it
@@ -79,20 +80,28 @@ class TopicPipeline:
     def module_call(self) -> ModuleCall | None:
         """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
         interceptor = self._interceptor
-        if self._preparation is not interceptor.preparation or self._lane is None:
+        if self._preparation != interceptor.preparation.number or self._lane is None:
             return None
         assert self._prepared is not None  # noqa: S101  prepared with the lane
         assert self._counts is not None  # noqa: S101  as well
         if not self._counts.begun:
             interceptor.observer.collect_later(self._counts)
-        if self._called is None or self._called[0] is not self._preparation:
+        if self._called is None or self._called[0] != self._preparation:
             native = self._lane.native()
             if native is None:
                 return None
             place = interceptor.cells_place(self._point[1]) if native.cells else NOT_KEPT
             if place is None:
                 return None
-            call = ModuleCall(interceptor, native, self._prepared, place, until=self._until)
+            call = ModuleCall(
+                interceptor.preparation,
+                native,
+                self._prepared,
+                place,
+                offset=interceptor.offset,
+                until=self._until,
+            )
+            self._counts.count_in(call)
             self._called = self._preparation, call
         return self._called[1]
 
@@ -108,7 +117,7 @@ class TopicPipeline:
         """Report a defect of the fast path, and leave this topic to the engine from now on."""
         self._interceptor.observer.defect(error, self._point, now)
         self._defect = lane
-        self._preparation = None
+        self._preparation = _UNPREPARED
 
     def _through(self, batch: Batch, progress: BatchProgress) -> Batch | None:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
@@ -177,7 +186,7 @@ class TopicPipeline:
             counts = self._counts = FastPathCounts(lane, point)
         if (
             prepared is None
-            or self._preparation is not self._interceptor.preparation
+            or self._preparation != self._interceptor.preparation.number
             or self._lane is not lane
         ):
             prepared = self._prepared = lane.prepare(
@@ -189,7 +198,7 @@ class TopicPipeline:
                 source=self._source,
                 changed=counts.changed,
             )
-        self._lane, self._preparation = lane, self._interceptor.preparation
+        self._lane, self._preparation = lane, self._interceptor.preparation.number
         self._until = _NEVER if monitors.next_due is None else monitors.next_due
         return prepared, counts
 

@@ -20,6 +20,7 @@ from math import ceil, gcd
 from typing import Literal
 
 from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.pump import Pump
 from roswire.errors import LimitExceededError
 
 SMALL = 4 << 10
@@ -139,14 +140,18 @@ class Scratch:
     It begins at a page boundary, because the kernel copies aligned data faster.
     """
 
-    __slots__ = ("area",)
+    __slots__ = ("_pump", "area")
 
-    def __init__(self) -> None:
+    def __init__(self, pump: Pump | None = None) -> None:
+        """`pump` receives into the area as well."""
+        self._pump = pump
         self.move(None)
 
     def move(self, area: memoryview | None) -> None:
         """Use this area from the next read on; with None, use a new area."""
         self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
+        if self._pump is not None:
+            self._pump.receive_into(self.area)
 
     def hold(self, batch: Batch) -> Batch:
         """Return the batch, copied into the area if it fits, because monitors are faster there."""

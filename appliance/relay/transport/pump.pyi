@@ -1,7 +1,6 @@
 from collections.abc import Sequence
 from typing import Final, NamedTuple, Protocol
 
-from appliance.relay.transport.frames import Scratch
 from rosmop.run.fast_path import BatchOptions, NativeCall
 
 SUBSCRIBERS: Final[int]
@@ -9,7 +8,6 @@ UNARMED: Final = 0
 RECEIVED: Final = 1
 JUDGED: Final = 2
 SENT: Final = 3
-CROWD: Final[str]
 LITTLE: Final[float]
 
 class CellsPlace(Protocol):
@@ -20,14 +18,11 @@ class CellsPlace(Protocol):
     @property
     def cells(self) -> tuple[int, int]: ...
 
-class _Interceptor(Protocol):
-    preparation: object
-    offset: int
-
 class _Topic(Protocol):
-    plain: object
-    counters: Traffic
-
+    @property
+    def plain(self) -> Version: ...
+    @property
+    def counters(self) -> Traffic: ...
     @property
     def keeps_large(self) -> bool: ...
 
@@ -41,6 +36,11 @@ class Left(NamedTuple):
     answer: int | Exception | None = None
     number: int = 0
     sent: int = 0
+
+class Version:
+    @property
+    def number(self) -> int: ...
+    def change(self) -> None: ...
 
 class Traffic:
     @property
@@ -56,13 +56,15 @@ class Traffic:
 class ModuleCall:
     def __init__(
         self,
-        interceptor: _Interceptor,
+        preparation: Version,
         native: NativeCall,
         options: BatchOptions,
         place: CellsPlace,
         *,
+        offset: int,
         until: int,
     ) -> None: ...
+    def settle(self) -> None: ...
 
 class PumpedConnection:
     @property
@@ -82,6 +84,8 @@ class Pump:
     def __init__(self, epoll: int) -> None: ...
     @property
     def began(self) -> float: ...
-    def connection(self, scratch: Scratch) -> PumpedConnection: ...
-    def put(self, descriptor: int, entry: PumpedConnection | str | None) -> None: ...
+    def receive_into(self, area: memoryview) -> None: ...
+    def connection(self) -> PumpedConnection: ...
+    def crowd(self, descriptor: int) -> None: ...
+    def put(self, descriptor: int, entry: PumpedConnection | None) -> None: ...
     def wait(self, longest: float, most: int, steps: bool) -> list[tuple[int, int]]: ...

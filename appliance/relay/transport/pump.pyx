@@ -10,8 +10,8 @@ it contains whole small frames, call the monitors' module, keep the monitors' st
 Then it waits again. In every other case `wait` returns the ready descriptors to Python.
 
 Python remains the definition of what happens. It arms a connection when it has found that the next frames need no
-other work, and names the objects for which this holds: the topic's `plain` and the interceptor's `preparation`. Both
-are replaced when something changes, so a step begins by comparing them. A step that meets anything else stops where it
+other work. This holds for one version of the topic (`plain`) and of the monitors (`preparation`). Whatever changes one
+of them changes its version, and a step begins by comparing both. A step that meets anything else stops where it
 is: its handler gets a `Left` from `take_left` and goes on from there. A frame is never judged or sent twice.
 
 What a step leaves to Python, with what it has done so far:
@@ -24,12 +24,13 @@ Bounds: a step makes one `recv` of at most the scratch area and at most `MOST_SU
 bounded by its fuel. `wait` returns when a step took longer than `LITTLE`, so that its payer is charged, and when the
 deadline of a timer has passed. If several descriptors are ready, Python divides the processor time among their payers.
 
-Memory safety: the scratch area, the module's memory and the state's memory are typed memoryviews, whose indices are
-checked. Addresses passed to the system lie in a range that was checked just before. Descriptors are never closed here.
-The only addresses from outside are those of the module's function (`rosmop.run.fast_path.NativeCall`).
+Memory safety: the scratch area, the module's memory and the state's memory are buffers of Python that are held while
+they are used. Each access goes through `_part`, which checks it. Descriptors are never closed here. The only addresses
+from outside are those of the module's function (`rosmop.run.fast_path.NativeCall`).
 """
 
 from cpython.exc cimport PyErr_CheckSignals
+from cpython.list cimport PyList_GetItem
 from libc.errno cimport EAGAIN, EINTR, errno
 from libc.math cimport ceil
 from libc.stdint cimport int64_t, uint8_t, uint32_t, uint64_t, uintptr_t
@@ -75,6 +76,8 @@ cdef enum:
     _SMALL = 4 << 10
     _EVENTS = 1024
     _BOUNDS = 10
+    _OPTIONS = 32
+    _PARTS = 16
     _BASE = 1  # these are bits of state_memory.py
     _CELLS = 2
     _HAS_CELLS = 4
@@ -85,8 +88,6 @@ cdef enum:
 
 SUBSCRIBERS = _SUBSCRIBERS
 UNARMED, RECEIVED, JUDGED, SENT = _UNARMED, _RECEIVED, _JUDGED, _SENT
-CROWD = "an epoll of other connections"
-
 LITTLE = 1e-4
 """Seconds of a step that are not charged, because no other descriptor was ready when it began."""
 
@@ -99,10 +100,36 @@ for _number, _seconds in enumerate(DELAY_BOUNDS):
     _BOUND[_number] = int(_seconds * 1e9)
 
 
+cdef struct Span:  # memory that a buffer of Python keeps in its place
+    uint8_t *start
+    Py_ssize_t size
+
+
+cdef Span _span(uint8_t[::1] buffer) except *:
+    return Span(&buffer[0], buffer.shape[0])
+
+
+cdef inline uint8_t *_part(Span span, Py_ssize_t at, Py_ssize_t size) except NULL:
+    """Return the address of a part; every access of this module to a span goes through this check."""
+    if at < 0 or size < 1 or size > span.size or at > span.size - size:
+        raise IndexError(f"{size} bytes at {at} are outside a memory of {span.size}")
+    return span.start + at
+
+
 cdef inline int64_t _now() noexcept nogil:
     cdef timespec now
     clock_gettime(CLOCK_MONOTONIC, &now)
     return <int64_t>now.tv_sec * 1_000_000_000 + now.tv_nsec
+
+
+cdef class Version:
+    """The version of something that an armed connection relies on."""
+
+    cdef readonly int64_t number
+
+    def change(self) -> None:
+        """Make the next steps ask Python again."""
+        self.number += 1
 
 
 cdef class Traffic:
@@ -153,61 +180,94 @@ cdef class ModuleCall:
     """The call of a monitors' module for the frames of one topic, and the place of the monitors' state.
 
     `native` is the lane's `NativeCall`, `options` its `BatchOptions`, and `place` the `CellsPlace` of its state. The call
-    is valid before the time `until` (ns), and while `interceptor.preparation` is the present object.
+    is valid before the time `until` (ns), and while `preparation` keeps its version. `offset` is the difference between
+    the monitors' clock and the monotonic clock (ns).
     """
 
-    cdef object _interceptor, _preparation, _options, _changed, _home, _native, _answer
-    cdef int64_t _offset, _until
+    cdef Version _preparation
+    cdef int64_t _version, _offset, _until
     cdef invoke_t _invoke
     cdef void *_context
     cdef void *_function
-    cdef uint8_t[::1] _memory, _kept
-    cdef Py_ssize_t _frames, _effects, _output, _sure, _flags, _first, _second
-    cdef list _cells
+    cdef Span _memory, _kept
+    cdef Py_ssize_t _frames, _effects, _output, _sure, _flags, _first, _second, _options
+    cdef uint8_t _wanted[_OPTIONS]
+    cdef int _parts
+    cdef Py_ssize_t _at[_PARTS]
+    cdef Py_ssize_t _size[_PARTS]
     cdef uint64_t _slots[6]
+    cdef int64_t _result, _who, _times
+    cdef object _failure, _native, _given
+    cdef uint8_t[::1] _memory_buffer, _kept_buffer
 
-    def __init__(self, interceptor, native, options, place, *, until: int) -> None:
-        self._interceptor, self._preparation = interceptor, interceptor.preparation
-        self._offset, self._until = interceptor.offset, min(until, _NEVER)
-        self._options, self._changed = options, options.changed
-        self._native, self._home = native, native.home
+    def __init__(self, preparation: Version, native, options, place, *, offset: int, until: int) -> None:
+        self._preparation, self._version = preparation, preparation.number
+        self._offset, self._until = offset, min(until, _NEVER)
+        self._native, self._given = native, options
         self._invoke = <invoke_t><uintptr_t>native.invoke
         self._context, self._function = <void *><uintptr_t>native.context, <void *><uintptr_t>native.function
-        self._memory, self._frames, self._effects = native.memory, native.frames, native.effects
-        self._output, self._sure = native.output, native.sure
-        self._kept, self._flags, (self._first, self._second) = place.memory, place.flags, place.cells
-        self._cells = list(native.cells)
+        self._memory_buffer, self._kept_buffer = native.memory, place.memory
+        self._memory, self._kept = _span(self._memory_buffer), _span(self._kept_buffer)
+        self._frames, self._effects = native.frames, native.effects
+        self._output, self._sure, self._options = native.output, native.sure, native.options
+        wanted = native.packed(options)
+        memcpy(self._wanted, <const char *><bytes>wanted, min(len(wanted), _OPTIONS))
+        self._flags, (self._first, self._second) = place.flags, place.cells
+        if len(wanted) != _OPTIONS or len(native.cells) > _PARTS:
+            raise ValueError(f"too much for a step: {len(wanted)} bytes of options, {len(native.cells)} parts of a state")
+        for at, size in native.cells:
+            self._at[self._parts], self._size[self._parts] = at, size
+            self._parts += 1
 
-    cdef bint _ready(self, uint8_t[::1] area, int64_t received) except -1:
+    def settle(self) -> None:
+        """Add the changed messages that were counted here to the options' counts."""
+        if self._times:
+            changed = self._given.changed
+            changed[self._who] = changed.get(self._who, 0) + self._times
+            self._times = 0
+
+    cdef bint _ready(self, Span area, int64_t received) except -1:
         """Whether the module may judge frames at the start of this area at this time."""
-        return received + self._offset < self._until and &area[0] == &self._memory[self._frames]
+        return received + self._offset < self._until and area.start == _part(self._memory, self._frames, area.size)
 
     cdef bint _judge(self, Py_ssize_t size, int64_t received) except -1:
-        """Judge `size` bytes of frames; return whether all pass and only counts are left to do. Else see `_answer`."""
+        """Judge `size` bytes of frames; return whether all pass and only counts are left to do."""
         cdef void *trap = NULL
         cdef void *error
-        cdef int64_t result
-        if self._home.prepared is not self._options:
-            self._home.prepare(self._options)
+        cdef int64_t effects
+        if memcmp(_part(self._memory, self._options, _OPTIONS), self._wanted, _OPTIONS) and not self._prepare():
+            return False
         self._slots[0], self._slots[2], self._slots[4] = self._frames, self._frames + size, received + self._offset
         error = self._invoke(self._context, self._function, self._slots, 3, &trap)
         if error != NULL or trap != NULL:
-            self._answer = self._native.failure(<uintptr_t>error, <uintptr_t>trap)
+            self._failure = self._native.failure(<uintptr_t>error, <uintptr_t>trap)
             return False
-        result = <int64_t>self._slots[0]
-        self._answer = result
-        if result < 0 or result >= _TOLD or (result & _ADDRESS) != self._frames + size:
+        self._result = <int64_t>self._slots[0]
+        if self._result < 0 or self._result >= _TOLD or (self._result & _ADDRESS) != self._frames + size:
             return False
         if self._output and _word(self._memory, self._sure) > self._output:
             return False
-        return self._count(result >> 32)  # no higher bit is set
+        effects = self._result >> 32  # no higher bit is set
+        return not effects or self._count(effects)
+
+    cdef object _answer(self):
+        """Return the module's answer, or the exception in its place."""
+        failure, self._failure = self._failure, None
+        return self._result if failure is None else failure
+
+    cdef bint _prepare(self) except -1:
+        """Move the state into the module, with the options; a defect is left to Python, which reports it."""
+        try:
+            self._native.home.prepare(self._given)
+        except Exception as error:
+            self._failure = error
+            return False
+        return True
 
     cdef bint _count(self, Py_ssize_t effects) except -1:
         """Count the changed messages; return False, with nothing counted, if one of the effects is a drop."""
         cdef int64_t effect[2]
         cdef Py_ssize_t number
-        if not effects:
-            return True
         cdef uint8_t *found = _part(self._memory, self._effects, 16 * effects)
         for number in range(effects):
             memcpy(effect, found + 16 * number, 16)
@@ -215,43 +275,45 @@ cdef class ModuleCall:
                 return False
         for number in range(effects):
             memcpy(effect, found + 16 * number, 16)
-            self._changed[effect[0]] = self._changed.get(effect[0], 0) + effect[1]
+            if effect[0] != self._who:
+                self.settle()
+                self._who = effect[0]
+            self._times += effect[1]
         return True
 
     cdef int _keep(self) except -1:
         """Keep the monitors' state if it has changed, in the order of writes of `state_memory.py`."""
-        cdef Py_ssize_t at, size, place
-        cdef uint8_t flags
+        cdef Py_ssize_t place
+        cdef uint8_t *flags
+        cdef int number
         cdef bint same
         if self._flags < 0:
             return 0
-        flags = self._kept[self._flags]
-        same = flags & _HAS_CELLS
-        place = self._second if flags & _CELLS else self._first
-        for at, size in self._cells:
-            same = same and not memcmp(_part(self._memory, at, size), _part(self._kept, place, size), size)
-            place += size
+        flags = _part(self._kept, self._flags, 1)
+        same = flags[0] & _HAS_CELLS
+        place = self._second if flags[0] & _CELLS else self._first
+        for number in range(self._parts):
+            same = same and not memcmp(self._state(number), _part(self._kept, place, self._size[number]),
+                                       self._size[number])
+            place += self._size[number]
         if same:
             return 0
-        place = self._first if flags & _CELLS else self._second
-        for at, size in self._cells:
-            memcpy(_part(self._kept, place, size), _part(self._memory, at, size), size)
-            place += size
+        place = self._first if flags[0] & _CELLS else self._second
+        for number in range(self._parts):
+            memcpy(_part(self._kept, place, self._size[number]), self._state(number), self._size[number])
+            place += self._size[number]
         keep_order()
-        self._kept[self._flags] = flags & _BASE | (flags & _CELLS ^ _CELLS) | _HAS_CELLS
+        flags[0] = flags[0] & _BASE | (flags[0] & _CELLS ^ _CELLS) | _HAS_CELLS
         keep_order()
         return 0
 
-
-cdef uint8_t *_part(uint8_t[::1] memory, Py_ssize_t at, Py_ssize_t size) except NULL:
-    if at < 0 or size < 1 or at + size > memory.shape[0]:
-        raise IndexError(f"{size} bytes at {at} are outside a memory of {memory.shape[0]}")
-    return &memory[at]
+    cdef uint8_t *_state(self, int number) except NULL:
+        return _part(self._memory, self._at[number], self._size[number])
 
 
-cdef int64_t _word(uint8_t[::1] memory, Py_ssize_t at) except -1:
+cdef inline int64_t _word(Span span, Py_ssize_t at) except -1:
     cdef uint32_t word = 0
-    memcpy(&word, _part(memory, at, 4), 4)  # little-endian, as the machine is (see `setup`)
+    memcpy(&word, _part(span, at, 4), 4)  # little-endian, like every machine that the appliance runs on
     return word
 
 
@@ -283,16 +345,18 @@ cdef class PumpedConnection:
 
     cdef readonly Pump pump
     cdef Traffic _traffic
-    cdef object _topic, _plain, _left
+    cdef Version _plain
+    cdef int64_t _version, _since, _ended
     cdef ModuleCall _module
+    cdef object _topic, _left
     cdef int _descriptor, _subscribers
     cdef int _to[_SUBSCRIBERS]
     cdef uint8_t _torn[_SMALL]
     cdef Py_ssize_t _kept
-    cdef bint _stepped
+    cdef bint _stepped, _crowd
 
     def arm(self, int descriptor, topic, subscribers, ModuleCall module, bytes torn) -> None:
-        """Let steps take the frames of `descriptor` to these subscribers' descriptors while `topic.plain` stays.
+        """Let steps take the frames of `descriptor` to these subscribers' descriptors while `topic.plain` does not change.
 
         The frames continue the incomplete frame `torn`.
         """
@@ -304,7 +368,9 @@ cdef class PumpedConnection:
         for one in subscribers:
             self._to[self._subscribers] = one
             self._subscribers += 1
-        self._descriptor, self._topic, self._plain, self._module = descriptor, topic, topic.plain, module
+        self._descriptor, self._topic, self._module = descriptor, topic, module
+        self._plain = topic.plain
+        self._version = self._plain.number
         self._traffic = topic.counters
 
     def disarm(self) -> bytes:
@@ -320,9 +386,9 @@ cdef class PumpedConnection:
         return self._is_armed()
 
     cdef bint _is_armed(self) except -1:
-        if self._topic is None or self._topic.plain is not self._plain:
+        if self._plain is None or self._plain.number != self._version:
             return False
-        return self._module is None or self._module._interceptor.preparation is self._module._preparation
+        return self._module is None or self._module._preparation.number == self._module._version
 
     def step(self) -> Left | None:
         """Perform a step, unless `Pump.wait` has just done so; return what is left to do (None: nothing)."""
@@ -334,59 +400,52 @@ cdef class PumpedConnection:
 
     cdef int64_t _step(self) except -1:
         """Perform a step; return the nanoseconds that it took. `_left` is what is left to do."""
-        cdef uint8_t[::1] area = self.pump._scratch()
-        cdef Py_ssize_t room = area.shape[0] - self._kept, got, end, size = 0, messages = 0, sent
-        cdef int64_t since
+        cdef Span area = self.pump._area
+        cdef Py_ssize_t got, end, size = 0, messages = 0, sent
         cdef int number
         self._stepped = True
-        got = recv(self._descriptor, _part(area, self._kept, room), room, MSG_DONTWAIT)
-        since = _now()
+        got = recv(self._descriptor, _part(area, self._kept, area.size - self._kept), area.size - self._kept, MSG_DONTWAIT)
+        self._since = self._ended = _now()
         if got <= 0:
             if got == 0 or errno != EAGAIN:
                 self._left = Left(_RECEIVED, 0 if got == 0 else -errno)
             return 0
         if self._kept:
-            memcpy(&area[0], self._torn, self._kept)
+            memcpy(_part(area, 0, self._kept), self._torn, self._kept)
         end, self._kept = self._kept + got, 0
         if (
             not _whole(area, end, &size, &messages)
             or size > _LARGE and not self._topic.keeps_large
-            or self._module is not None and not self._module._ready(area, since)
+            or self._module is not None and not self._module._ready(area, self._since)
         ):
             self._left = Left(_RECEIVED, end)
             return 0
-        judged = 0
         if self._module is not None and size:
-            judged = self._module._offset + since
-            if not self._judged(size, since):
-                self._left = Left(_JUDGED, end, size, messages, since / 1e9, judged, self._module._answer)
+            if not self._module._judge(size, self._since):
+                self._left = self._whole_left(_JUDGED, end, size, messages, self._module._answer(), 0, 0)
                 return 0
             self._module._keep()
         for number in range(self._subscribers if size else 0):
-            sent = send(self._to[number], &area[0], size, MSG_DONTWAIT | MSG_NOSIGNAL)
+            sent = send(self._to[number], _part(area, 0, size), size, MSG_DONTWAIT | MSG_NOSIGNAL)
             if sent != size:
                 sent = sent if sent >= 0 else -errno
-                self._left = Left(_SENT, end, size, messages, since / 1e9, judged, None, number, sent)
+                self._left = self._whole_left(_SENT, end, size, messages, None, number, sent)
                 return 0
         if end > size:
-            memcpy(self._torn, &area[size], end - size)
+            memcpy(self._torn, _part(area, size, end - size), end - size)
             self._kept = end - size
-        cdef int64_t took = _now() - since
+        self._ended = _now()
         self._traffic._add(messages, size)
         if self._subscribers and messages:
-            self._traffic._delay(took, messages)
-        return took
+            self._traffic._delay(self._ended - self._since, messages)
+        return self._ended - self._since
 
-    cdef bint _judged(self, Py_ssize_t size, int64_t since) except -1:
-        """Judge the frames; a defect of the module's code is left to Python, which reports it."""
-        try:
-            return self._module._judge(size, since)
-        except Exception as error:
-            self._module._answer = error
-            return False
+    cdef object _whole_left(self, kind, end, size, messages, answer, number, sent):
+        judged = 0 if self._module is None else self._module._offset + self._since
+        return Left(kind, end, size, messages, self._since / 1e9, judged, answer, number, sent)
 
 
-cdef bint _whole(uint8_t[::1] area, Py_ssize_t end, Py_ssize_t *size, Py_ssize_t *messages) except -1:
+cdef bint _whole(Span area, Py_ssize_t end, Py_ssize_t *size, Py_ssize_t *messages) except -1:
     """Find the whole frames in `area[:end]`; return whether they, and the rest, are small and not too many."""
     cdef Py_ssize_t need, at = 0
     while end - at >= 4:
@@ -405,9 +464,10 @@ cdef class Pump:
     """Waits for events of an epoll (`epoll`: its descriptor), and performs the steps of armed connections."""
 
     cdef int _epoll
-    cdef object _scratch_of, _area
-    cdef uint8_t[::1] _memory
+    cdef Span _area
+    cdef uint8_t[::1] _area_buffer
     cdef list _connections
+    cdef Py_ssize_t _known
     cdef epoll_event _events[_EVENTS]
     cdef readonly double began
     """When the step began to which the last result of `wait` belongs (seconds, `time.monotonic`); 0 without a step."""
@@ -415,18 +475,25 @@ cdef class Pump:
     def __init__(self, int epoll) -> None:
         self._epoll, self._connections = epoll, []
 
-    def connection(self, scratch) -> PumpedConnection:
-        """Return an unarmed connection that receives into `scratch.area`; all connections have the same scratch."""
+    def receive_into(self, uint8_t[::1] area) -> None:
+        """Receive into this area from the next step on."""
+        if area.shape[0] < 2 * _SMALL:
+            raise ValueError(f"a scratch area of {area.shape[0]} bytes is too small")
+        self._area_buffer, self._area = area, _span(area)
+
+    def connection(self) -> PumpedConnection:
+        """Return an unarmed connection."""
         cdef PumpedConnection made = PumpedConnection()
-        made.pump, self._scratch_of = self, scratch
+        made.pump = self
         return made
 
-    def put(self, int descriptor, entry) -> None:
-        """Set the connection whose events have this descriptor; `CROWD` for an epoll of others, None for no steps."""
+    def put(self, int descriptor, PumpedConnection entry) -> None:
+        """Set the connection whose events have this descriptor (None: no steps)."""
         if descriptor >= len(self._connections):
             if entry is None:
                 return
             self._connections += [None] * (descriptor + 1 - len(self._connections))
+            self._known = len(self._connections)
         self._connections[descriptor] = entry
 
     def wait(self, double longest, int most, bint steps) -> list:
@@ -444,32 +511,38 @@ cdef class Pump:
             if found == 1 and steps:
                 connection = self._alone()
                 if connection is not None:
-                    now = _now()
                     if connection._step() > _LITTLE or connection._left is not None:
-                        self.began = now / 1e9
+                        self.began = connection._since / 1e9
                         return [(connection._descriptor, EPOLLIN)]
                     connection._stepped = False
-                    now = _now()
+                    now = connection._ended
                     if now >= deadline:
                         return []
                     continue
             return [(self._events[number].data.fd, self._events[number].events) for number in range(found)]
 
+    def crowd(self, int descriptor) -> None:
+        """Look for connections in the epoll with this descriptor, too."""
+        cdef PumpedConnection crowd = self.connection()
+        crowd._crowd = True
+        self.put(descriptor, crowd)
+
     cdef PumpedConnection _alone(self):
         """Return the armed connection of the only event, if it is one."""
         cdef epoll_event inner[2]
         cdef epoll_event event = self._events[0]
-        entry = self._entry(event.data.fd)
-        if entry is CROWD and epoll_wait(event.data.fd, inner, 2, 0) == 1:
+        cdef PumpedConnection entry = self._entry(event.data.fd)
+        if entry is not None and entry._crowd and epoll_wait(event.data.fd, inner, 2, 0) == 1:
             event = inner[0]
             entry = self._entry(event.data.fd)
-        if event.events == EPOLLIN and isinstance(entry, PumpedConnection):
-            if (<PumpedConnection>entry)._is_armed():
-                return entry
+        if entry is not None and event.events == EPOLLIN and entry._is_armed():
+            return entry
         return None
 
-    cdef object _entry(self, Py_ssize_t descriptor):
-        return self._connections[descriptor] if descriptor < len(self._connections) else None
+    cdef PumpedConnection _entry(self, Py_ssize_t descriptor):
+        if descriptor >= self._known:
+            return None
+        return <PumpedConnection>PyList_GetItem(self._connections, descriptor)  # `put` takes no others
 
     cdef int _poll(self, int most, int64_t nanoseconds) except -1:
         """Wait for events, and return their number; 0 also after a signal."""
@@ -490,11 +563,3 @@ cdef class Pump:
             PyErr_CheckSignals()
             return 0
         return found
-
-    cdef uint8_t[::1] _scratch(self):
-        area = self._scratch_of.area
-        if area is not self._area:
-            if len(area) < 2 * _SMALL:
-                raise ValueError(f"a scratch area of {len(area)} bytes is too small")
-            self._memory, self._area = area, area
-        return self._memory
