@@ -6,9 +6,10 @@ the appliance) needs it, and a short time longer.
 
 Subscribers stay connected when the upstream is lost. Their publication stays valid until the control process withdraws
 it, which happens when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that
-closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are
-passed on whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with
-another type, md5sum, definition or latching flag, because they must read the new header.
+closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once.
+Subscribers are cut if the publisher returns with another type, md5sum, definition or latching flag, because they must
+read the new header. They are also cut if the publisher's connection ends within a large frame that is passed on in
+pieces (`large_frames`). All other frames are passed on whole.
 
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
@@ -30,6 +31,7 @@ from typing import Protocol
 from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
+from appliance.relay.connections.large_frames import FrameInPieces, PieceSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
@@ -41,7 +43,7 @@ _ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
-class TopicSubscriber(Protocol):
+class TopicSubscriber(PieceSubscriber, Protocol):
     """A subscriber, as its topic uses it."""
 
     host: str
@@ -52,9 +54,6 @@ class TopicSubscriber(Protocol):
 
     missed: bool
     """Whether its rate limit dropped the last message for it."""
-
-    behind_since: float | None
-    """When its queue first became so long that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
@@ -177,6 +176,7 @@ class RelayedTopic:
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = (
             None  # a batch, and the subscribers that still need it
         )
+        self._begun: FrameInPieces | None = None
         self._recording: RingStream | ExcludedStream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
@@ -263,7 +263,9 @@ class RelayedTopic:
         """
         if self._latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._recording is not None or self._startup_replay is not None or self._waits is not None:
+        if self._recording is not None or self._startup_replay is not None:
+            return None
+        if self._waits is not None or self._begun is not None:
             return None
         call = None
         if self.through is not None:
@@ -343,6 +345,9 @@ class RelayedTopic:
 
     def upstream_closed(self) -> None:
         """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            begun.tear(self._served)
         self._end_recording()
         self.hand_out(divided=False)
         self._latch(None)
@@ -387,6 +392,35 @@ class RelayedTopic:
         if behind:
             self._pause_or_trim()
         self.counters.delayed(self._clock() - since, batch.messages)
+
+    def takes_pieces(self, size: int) -> bool:
+        """Whether a frame of `size` bytes may be passed on in pieces (`large_frames`)."""
+        return (
+            self.through is None
+            and not (self._taps or self._latching or self.flow.limits)
+            and self._startup_replay is None
+            and self._waits is None
+            and (self._recording is None or not self._recording.keeps)
+            and 0 < len(self._served) <= _ROW
+            and all(member.ready_for(size) for member in self._each())
+        )
+
+    def pass_piece(self, piece: memoryview, left: int, since: float) -> None:
+        """Pass on a piece, received at `since`, of a frame of which `left` bytes are still to come."""
+        begun = self._begun
+        if begun is None:
+            begun = self._begun = FrameInPieces(self._each())
+        if begun.pass_on(piece, self._served):
+            self._pause_or_trim()
+        if left:
+            return
+        self._begun = None
+        if self._recording is not None:
+            self._recording.write(piece[:0], 1, self.counters.following)
+        self.counters.add(1, begun.size)
+        self._reported = False
+        if self._served:
+            self.counters.delayed(self._clock() - since, 1)
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         """Like `received`, for frames that were left for later."""

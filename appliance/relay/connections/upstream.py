@@ -49,7 +49,7 @@ class PublisherConnection(Upstream):
         self._limits = limits = context.limits
         self._weight = HeldBytes(context.memory.frames.of(topic.host))
         self._receiver = FrameReceiver(
-            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
+            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host), topic.takes_pieces
         )
         self._stall = StallDetector(limits.stall_seconds)
         self._pumped = context.loop.pump.connection()
@@ -322,6 +322,10 @@ class PublisherConnection(Upstream):
             if rest is not None or self._receiver.more or self._topic.undelivered:
                 self._since = since
                 self._continue(rest)
+            return
+        piece = self._receiver.take_piece()
+        if piece is not None:
+            self._topic.pass_piece(piece, self._receiver.left, since)
 
     def _continue(self, rest: Batch | None) -> None:
         """Process received data until the quantum is used up; read from the publisher only when all is processed."""

@@ -11,11 +11,15 @@ returns all whole frames after each read as one `Batch`, without copying them:
   queue has kept it. A larger area is anonymous memory, so a declared length that is never sent costs only address
   space. While memory is short, no area is reused.
 
-Frames are passed on whole: the data sent to subscribers always ends with a whole frame.
+- A large frame that is passed on in pieces (`connections/large_frames.py`) has no area: each piece is received into the
+  scratch area, and the last one ends with the frame.
+
+A batch always ends with a whole frame, so that other frames can follow it.
 """
 
 import mmap
 import struct
+from collections.abc import Callable
 from math import ceil, gcd
 from typing import Literal
 
@@ -28,6 +32,10 @@ SMALL = 4 << 10
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
+
+PIECE = 256 << 10
+"""The most bytes of a large frame that are passed on together; they stay in the processor's cache."""
+
 _KEEP_AREA = 8 << 20  # a camera image fits; new memory for each image costs four times all other work
 
 LITTLE = 8
@@ -165,9 +173,19 @@ class Scratch:
 
 
 class FrameReceiver:
-    """Receives frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver the batch."""
+    """Receives frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver the batch.
 
-    def __init__(self, scratch: Scratch, limit: int, share: HostMemory) -> None:
+    `passes(size)`: whether a large frame of this size is passed on in pieces. If it is, `received` returns None, and
+    `take_piece` returns the next piece.
+    """
+
+    def __init__(
+        self,
+        scratch: Scratch,
+        limit: int,
+        share: HostMemory,
+        passes: Callable[[int], bool] = lambda _size: False,
+    ) -> None:
         self._scratch = scratch
         self._limit = limit
         self._share = share
@@ -180,9 +198,18 @@ class FrameReceiver:
         self._idle = True
         self._unwalked: memoryview | None = None
         self._aside = 0
+        self._passes = passes
+        self._in_pieces = False  # whether the last frame was passed on in pieces
+        self._piece: memoryview | None = None
+        self.left = 0
+        """The bytes that are still to come of a frame that is passed on in pieces."""
 
     def buffer(self) -> memoryview:
         """Return the buffer for the next bytes of the connection."""
+        if self.left:
+            return self._scratch.area[: min(PIECE, self.left)]
+        if self._area is not None and not self._filled and self._passes(self._target):
+            self.abandon()
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
@@ -193,7 +220,7 @@ class FrameReceiver:
         if torn:
             scratch[: len(torn)] = torn
             return scratch[len(torn) :]
-        return scratch
+        return scratch[:PIECE] if self._in_pieces else scratch
 
     def received(self, count: int) -> Batch | None:
         """Take `count` received bytes in the buffer; return the frames that are now complete.
@@ -202,9 +229,18 @@ class FrameReceiver:
         and if the publisher's host has no memory left for an unfinished frame.
         """
         self._idle = False
+        if self.left:
+            self.left -= count
+            self._piece = self._scratch.area[:count]
+            return None
         if self._area is not None:
             return self._received_in_area(self._area, count)
-        return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
+        return self._walk(self._scratch.area, len(self._torn) + count, owned=False, whole=False)
+
+    def take_piece(self) -> memoryview | None:
+        """Return the piece that has just been received, if any; it is valid until the next call of `buffer`."""
+        piece, self._piece = self._piece, None
+        return piece
 
     def hand_over(self) -> bytes:
         """Return the incomplete frame, which the pump continues."""
@@ -251,8 +287,9 @@ class FrameReceiver:
 
     @property
     def small(self) -> bool:
-        """Whether the next bytes begin a frame or continue a small one, and no received frames are left."""
-        return self._area is None and self._unwalked is None and len(self._torn) <= SMALL
+        """Whether the next bytes probably begin or continue a small frame, and no received frames are left."""
+        large = self._area is not None or self._in_pieces or self.left
+        return not large and self._unwalked is None and len(self._torn) <= SMALL
 
     @property
     def unfinished(self) -> int:
@@ -271,6 +308,7 @@ class FrameReceiver:
         self._share.add(-self._aside)
         self._unwalked, self._aside = None, 0
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
+        self._piece, self.left = None, 0
 
     def _count(self, size: int) -> None:
         """Count the bytes that are held for this connection."""
@@ -278,9 +316,11 @@ class FrameReceiver:
             self._share.add(size - self._counted)
             self._counted = size
 
-    def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
-        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them."""
-        limit = self._limit
+    def _walk(self, buffer: memoryview, end: int, *, owned: bool, whole: bool = True) -> Batch | None:
+        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them.
+
+        Unless frames are needed `whole`, a large frame at the beginning may be passed on in pieces.
+        """
         need = 0
         stride, messages = equal_frames(buffer, end)
         position = stride * messages
@@ -301,9 +341,7 @@ class FrameReceiver:
             return Batch(buffer[:position], messages, last, owned=owned)
         if position < end:
             if position + 4 <= end and need > LARGE:
-                if need - 4 > limit:
-                    raise _too_long(need - 4, limit)
-                self._begin_area(need, buffer[position:end])
+                self._begin(need, buffer[position:end], whole=whole or messages > 0)
             else:
                 self._torn = bytes(buffer[position:end])
         if self._area is None and len(self._torn) != self._counted:
@@ -312,7 +350,17 @@ class FrameReceiver:
                 raise _no_memory()
         if not messages:
             return None
+        self._in_pieces = False
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
+
+    def _begin(self, need: int, start: memoryview, *, whole: bool) -> None:
+        """Begin a large frame of `need` bytes; `start` is the part received so far."""
+        if need - 4 > self._limit:
+            raise _too_long(need - 4, self._limit)
+        if whole or self._share.exhausted or not self._passes(need):
+            self._begin_area(need, start)
+        else:
+            self._in_pieces, self._piece, self.left = True, start, need - len(start)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
         """Continue a frame of `need` bytes in its own area; `start` is the part received so far."""
