@@ -5,9 +5,10 @@ A frame that is received whole has left the processor's cache when its first byt
 piece is in the scratch area, and goes to the subscribers before the next one is read.
 
 Invariants:
-- A frame is decided before its first byte is passed on. If anything needs the whole frame (a tap, a latching topic, the
-  recorder, a rate limit, a monitor, a subscriber that is behind), the frame is received whole before it is passed on.
-  Anything that comes into force during a frame applies from the next frame on.
+- A frame is decided before its first byte is passed on, by monitors with its first piece. If anything needs the whole
+  frame (a tap, a latching topic, the recorder, a rate limit, a monitor that reads on, a subscriber that is behind),
+  the frame is received whole before it is passed on. A frame that monitors drop is discarded while it arrives.
+- Anything that comes into force during a frame applies from the next frame on.
 - A frame goes to the subscribers that were ready at its beginning. A later subscriber gets the next frame first.
 - Each of them gets the frame whole, or its connection is closed: if its grant ends, if the publisher's connection ends
   within the frame, or if the subscriber's host has no memory left for its unsent bytes.
@@ -42,17 +43,17 @@ class PieceSubscriber(Protocol):
 class FrameInPieces:
     """One frame; `members` get its pieces as long as they are served."""
 
-    __slots__ = ("_members", "size")
+    __slots__ = ("members", "size")
 
     def __init__(self, members: Sequence[PieceSubscriber]) -> None:
-        self._members = members
+        self.members = members
         self.size = 0
 
     def pass_on(self, piece: memoryview, served: Container[PieceSubscriber]) -> bool:
         """Send the next piece; return whether a subscriber is behind."""
         batch, behind = Batch(piece, 0, None), False
         self.size += len(piece)
-        for member in self._members:
+        for member in self.members:
             if member in served:
                 member.extend(batch)
                 behind = behind or member.behind_since is not None
@@ -60,6 +61,6 @@ class FrameInPieces:
 
     def tear(self, served: Container[PieceSubscriber]) -> None:
         """End the frame, because its rest will not come."""
-        for member in self._members:
+        for member in self.members:
             if member in served:
                 member.tear(PUBLISHER_GONE)

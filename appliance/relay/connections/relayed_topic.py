@@ -39,6 +39,7 @@ from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 
+_WHOLE = 8  # messages that are received whole after one that monitors needed whole
 _ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
@@ -133,6 +134,9 @@ def _no_call() -> ModuleCall | None:
 Through = Callable[[Batch], Batch | None]
 """Passes frames through monitors; returns the frames that are passed on, or None."""
 
+Judge = Callable[[memoryview, int, int], bool | None]
+"""Decides a frame by its start, size and number: whether it is passed on, or None if monitors need the whole frame."""
+
 
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
@@ -194,6 +198,8 @@ class RelayedTopic:
         self._paused = False
         self._connected = False
         self.through: Through | None = None
+        self._judge: Judge | None = None
+        self._whole_until = 0  # the number of the next message that monitors may decide by its start
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
@@ -298,15 +304,15 @@ class RelayedTopic:
         through: Through | None,
         *,
         wanted: bool,
+        judge: Judge | None = None,
         call: Callable[[], ModuleCall | None] = _no_call,
     ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected for monitors even without a subscriber. `call` returns how the pump
-        passes small frames through them (None: it cannot now).
+        With `wanted`, the topic stays connected for monitors even without a subscriber. Without `judge`, monitors need
+        all frames whole. `call` returns how the pump passes small frames through them (None: it cannot now).
         """
-        self.through = through
-        self._call = call
+        self.through, self._judge, self._call = through, judge, call
         self.differs()
         if wanted == self._wanted:
             return
@@ -396,7 +402,10 @@ class RelayedTopic:
     def takes_pieces(self, size: int) -> bool:
         """Whether a frame of `size` bytes may be passed on in pieces (`large_frames`)."""
         return (
-            self.through is None
+            (
+                self.through is None
+                or (self._judge is not None and self.counters.following >= self._whole_until)
+            )
             and not (self._taps or self._latching or self.flow.limits)
             and self._startup_replay is None
             and self._waits is None
@@ -405,22 +414,35 @@ class RelayedTopic:
             and all(member.ready_for(size) for member in self._each())
         )
 
-    def pass_piece(self, piece: memoryview, left: int, since: float) -> None:
-        """Pass on a piece, received at `since`, of a frame of which `left` bytes are still to come."""
+    def pass_piece(self, piece: memoryview, left: int, since: float) -> bool:
+        """Pass on a piece, received at `since`, of a frame of which `left` bytes are still to come.
+
+        Return False for the first piece of a frame that monitors need whole.
+        """
         begun = self._begun
         if begun is None:
-            begun = self._begun = FrameInPieces(self._each())
+            passes = (
+                True
+                if self._judge is None
+                else self._judge(piece, len(piece) + left, self.counters.following)
+            )
+            if passes is None:
+                self._whole_until = self.counters.following + _WHOLE
+                return False
+            self._withheld = self._withheld or not passes
+            begun = self._begun = FrameInPieces(self._each() if passes else ())
         if begun.pass_on(piece, self._served):
             self._pause_or_trim()
         if left:
-            return
+            return True
         self._begun = None
         if self._recording is not None:
             self._recording.write(piece[:0], 1, self.counters.following)
         self.counters.add(1, begun.size)
         self._reported = False
-        if self._served:
+        if begun.members:
             self.counters.delayed(self._clock() - since, 1)
+        return True
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         """Like `received`, for frames that were left for later."""

@@ -34,7 +34,9 @@ LARGE = 128 << 10
 SCRATCH = 512 << 10
 
 PIECE = 256 << 10
-"""The most bytes of a large frame that are passed on together; they stay in the processor's cache."""
+"""The bytes of a large frame that are passed on together; they stay in the processor's cache."""
+
+_START = 8 << 10  # the least bytes of the first piece, because monitors decide by them
 
 _KEEP_AREA = 8 << 20  # a camera image fits; new memory for each image costs four times all other work
 
@@ -207,7 +209,7 @@ class FrameReceiver:
     def buffer(self) -> memoryview:
         """Return the buffer for the next bytes of the connection."""
         if self.left:
-            return self._scratch.area[: min(PIECE, self.left)]
+            return self._scratch.area[: PIECE if self.left > PIECE + LARGE else self.left]
         if self._area is not None and not self._filled and self._passes(self._target):
             self.abandon()
         if self._area is not None:
@@ -258,6 +260,11 @@ class FrameReceiver:
         self._idle, self._torn = False, bytes(area[size:end])
         self._count(len(self._torn))
         return Batch(area[:size], messages, None)
+
+    def gather(self, start: memoryview) -> None:
+        """Receive a frame whole after all; `start` is its first piece."""
+        self._begin_area(len(start) + self.left, start)
+        self.left = 0
 
     @property
     def more(self) -> bool:
@@ -359,6 +366,8 @@ class FrameReceiver:
             raise _too_long(need - 4, self._limit)
         if whole or self._share.exhausted or not self._passes(need):
             self._begin_area(need, start)
+        elif len(start) < _START:
+            self._torn = bytes(start)
         else:
             self._in_pieces, self._piece, self.left = True, start, need - len(start)
 
