@@ -37,6 +37,25 @@ def open_alarms(status: Status) -> list[Alarm]:
     return sorted(alarms, key=lambda alarm: _ORDER.index(alarm.severity))
 
 
+def activity(status: Status) -> list[Alarm]:
+    """Return warnings for the denials and drops of the last minute. They are not faults of the appliance."""
+    recent = status.last_minute
+    found = [
+        Alarm(
+            kind=f"drops:{name}",
+            severity="warning",
+            text=f"{name} dropped {drops} {'message' if drops == 1 else 'messages'} in the last minute;"
+            " rosrv audit search --event 'message dropped' --since 1m",
+            about="monitors",
+        )
+        for name, drops in sorted(recent.drops.items())
+    ]
+    if recent.denials >= recent.attention_at:
+        text = f"{recent.denials} denials in the last minute; rosrv audit summary --since 1m"
+        found.insert(0, Alarm(kind="denials", severity="warning", text=text, about="audit"))
+    return found
+
+
 def _system(status: Status) -> Iterator[_Condition]:
     audit, forwarding = status.audit, status.audit.forwarding
     if audit.failed is not None:

@@ -14,7 +14,7 @@ from fastapi import Query, Request, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from appliance.api.access import Bearer
-from appliance.api.alarms import Alarm, open_alarms
+from appliance.api.alarms import Alarm, activity, open_alarms
 from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, LastSample, Sample
 from appliance.api.moments import in_full
@@ -116,7 +116,7 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
 def _state_event(seen: LastSample) -> ServerSentEvent:
     if seen.status is None or seen.sample is None:
         return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
-    now = _Now(seen.status, open_alarms(seen.status), seen.sample)
+    now = _Now(seen.status, [*open_alarms(seen.status), *activity(seen.status)], seen.sample)
     return ServerSentEvent(event="now", data=msgspec.json.encode(in_full(now)).decode())
 
 

@@ -12,7 +12,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from appliance.api.alarms import open_alarms
+from appliance.api.alarms import activity, open_alarms
 from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
@@ -90,8 +90,9 @@ def _look(appliance: Appliance) -> StatusView:
 
 def _view(body: Status) -> StatusView:
     troubles = list(troubles_of(body))
-    fields = {**in_full(body), "troubles": troubles}
-    return StatusView(1 if troubles else 0, StatusScreen(body, troubles), fields)
+    attention = [alarm.text for alarm in activity(body)]
+    fields = {**in_full(body), "troubles": troubles, "attention": attention}
+    return StatusView(1 if troubles else 0, StatusScreen(body, troubles, attention), fields)
 
 
 def troubles_of(body: Status) -> list[str]:
@@ -105,15 +106,18 @@ def troubles_of(body: Status) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatusScreen:
-    """A status as text, problems first; its tables have the width of the terminal."""
+    """A status as text, problems first, then recent denials and drops; its tables have the width of the terminal."""
 
     body: Status
     troubles: list[str]
+    attention: list[str]
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield its parts."""
         for trouble in shortened(self.troubles, _MOST_TROUBLES):
             yield Text(f"! {trouble}", style=_RED)
+        for line in shortened(self.attention, _MOST_TROUBLES):
+            yield Text(f"attention: {line}", style=_YELLOW)
         yield _grid(self.body)
         yield processes_table(self.body.processes, options.max_width)
 

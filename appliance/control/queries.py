@@ -23,6 +23,7 @@ from appliance.channel.answers.status import (
     AuditState,
     BlocksState,
     ClockState,
+    MinuteState,
     PolicyState,
     RecorderState,
     Status,
@@ -161,6 +162,7 @@ class Queries:
 
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
+        meter = self.trail.meter
         # The appliance's own nodes are not counted; the graph leaves them out also.
         lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
         named = {
@@ -195,6 +197,7 @@ class Queries:
             recorder=self.recorder(),
             switched_off=self.switched_off(),
             blocks=self.blocks(),
+            last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
         )
 
     def _policy(self) -> PolicyState:

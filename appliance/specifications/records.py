@@ -44,6 +44,8 @@ class MonitorRecords:
         for event in events:
             for monitor in _monitors(event):
                 self.counts[event.kind, monitor] += event.count or 1
+                if event.kind == "drop":
+                    self.trail.meter.dropped.add(monitor, event.count or 1)
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from appliance.channel.messages import DELAY_BOUNDS
+from appliance.telemetry.last_minute import LastMinute
 
 BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)  # seconds
 
@@ -154,16 +155,23 @@ class Histogram:
 
 
 class Meter:
-    """The counters of RVMaster's events since its start."""
+    """The counters of RVMaster's events since its start, and of the last minute.
+
+    `denied` has the denials by category, `dropped` the messages that monitors dropped by monitor.
+    """
 
     def __init__(self) -> None:
         self.decisions: Counter[tuple[str, str]] = Counter()
         self.decision_seconds = Histogram()
         self.calls: dict[str, Histogram] = {}
+        self.denied = LastMinute()
+        self.dropped = LastMinute()
 
     def decided(self, category: str, outcome: str, seconds: float) -> None:
         """Count a decision."""
         self.decisions[category, outcome] += 1
+        if outcome == "deny":
+            self.denied.add(category)
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:

@@ -180,6 +180,14 @@ class BlocksState(msgspec.Struct, frozen=True):
     first_end: Annotated[Moment | None, doc("when the first block ends; null: none ends without an order")]
 
 
+class MinuteState(msgspec.Struct, frozen=True):
+    """The last minute's denials and drops. From `attention_at` denials on, an operator should look at them."""
+
+    denials: Annotated[int, doc("decisions to deny; `would deny` is not counted")]
+    drops: Annotated[dict[str, int], doc("messages that monitors dropped, by monitor")]
+    attention_at: Annotated[int, doc("the least number of denials that needs attention")] = 10
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -209,3 +217,4 @@ class Status(msgspec.Struct, frozen=True):
     recorder: Annotated[RecorderState | None, doc("null: nothing is recorded")] = None
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
     blocks: BlocksState = BlocksState(0, None)
+    last_minute: MinuteState = MinuteState(0, {})

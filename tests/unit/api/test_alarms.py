@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.api.alarms import open_alarms
+from appliance.api.alarms import activity, open_alarms
 from appliance.channel.answers.status import Status
 from tests.support.answers import example
 
@@ -92,3 +92,23 @@ def test_the_gravest_come_first() -> None:
     """Alarms come before warnings, and warnings before notices."""
     status = changed("policy.differs_from_file", True, relay="away", rosmaster="being rebuilt")
     assert [one.severity for one in open_alarms(status)] == ["alarm", "warning", "notice"]
+
+
+def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:
+    """Each monitor that dropped messages gives a warning, and so do enough denials; neither is a fault."""
+    recent = {"denials": 9, "drops": {"zone": 2, "limit": 1}, "attention_at": 10}
+    status = example(Status, **GOOD, last_minute=recent)
+    drops = [
+        "limit dropped 1 message in the last minute; rosrv audit search --event 'message dropped' --since 1m",
+        "zone dropped 2 messages in the last minute; rosrv audit search --event 'message dropped' --since 1m",
+    ]
+    assert [(alarm.severity, alarm.text, alarm.about) for alarm in activity(status)] == [
+        ("warning", text, "monitors") for text in drops
+    ]
+    many = activity(example(Status, **GOOD, last_minute=recent | {"denials": 10}))
+    assert (many[0].kind, many[0].about) == ("denials", "audit")
+    assert [alarm.text for alarm in many] == [
+        "10 denials in the last minute; rosrv audit summary --since 1m",
+        *drops,
+    ]
+    assert open_alarms(status) == []

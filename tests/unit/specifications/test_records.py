@@ -31,6 +31,7 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     records.reported([event] * 2, lost=0)
     settle(log)
     assert records.counts == {(kind, "gun"): 2}
+    assert records.trail.meter.dropped.counts() == ({"gun": 2} if kind == "drop" else {})
     found = [
         entry.record
         for entry in export(tmp_path / "audit.db", Filter())

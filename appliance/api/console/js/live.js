@@ -9,7 +9,7 @@ const HOUR = 3600;
 /**
  * @typedef {{time: number, allowed: number, denied: number, messages: number, bytes: number, dropped: number,
  *   nodes: number, monitors: Record<string, number[]>}} Sample
- * @typedef {{kind: string, severity: "alarm" | "warning" | "notice", text: string, about: string, to?: string}} Alarm
+ * @typedef {{kind: string, severity: "alarm" | "warning" | "notice", text: string, about: string}} Alarm
  */
 
 export const live = createStore({

@@ -7,13 +7,14 @@ import { Given } from "../parts/given.js";
 import { Empty, Loading } from "../parts/notice.js";
 import { Link } from "../router.js";
 
-const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning" };
+const PLACES = { policy: "/console/policy", monitors: "/console/monitors", hosts: "/console/hosts", audit: "/console/audit", system: "/console/audit?severity=warning", denials: "/console/audit?decision=deny&since=1h" };
 const SEEN = "rosrv.reviewed";
 const MOST = 8;
 
-/** The page about an alarm. @param {import("../live.js").Alarm} alarm */
+/** The page about an alarm, by its kind or subject. @param {import("../live.js").Alarm} alarm */
 export function placeOf(alarm) {
-  return alarm.to ?? PLACES[/** @type {keyof typeof PLACES} */ (alarm.about)];
+  const places = /** @type {Record<string, string>} */ (PLACES);
+  return places[alarm.kind] ?? places[alarm.about];
 }
 
 export function Alarms(/** @type {{alarms: any[], incidents: any[] | null}} */ { alarms, incidents }) {

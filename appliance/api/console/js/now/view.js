@@ -13,15 +13,14 @@ import { Link } from "../router.js";
 import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
-import { activity, droppedByMonitors } from "./activity.js";
 import { Doings, Refusals } from "./lists.js";
 
 const SPAN = 900;
+const DROPS = 1; // index in the counts of a monitor: verdicts, drops, changes, faults
 
 export function Now() {
   const status = useStore(live, (one) => one.status);
-  const conditions = useStore(live, (one) => one.alarms);
-  const samples = useStore(live, (one) => one.samples);
+  const alarms = useStore(live, (one) => one.alarms);
   const incidents = useStore(notable, (one) => one.incidents);
   const now = useNow(5000);
   useKeys((key) => {
@@ -33,7 +32,6 @@ export function Now() {
     return true;
   });
   if (!status) return html`<div class="head"><h1>Now</h1></div><section class="panel"><${Loading} /></section>`;
-  const alarms = [...conditions, ...activity(samples)];
   return html`<div class="head"><h1>Now</h1><span class="head-sub">running for ${lasting(now / 1000 - status.since)}</span></div>
     <${Health} status=${status} alarms=${alarms} />
     <div class="now-grid">
@@ -72,6 +70,10 @@ function Curves() {
       <div><h3>Decisions</h3><${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("denied", "c2", (one) => one.denied)]} /></div>
       <div><h3>Messages through the relay</h3><${Plot} label="Messages" span=${SPAN} series=${[series("relayed", "c3", (one) => one.messages), series("dropped by monitors", "c2", droppedByMonitors), series("missed by slow subscribers", "c4", (one) => one.dropped)]} /></div>
     </div></section>`;
+}
+
+function droppedByMonitors(/** @type {import("../live.js").Sample} */ sample) {
+  return Object.values(sample.monitors).reduce((sum, counts) => sum + counts[DROPS], 0);
 }
 
 function Processes(/** @type {{status: any}} */ { status }) {

@@ -1,0 +1,39 @@
+"""Tests of `appliance.telemetry.last_minute`."""
+
+from appliance.telemetry.last_minute import LastMinute
+from appliance.telemetry.metrics import Meter
+
+
+def test_only_the_last_minute_counts() -> None:
+    """Events of 60 seconds are summed by name; older ones no longer count, with or without new events."""
+    now = 100.2
+    counted = LastMinute(lambda: now)
+    counted.add("publish", 5)
+    counted.add("node")
+    now = 130.0
+    counted.add("publish")
+    assert counted.counts() == {"publish": 6, "node": 1}
+    now = 159.9
+    assert counted.counts() == {"publish": 6, "node": 1}
+    now = 160.0
+    assert counted.counts() == {"publish": 1}
+    now = 1000.0
+    assert counted.counts() == {}
+
+
+def test_a_flood_holds_a_minute_of_seconds() -> None:
+    """An hour of events leaves the counts of its last minute."""
+    now = 0.0
+    counted = LastMinute(lambda: now)
+    for second in range(3600):
+        now = float(second)
+        counted.add("publish", 2)
+    assert counted.counts() == {"publish": 120}
+
+
+def test_only_denials_count_as_denied() -> None:
+    """An allowed request and one that only would be denied are not denials."""
+    meter = Meter()
+    for outcome in ("deny", "allow", "would deny", "deny"):
+        meter.decided("publish", outcome, 0.001)
+    assert meter.denied.counts() == {"publish": 2}
