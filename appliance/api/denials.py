@@ -41,6 +41,11 @@ def asked_of(record: AuditRecord) -> DecidedRequest:
         raise UngrantableError("it is not a record of a decision about a host's call")
     if isinstance(what, str):
         raise UngrantableError(f"no change of the policy would allow it: {what}")
+    if record.rule is None and record.reason.startswith(f"{record.host} is blocked by "):  # `Policy.blocked`
+        raise UngrantableError(
+            "an operator's block denied it, not the policy; if the block is still in force (rosrv host blocks),"
+            f" lift it: rosrv host unblock {record.host}"
+        )
     return what(record)
 
 

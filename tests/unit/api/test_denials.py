@@ -1,17 +1,20 @@
 """Every denial names the smallest change of the policy that would allow it, or why no change would."""
 
 import ipaddress
+from dataclasses import replace
 from typing import get_args, get_type_hints
 
+import msgspec
 import pytest
 
 from appliance.api.denials import DENIALS, asks_policy, is_denial
-from appliance.api.dry_run_policy import explained
+from appliance.api.dry_run_policy import explained, granted
 from appliance.audit.events import EVENTS
 from appliance.audit.record import AuditRecord, RuleReference
 from appliance.channel.answers.policy_answers import PolicyKnown, Why
 from appliance.channel.messages.relay_link import Violation
 from appliance.master.graph.graph import revocation
+from appliance.policy.grant import UngrantableError
 from appliance.policy.live_rights import LiveRight, may_keep
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_settings import AT_ONCE
@@ -161,3 +164,31 @@ def test_repetitions_and_limits() -> None:
     assert "record 7" in why(denied("denials folded", detail=one | {"scope": "all"})).refusal
     rule = RuleReference("Limits", "/x", "p.ini", 9)
     assert "[Limits] /x p.ini:9" in why(denied("rate limited", rule=rule, decision=None)).refusal
+
+
+@pytest.mark.parametrize("lifted", [False, True])
+@pytest.mark.parametrize("event", ["decision", "revoked", "denials folded"])
+def test_a_block_is_lifted_and_no_policy_is_changed(event: str, *, lifted: bool) -> None:
+    """The denial of a blocked host names the command that lifts the block, also after the block was lifted."""
+    host = ipaddress.ip_address(HOST)
+    blocks = {host: "blocked by ann until noon: odd; lift it with `rosrv host unblock 10.0.0.9`"}
+    live = LiveRight(host, "/it", "registerPublisher", "/x")
+    decision = may_keep(replace(compile_policy(CLOSED, file="p.ini"), blocks=blocks), live)
+    kind = {"scope": "kind", "of": "decision", "recorded_id": "7"}
+    record = denied(event, decision.reason, rule=rule_reference(decision.rule), detail=kind)
+    current = known() if lifted else msgspec.structs.replace(known(), blocks={HOST: blocks[host]})
+    assert not asks_policy(record)
+    found = explained(record, current)
+    assert (found.grant, allowing(found)) == (None, [])
+    assert found.refusal.endswith(": rosrv host unblock 10.0.0.9")
+    with pytest.raises(UngrantableError, match=f"rosrv host unblock {HOST}$"):
+        granted(record, current)
+
+
+def test_a_name_like_a_block_is_not_a_block() -> None:
+    """Only a denial without a rule, for the record's own host, is a block."""
+    for reason, rule in (
+        ("10.0.0.1 is blocked by ann", None),
+        (f"{HOST} is blocked by ann", RuleReference("Publishers", "/x", "p.ini", 4)),
+    ):
+        assert asks_policy(denied("decision", reason, rule=rule))
