@@ -22,6 +22,7 @@ from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.filter import filtered
+from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.record_table import (
     line,
     print_entries,
@@ -95,7 +96,7 @@ def tail(
 @speaks_with(_Json)
 def show(
     appliance: Appliance,
-    record_id: Annotated[str, typer.Argument(metavar="ID", help="Id or sequence number of the record")],
+    record: RecordArgument,
     neighbours: Annotated[
         int, typer.Option("--neighbours", min=0, max=1000, help="Records to show around it")
     ] = 5,
@@ -105,13 +106,13 @@ def show(
     Example: rosrv audit show 18e9aa02efc40abb0e51
     """
     with Errors():
-        shown = appliance.audit().show(record_id, neighbours)
+        shown = appliance.audit().show(record, neighbours)
         if shown is None:
-            fail(f"no record in the log has the id {record_id!a}; list them: rosrv audit search", 1)
+            fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
         if appliance.as_json:
             around = {
-                "before": [as_object(record) for record in shown.before],
-                "after": [as_object(record) for record in shown.after],
+                "before": [as_object(one) for one in shown.before],
+                "after": [as_object(one) for one in shown.after],
             }
             write(json.dumps(as_object(shown.entry) | {"neighbours": around}))
         else:

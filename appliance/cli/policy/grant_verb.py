@@ -11,6 +11,7 @@ from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.audit.audit_errors import Errors, fail
+from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
@@ -20,10 +21,7 @@ from rosmop.tool.terminal import printable, say
 
 
 @speaks
-def why(
-    appliance: Appliance,
-    record: Annotated[str, typer.Argument(metavar="RECORD", help="Id or sequence number of the record")],
-) -> None:
+def why(appliance: Appliance, record: RecordArgument) -> None:
     """Explain a record: its sender, events, values, line and recording, and the rule that would allow a denied request.
 
     The listed events alone lead to a monitor's verdict. The appliance may be stopped; only the rule that would allow a
@@ -63,9 +61,7 @@ def _explained(appliance: Appliance, record: str) -> Why:
 @speaks
 def grant(
     appliance: Appliance,
-    record: Annotated[
-        str, typer.Argument(metavar="RECORD", help="Id or sequence number of a denied request's record")
-    ],
+    record: RecordArgument,
     *,
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
