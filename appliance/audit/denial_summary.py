@@ -5,7 +5,8 @@ Invariants:
 1. A record counts as often as its event happened, so the summary of repetitions counts as their number.
 2. A summary of repetitions that covers many hosts counts for the hosts that it names; the rest is `OTHERS`.
 3. Memory and time are bounded. The newest `MOST_RECORDS` records are read. The oldest hosts beyond `_MOST_HOSTS`, and
-   the reasons and callers of a host beyond `_MOST_NAMES`, are counted together as `OTHERS`.
+   the reasons and callers of a host beyond `_MOST_NAMES`, are counted together as `OTHERS`. Decisions about calls have
+   their own limit, so the noise of a port scan does not hide them.
 4. No reason has contents of messages. Reasons that differ only in numbers are counted together, under the newest text.
 5. Rights that a new policy or a block revoked are not counted, because the host attempted nothing.
 """
@@ -61,9 +62,16 @@ class HostDenials(msgspec.Struct, frozen=True):
     count: Annotated[int, msgspec.Meta(description="number of denials, with those that a record only counts")]
     first: _Time
     last: _Time
-    reasons: Annotated[list[CountedName], msgspec.Meta(description="at most three, the most frequent first")]
+    reasons: Annotated[
+        list[CountedName],
+        msgspec.Meta(
+            description="at most three, the most frequent first; decisions about calls before all others, such as"
+            " malformed data"
+        ),
+    ]
     callers: Annotated[list[CountedName], msgspec.Meta(description="at most five, the most frequent first")]
     more_callers: Annotated[int, msgspec.Meta(description="number of further callers")]
+    more_reasons: Annotated[int, msgspec.Meta(description="number of further reasons")] = 0
 
 
 class DenialSummary(msgspec.Struct, frozen=True):
@@ -86,6 +94,8 @@ class _HostCounts:
     first: int
     last: int
     count: int = 0
+    decisions: Counter[str] = field(default_factory=Counter)
+    """The rules and reasons of decisions about calls; `reasons` has all others."""
     reasons: Counter[str] = field(default_factory=Counter)
     texts: dict[str, str] = field(default_factory=dict)
     """The newest text of each reason without numbers."""
@@ -116,7 +126,7 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
             break
         record = without_contents(entry).record
         last = record.time
-        if _is_revocation(record):
+        if _event_of(record) == "revoked":
             continue
         for host, count in _hosts_of(record):
             _count(hosts, host, count, record)
@@ -131,8 +141,9 @@ def summarised(denials: Iterable[LogEntry], limit: int) -> DenialSummary:
     )
 
 
-def _is_revocation(record: AuditRecord) -> bool:
-    return (record.detail.get("of") if record.event in FOLDED else record.event) == "revoked"
+def _event_of(record: AuditRecord) -> object:
+    """Return the event of a record, or the event whose repetitions it counts."""
+    return record.detail.get("of") if record.event in FOLDED else record.event
 
 
 def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
@@ -159,10 +170,11 @@ def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditR
         counts = hosts[host] = _HostCounts(first, last)
     counts.count += number
     counts.first, counts.last = min(counts.first, first), max(counts.last, last)
+    reasons = counts.decisions if _event_of(record) == "decision" else counts.reasons
     for reason, count in _reasons(record, number):
         key = _without_numbers(reason)
-        _tally(counts.reasons, key, count)
-        if key in counts.reasons:
+        _tally(reasons, key, count)
+        if key in reasons:
             counts.texts.setdefault(key, reason)
     for caller, count in _callers(record, number):
         _tally(counts.callers, caller, count)
@@ -201,15 +213,14 @@ def _tally(counts: Counter[str], name: str, number: int) -> None:
 
 
 def _shown(host: str, counts: _HostCounts) -> HostDenials:
+    reasons = [*counts.decisions.most_common(), *counts.reasons.most_common()]
     return HostDenials(
         host,
         counts.count,
         rfc3339(counts.first),
         rfc3339(counts.last),
-        [
-            CountedName(counts.texts.get(reason, reason), count)
-            for reason, count in counts.reasons.most_common(_SHOWN_REASONS)
-        ],
+        [CountedName(counts.texts.get(reason, reason), count) for reason, count in reasons[:_SHOWN_REASONS]],
         [CountedName(*one) for one in counts.callers.most_common(_SHOWN_CALLERS)],
         max(0, len(counts.callers) - _SHOWN_CALLERS),
+        max(0, len(reasons) - _SHOWN_REASONS),
     )

@@ -32,8 +32,8 @@ def summarise(
 ) -> None:
     """Show the denials of each host: number, first and last time, callers, the three most frequent rules or reasons.
 
-    Hosts with the most denials come first. Repetitions that the log only counts are included with their number.
-    Times are UTC.
+    Hosts with the most denials come first, and decisions about calls before malformed data and other reasons.
+    Repetitions that the log only counts are included with their number.
 
     Example: rosrv audit summary --since 1h
     """
@@ -55,13 +55,15 @@ def _lines(found: DenialSummary) -> Iterator[str]:
         yield f"{row.host:<{width}}  {counted(row.count, 'denial')}, {_span(row)}{_callers(row)}"
         for reason in row.reasons:
             yield f"{reason.count:>8}  {_cut(reason.name)}"
+        if row.more_reasons:
+            yield f"{'':>8}  and {counted(row.more_reasons, 'other reason')}"
     if found.more_hosts:
         yield (
             f"and {counted(found.more_hosts, 'more host')} with {counted(found.more_denials, 'denial')}: --limit"
             f" {min(LARGEST_SUMMARY, len(found.hosts) + found.more_hosts)}"
         )
     if found.counted_since is not None:
-        earlier = found.counted_since.partition(".")[0] + "Z"
+        earlier = found.counted_since[:_SECONDS] + "Z"
         yield f"earlier records were not counted, as there are too many: --until {earlier}"
 
 
@@ -71,7 +73,7 @@ def _span(row: HostDenials) -> str:
 
 
 def _second(time: str) -> str:
-    return time.replace("T", " ")[:_SECONDS]
+    return time.replace("T", " ")[:_SECONDS] + "Z"
 
 
 def _callers(row: HostDenials) -> str:

@@ -71,6 +71,25 @@ def test_the_host_with_the_most_denials_is_first() -> None:
     assert second.callers == [CountedName("/a", 6), CountedName("/b", 1)]
 
 
+def test_decisions_come_before_the_noise_of_a_port_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few denied calls are shown before frequent and varied malformed data, and the number of other reasons."""
+    monkeypatch.setattr(denial_summary, "_MOST_NAMES", 8)
+    noise = [
+        denial(at, reason=f"{word} is not HTTP", event="malformed")
+        for word in "abcdefghijkl"
+        for at in range(9)
+    ]
+    folded_noise = folded(KIND, "10.0.0.1", 99, of="malformed", reasons={"x is not HTTP": 99})
+    calls = folded(KIND, "10.0.0.1", 3, of="decision", reasons={"no rule for /arm": 3})
+    [row] = of(denial(1, rule=RULE), calls, *noise, folded_noise).hosts
+    assert [(one.name, one.count) for one in row.reasons] == [
+        ("no rule for /arm", 3),
+        ("[Publishers] /cmd_* robot.ini:12", 1),
+        ("x is not HTTP", 99),
+    ]
+    assert row.more_reasons == 8
+
+
 def test_revoked_rights_are_not_counted() -> None:
     """A blocked robot is not listed as an attacker; that repetitions are counted together changes nothing."""
     revoked = msgspec.structs.replace(denial(1), event="revoked")
@@ -139,7 +158,7 @@ def test_no_reason_has_contents_of_messages() -> None:
 
 
 def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
-    """It counts the same records as `--deny`, in the same time; a folded flood counts with its number."""
+    """It reads the records of `--deny`, in the same time; a folded flood counts with its number."""
     log = make_log()
     for _ in range(30):
         log.record(decision(log, decision="deny", host="10.0.0.1", caller_id="/flood", resource="/x"))
