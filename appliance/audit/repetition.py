@@ -150,14 +150,14 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     if recovered:
         detail["recovered"] = True
     passed = state.folds
-    what = "further records of a host beyond its share" if passed else "further denials of many kinds"
+    what = "further record{} of a host beyond its share" if passed else "further denial{} of many kinds"
     return AuditRecord(
         id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,
         decision=state.decision, host=None if state.scope in (ALL_UNKNOWN, ALL) else state.host,
         caller_id=state.caller_id if exact else None, category=state.category if exact else None,
         resource=state.resource if exact else None, rule=state.rule if exact else None, revision=state.revision,
-        reason=state.reason if exact else f"{state.count} {what}", duration_us=None, detail=detail,
-        unknown=state.scope in (UNKNOWN, ALL_UNKNOWN),
+        reason=state.reason if exact else f"{state.count} {what.format('' if state.count == 1 else 's')}",
+        duration_us=None, detail=detail, unknown=state.scope in (UNKNOWN, ALL_UNKNOWN),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.audit.folding import FoldSettings, RecordFolder
 from appliance.audit.record import AuditRecord, RuleReference
-from appliance.audit.repetition import ALL_UNKNOWN, HOST, UNKNOWN, new_state
+from appliance.audit.repetition import ALL_UNKNOWN, HOST, UNKNOWN, new_state, summary
 from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
@@ -63,6 +63,22 @@ def test_summaries_continue_with_the_repetitions() -> None:
     assert len(folder) == 0
     again = denial()
     assert offer(folder, again, now=31) == [again]
+
+
+def test_the_reason_of_a_summary_counts_in_english() -> None:
+    """One denial or record is singular, more are plural."""
+    reasons = []
+    for folds in (False, True):
+        state = new_state(denial(folds=folds), HOST)
+        for _ in range(2):
+            state.count_in(denial())
+            reasons.append(summary(state, "s", 1).reason)
+    assert reasons == [
+        "1 further denial of many kinds",
+        "2 further denials of many kinds",
+        "1 further record of a host beyond its share",
+        "2 further records of a host beyond its share",
+    ]
 
 
 def test_a_summary_has_no_author_if_none_is_known() -> None:
