@@ -9,7 +9,6 @@ from pathlib import Path
 
 import msgspec
 from rich.console import Console
-from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -23,22 +22,21 @@ from appliance.evidence.export_verification import ExportVerification
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
 _SECONDS, _MILLISECONDS = 19, 23  # characters of a time
 _DATE = 11
-_TABLE_WIDTH = 140  # a narrower terminal has no room for the reasons in a column
+_LEAST_WHY = 40  # characters; with less room for the reasons in a column, they are below the records
+_COLUMNS = ("record", "time (UTC)", "decision", "event", "who", "what", "why")
+_GAP = 2
 
 
 def print_entries(entries: list[LogEntry], *, each: bool = False) -> None:
     """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line.
 
-    The rows are a table, or on a narrow terminal a line each, with the reason below it.
+    The rows are a table. If the terminal is too narrow for its names, the reason of each row is below it.
     """
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
+        cells = [(Text(str(row.first.sequence)), Text(_times(row)), *_cells(row)) for row in rows]
         console = Console(highlight=False)
-        if console.width < _TABLE_WIDTH:
-            for row in rows:
-                console.print(*_lines(row), sep="\n")
-        else:
-            console.print(_table(rows))
+        console.print(_table(cells) if _has_room(cells, console.width) else _below(cells))
     else:
         for entry in entries:
             write(line(entry))
@@ -158,25 +156,34 @@ def write(text: str) -> None:
     sys.stdout.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")
 
 
-def _table(rows: list[EqualRecords]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("record", no_wrap=True, justify="right")
-    table.add_column("time (UTC)", no_wrap=True)
-    table.add_column("decision", no_wrap=True)
-    for name in ("event", "who", "what", "why"):
-        table.add_column(name, overflow="fold")
+def _has_room(rows: list[tuple[Text, ...]], width: int) -> bool:
+    """Whether a table of this width has room for the reasons beside the longest names."""
+    columns = list(zip(map(Text, _COLUMNS), *rows, strict=True))[:-1]
+    names: int = sum(max(cell.cell_len for cell in column) + _GAP for column in columns)
+    return names + _LEAST_WHY <= width
+
+
+def _table(rows: list[tuple[Text, ...]]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, _GAP, 0, 0))
+    for name in _COLUMNS:
+        table.add_column(
+            name, overflow="fold", no_wrap=name != "why", justify="right" if name == "record" else "left"
+        )
     for row in rows:
-        table.add_row(str(row.first.sequence), _times(row), *_cells(row))
+        table.add_row(*row)
     return table
 
 
-def _lines(row: EqualRecords) -> Iterator[Text | Padding]:
-    """Yield a row for a narrow terminal: what happened, then the reason, indented."""
-    *cells, why = _cells(row)
-    head = Text("  ").join(cell for cell in cells if cell.plain)
-    yield Text.assemble((str(row.first.sequence), "bold"), "  ", _times(row), "  ", head)
-    if why.plain:
-        yield Padding(why, (0, 0, 0, 4))
+def _below(rows: list[tuple[Text, ...]]) -> Table:
+    """Return the rows for a narrow terminal: record and event, then the reason, all beside the number."""
+    grid = Table.grid(padding=(0, _GAP, 0, 0))
+    grid.add_column(no_wrap=True, justify="right", style="bold")
+    grid.add_column(overflow="fold")
+    for number, *cells, why in rows:
+        grid.add_row(number, Text("  ").join(cell for cell in cells if cell.plain))
+        if why.plain:
+            grid.add_row("", why)
+    return grid
 
 
 def _cells(row: EqualRecords) -> tuple[Text, ...]:

@@ -68,7 +68,7 @@ def test_a_table_of_records_has_the_author_of_a_change(
 def test_a_narrow_terminal_has_the_reason_below(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At 80 columns a column of reasons would be six characters wide; a missing reason takes no line."""
+    """At 80 columns a column of reasons would be six characters wide; lines continue beside the number."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "dumb")
     monkeypatch.setenv("COLUMNS", "80")
@@ -79,10 +79,36 @@ def test_a_narrow_terminal_has_the_reason_below(
     print_entries([LogEntry(12, denied), LogEntry(11, AuditRecord(id="1", time=0, event="log begun"))])
     assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
         "12  1970-01-01 00:00:00.000  deny  decision  10.77.0.66 /tablet  publish",
-        "/cmd_vel",
+        "    /cmd_vel",
         "    10.77.0.66 is not among the hosts that may publish /cmd_vel",
         "11  1970-01-01 00:00:00.000  log begun",
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "columns", "head"),
+    [
+        ("/base", 140, "record"),
+        ("/base", 130, "4711"),
+        ("/navigation/local_planner/cmd_vel", 140, "4711"),
+        ("/navigation/local_planner/cmd_vel", 190, "record"),
+    ],
+)
+def test_a_table_needs_room_for_its_reasons(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, columns: int, head: str
+) -> None:
+    """Reasons are beside the records if the longest names leave room; no name is ever broken at these widths."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", str(columns))
+    denied = AuditRecord(
+        id="0" * 20, time=0, event="decision", decision="deny", host="192.168.100.200", caller_id=name,
+        category="publish", resource=name, reason=f"192.168.100.200 is not among the hosts that may publish {name}",
+    )  # fmt: skip
+    print_entries([LogEntry(4711, denied)])
+    shown = _STYLE.sub("", capsys.readouterr().out)
+    assert shown.split()[0] == head
+    assert f"192.168.100.200 {name}  publish {name}" in shown
 
 
 def test_equal_records_are_one_row(
