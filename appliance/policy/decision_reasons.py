@@ -27,7 +27,8 @@ class DecisionExplanation:
     `through` lists the words of the deciding rule that include the host (empty for a denial). `lost` lists the
     overruled rules. `also` explains the other rights that the request needs (`policy/rights`); `allowed` covers all of
     them. `namespace` is the denial that an allowed parameter gets if it contains other parameters at the time of the
-    call. `told` is the text of a denial for the host, as `[Options] tell` requires.
+    call. `told` is the text of a denial for the host, as `[Options] tell` requires. `blocked`: an operator's block of
+    the host denies it, so no rule matters.
     """
 
     request: Request
@@ -39,6 +40,7 @@ class DecisionExplanation:
     told: str | None = None
     limit: str = ""
     """The rate limit of an allowed request, and its line in `[Limits]`."""
+    blocked: bool = False
 
     @property
     def allowed(self) -> bool:
@@ -70,13 +72,12 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
     parameter = request.category in PARAMETERS
     decision = decide_right(policy, right)
     atoms = policy.atoms_of(request.host)
-    matching, blocked = _matching(policy, request), policy.blocked(request.host) is not None
+    blocked = policy.blocked(request.host) is not None
+    matching = [] if blocked else _matching(policy, request)
     winner = next((rule for rule in matching if rule.rule == decision.rule), None)
     through = winner.granted_through(atoms) if winner is not None else ()
     lost = tuple(
-        OverruledRule(
-            rule.rule, rule.grants(atoms), "the host is blocked" if blocked else _why(rule, decision)
-        )
+        OverruledRule(rule.rule, rule.grants(atoms), _why(rule, decision))
         for rule in matching
         if rule is not winner
     )
@@ -85,12 +86,14 @@ def _explain(policy: Policy, right: Right) -> DecisionExplanation:
         namespace = None
     told = None if decision.allowed else text_for_caller(decision, policy.tell)
     limit = _limit(policy, request) if decision.allowed else ""
-    return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit)
+    return DecisionExplanation(request, decision, through, lost, (), namespace, told, limit, blocked)
 
 
 def render(explanation: DecisionExplanation) -> Iterator[str]:
-    """Yield the explanation as lines of text."""
+    """Yield the explanation as lines of text. For a blocked host the block is the whole reason."""
     yield from _render_one(explanation)
+    if explanation.blocked:
+        return
     for other in explanation.also:
         if other.request.category is Category.NODE:
             yield "and the node rule, because this call makes a node part of the graph:"
@@ -105,7 +108,8 @@ def _render_one(explanation: DecisionExplanation) -> Iterator[str]:
     decision = explanation.decision
     verdict = "allowed" if decision.allowed else "denied"
     yield f"{'would be denied (audit-only: passes)' if decision.would_deny else verdict}: {decision.reason}"
-    yield f"  rule: {decision.rule or 'no rule'}"
+    if not explanation.blocked:
+        yield f"  rule: {decision.rule or 'no rule'}"
     if explanation.told is not None:
         yield f"  answer to the host: {explanation.told}"
     if explanation.through:

@@ -180,7 +180,7 @@ def explain_request(
     else:
         for line in render(explanation):
             say(line, "green" if explanation.allowed else "red")
-        if not explanation.allowed:
+        if not explanation.allowed and not explanation.blocked:
             for line in _allowing(policy, request):
                 say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
