@@ -5,6 +5,7 @@ from typing import Any
 
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import rfc3339, rule_text
+from appliance.base.actors import actor
 
 _ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
 """The events of monitors that trigger recordings, if `recorder.triggers` has them."""
@@ -16,7 +17,8 @@ def lines_of(record: AuditRecord) -> Iterator[str]:
     yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]
     author = detail.get("who")
-    who = [str(part) for part in (record.caller_id, author, record.host and f"on {record.host}") if part]
+    by = author and actor(str(author))
+    who = [str(part) for part in (record.caller_id, by, record.host and f"on {record.host}") if part]
     if who or sent:
         message = f"message {', '.join(sent)} of " if sent else ""
         when = f", {rfc3339(record.time)}" if author else ""

@@ -6,6 +6,7 @@ from typing import Annotated, TypeVar
 
 import typer
 
+from appliance.base.actors import actor
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.connection.target import Appliance, speaks
@@ -83,7 +84,7 @@ def _say_revision(
         return
     files = row.file if isinstance(row, policy_answers.PolicyRevision) else " ".join(row.names)
     mark = "in force" if row.in_force else ""
-    say(f"{row.revision:>5}  {_time(row.loaded)}  {row.who}: {row.note}  {files}  {mark}".rstrip())
+    say(f"{row.revision:>5}  {_time(row.loaded)}  {actor(row.who)}: {row.note}  {files}  {mark}".rstrip())
 
 
 def _time(seconds: float) -> str:

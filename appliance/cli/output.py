@@ -12,6 +12,7 @@ import msgspec
 import typer
 
 from appliance.api.moments import in_full
+from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
@@ -27,9 +28,9 @@ def moment(seconds: float) -> str:
 def loaded_by(who: str, seconds: float | None) -> str:
     """Return who loaded a policy or specifications, and when; those of the disk were read."""
     match who:
-        case "disk":
+        case actors.DISK:
             how = "read from disk"
-        case "not confirmed in time":
+        case actors.UNCONFIRMED:
             how = f"rolled back automatically ({who})"
         case _:
             how = f"loaded by {who}"

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from appliance.api.alarms import activity, open_alarms
 from appliance.api.moments import in_full
+from appliance.base.actors import DISK
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.status import (
@@ -143,7 +144,7 @@ def _grid(body: Status) -> Table:
     if monitors.shadow:
         shown += f", {len(monitors.shadow)} in shadow mode"
     if monitors.differs_from_folder:
-        shown += f"; loaded by {monitors.who}, differs from the folder"
+        shown += f"; {loaded_by(monitors.who, None)}, differs from the folder"
     grid.add_row("monitors", shown)
     for off in body.switched_off:
         end = "indefinitely" if off.until is None else f"until {moment(off.until)}"
@@ -173,7 +174,7 @@ def _grid(body: Status) -> Table:
 def _policy(policy: PolicyState) -> Text:
     differs = ""
     if policy.differs_from_file:
-        theirs = policy.who != "disk"
+        theirs = policy.who != DISK
         differs = (
             "; differs from the file" if theirs else "; the file has changed, load it: rosrv policy reload"
         )

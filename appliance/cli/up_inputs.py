@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
+from appliance.base.actors import DISK
 from appliance.base.input_files import read_given_text
 from appliance.configuration.settings import Settings
 from appliance.policy.judgement import PolicyContext, judge
@@ -18,7 +19,6 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
 
-_DISK = "disk"
 _VALID = "valid"
 
 
@@ -96,4 +96,4 @@ def _is_read_at_start(state: Path, table: str) -> bool:
             row = database.execute(f"SELECT who FROM {table} ORDER BY revision DESC LIMIT 1").fetchone()  # noqa: S608  one of two names
     except (OSError, sqlite3.Error):
         return False
-    return row is None or row[0] == _DISK
+    return row is None or row[0] == DISK

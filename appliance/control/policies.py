@@ -17,6 +17,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
+from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.input_files import read_given_text
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
@@ -30,7 +31,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import read_signature, signer
-from appliance.store.revisions import DISK, Revisions, reloaded_by
+from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -343,4 +344,4 @@ class Policies(Revisions[RevisionRow]):
         return Loaded(self.revision, before, warnings, revoked, self.confirm_by)
 
     async def _go_back(self, revision: int) -> None:
-        await self.rollback(revision, who="not confirmed in time")
+        await self.rollback(revision, who=UNCONFIRMED)

@@ -6,6 +6,7 @@ from typing import Any
 
 import structlog
 
+from appliance.base.actors import DISK
 from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import ProcessInfo
@@ -109,7 +110,7 @@ class SupervisorMessages:
             except StoreError as error:
                 _log.error("the policy is in force and not stored", reason=str(error))
             try:
-                await self._operators.hosts.reload(HostsReload(), "disk")
+                await self._operators.hosts.reload(HostsReload(), DISK)
             except HostRefusedError as error:
                 _log.error("hosts.yaml was rejected", reason=str(error))
             except StoreError as error:
@@ -118,7 +119,7 @@ class SupervisorMessages:
     async def _reload_policy(self) -> None:
         while True:
             try:
-                await self._base.policies.reload(PolicyReload(), "disk")
+                await self._base.policies.reload(PolicyReload(), DISK)
             except RevisionChangedError:  # another revision came into force in the meantime
                 continue
             return

@@ -30,6 +30,7 @@ import msgspec
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
@@ -56,7 +57,7 @@ from appliance.specifications.specification_revisions import (
 )
 from appliance.specifications.switches import Switches, require_whole
 from appliance.specifications.timed_disables import LONGEST, TimedDisables
-from appliance.store.revisions import DISK, Revisions, reloaded_by
+from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -526,7 +527,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._acts += 1
 
     async def _go_back(self, revision: int) -> None:
-        await self.roll_back(admin.MonitorRollback(revision), "not confirmed in time")
+        await self.roll_back(admin.MonitorRollback(revision), UNCONFIRMED)
 
     async def _change(
         self,

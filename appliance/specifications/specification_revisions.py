@@ -4,13 +4,13 @@ from collections.abc import Awaitable, Callable, Sequence
 
 import msgspec
 
+from appliance.base.actors import DISK
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
     SpecificationsRefusedError,
 )
-from appliance.store.revisions import DISK
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]

@@ -9,15 +9,13 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import structlog
 
+from appliance.base.actors import DISK
 from appliance.base.withdrawal import require_awaited
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 _log = structlog.get_logger()
 _AGAIN_SECONDS = 5.0
-
-DISK = "disk"
-"""The `who` of a revision that was read from the disk."""
 
 
 def reloaded_by(who: str) -> str:

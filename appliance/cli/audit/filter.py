@@ -53,7 +53,8 @@ def _filter(
         str | None, typer.Option("--text", help="Text anywhere in names, reason and details")
     ] = None,
     who: Annotated[
-        str | None, typer.Option("--who", help="Name of the token of a REST request, or operator; a glob")
+        str | None,
+        typer.Option("--who", help="Author: the name of a token, operator, or disk; a glob"),
     ] = None,
 ) -> Filter:
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}

@@ -17,6 +17,7 @@ from appliance.audit.equality import FOLDED, EqualRecords, grouped
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import LogEntry, fields_of, printable, rfc3339, rule_text
 from appliance.audit.search import RecordInContext
+from appliance.base.actors import actor
 from appliance.evidence.export_verification import ExportVerification
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
@@ -219,7 +220,7 @@ def _by(record: AuditRecord) -> str | None:
     unknown = (
         who == "None" and record.event in FOLDED
     )  # as versions up to 0.2.0 counted calls without a token
-    return f"by {who}" if who and not unknown else None
+    return f"by {actor(str(who))}" if who and not unknown else None
 
 
 def _why_of_several(row: EqualRecords) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 from playwright.sync_api import expect
 
+from appliance.base.actors import DISK, UNCONFIRMED, actor
 from tests.support.appliance import Appliance
 from tests.system.console.reader import LIMIT, Reader
 
@@ -120,3 +121,15 @@ def test_an_alarm_is_open_until_its_cause_is_gone(
     expect(alarms).to_contain_text(" s unless confirmed")
     assert rest.post("/v1/policy/confirm", match=loaded.etag).status == 200
     expect(alarms).not_to_contain_text("unless confirmed")
+
+
+def test_changes_of_the_appliance_are_not_shown_as_those_of_a_person(opened: Callable[..., Reader]) -> None:
+    """The names are those of `appliance.base.actors`, which no token can have."""
+    page = opened().go("now")
+    shown = """async (authors) => {
+      const { actor } = await import("/console/static/js/parts/given.js");
+      return authors.map(actor);
+    }"""
+    authors = ["alice", DISK, UNCONFIRMED, "disk2"]
+    assert page.evaluate(shown, authors) == [actor(who) for who in authors]
+    assert page.evaluate(shown, [DISK, None]) == ["the appliance (disk)", None]

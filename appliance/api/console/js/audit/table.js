@@ -3,7 +3,7 @@
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
 import { Outcome } from "../parts/badge.js";
-import { Given } from "../parts/given.js";
+import { actor, Given } from "../parts/given.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
 import { Count, Range } from "./rows.js";
@@ -30,7 +30,7 @@ function Row(/** @type {{record: any, time: any, count?: any, reason: string, pa
     event.stopPropagation();
     open();
   };
-  const who = record.caller_id || record.detail.who;
+  const who = record.caller_id || actor(record.detail.who);
   return html`<tr class=${`pick${chosen ? " chosen" : ""}${part ? " part" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
     <td class="time"><a href=${auditPath(filter, record.id)} onClick=${link}>${time}</a></td>
     <td><${Outcome} record=${record} /></td>

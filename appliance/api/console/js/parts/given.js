@@ -16,9 +16,16 @@ export function Given({ value, most = 160, mono = false, none = "–" }) {
     ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : name ? words(one.text) : one.text))}</bdi>`;
 }
 
-/** The origin of a revision: "by" a user or program, or "from disk". @param {{who: string, most?: number}} given */
+const APPLIANCE = ["disk", "not confirmed in time"]; // as in base/actors.py
+
+/** An author as text; one that is not a person is the appliance. @param {string | null | undefined} who */
+export function actor(who) {
+  return who && APPLIANCE.includes(who) ? `the appliance (${who})` : who;
+}
+
+/** The origin of a revision: "by" its author, or "from disk". @param {{who: string, most?: number}} given */
 export function By({ who, most = 40 }) {
-  return who === "disk" ? "from disk" : html`by <${Given} value=${who} most=${most} />`;
+  return who === "disk" ? "from disk" : html`by <${Given} value=${actor(who)} most=${most} />`;
 }
 
 /** A short name does not break; a longer one breaks after slashes and underscores, or anywhere if it must. */

@@ -7,7 +7,7 @@ import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Difference } from "../parts/difference.js";
 import { Editor } from "../parts/editor.js";
-import { Given } from "../parts/given.js";
+import { actor, Given } from "../parts/given.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { done, failed } from "../parts/toast.js";
@@ -22,7 +22,7 @@ export function Revisions() {
   if (error) return html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>`;
   if (!value) return html`<${Loading} />`;
   return html`<div class="table-wrap"><table class="table"><thead><tr><th class="number">Revision</th><th>When</th><th>Who</th><th>Comment</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>
-    ${value.map((/** @type {any} */ one) => html`<tr key=${one.revision}><td class="number">${one.revision}</td><td class="nowrap"><${Moment} at=${one.loaded} /></td><td><${Given} value=${one.who} most=${40} /></td><td><${Given} value=${one.note} most=${120} none="" /></td>
+    ${value.map((/** @type {any} */ one) => html`<tr key=${one.revision}><td class="number">${one.revision}</td><td class="nowrap"><${Moment} at=${one.loaded} /></td><td><${Given} value=${actor(one.who)} most=${40} /></td><td><${Given} value=${one.note} most=${120} none="" /></td>
       <td><div class="row">${one.in_force ? html`<${Badge} word="in force" tone="allow" />` : html`<${Button} small onClick=${() => setOpen({ revision: one.revision, back: false })}>Compare</${Button}><${Button} small role="operator" onClick=${() => setOpen({ revision: one.revision, back: true })}>Roll back</${Button}>`}</div></td></tr>`)}</tbody></table></div>
     ${open && html`<${RevisionDialog} revision=${open.revision} back=${open.back} close=${() => setOpen(null)} />`}`;
 }

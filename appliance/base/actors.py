@@ -1,0 +1,11 @@
+"""Name the authors of revisions and records, also those that are not people."""
+
+DISK = "disk"
+"""The author of a change that was read from the disk, at a start or by a signal to the appliance."""
+UNCONFIRMED = "not confirmed in time"
+"""The author of an automatic rollback. No token has this name or that of `DISK`."""
+
+
+def actor(who: str) -> str:
+    """Return an author as text; one that is not a person is the appliance."""
+    return f"the appliance ({who})" if who in (DISK, UNCONFIRMED) else who
