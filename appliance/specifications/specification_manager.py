@@ -364,7 +364,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if shadowed:
                 text = f"{', '.join(shadowed)} is in shadow mode: rosrv monitor promote brings it into force"
                 raise SpecificationsRefusedError([text])
-            return self._switched(await self._switch(request.names, request.enabled, who, seconds))
+            names = await self._switch(request.names, request.enabled, who, seconds)
+            return self._switched(names, until=self.returns.until(names[0]) if names else None)
 
     async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
         """Put monitors into shadow mode, or from shadow mode into force; return the monitors that changed.
@@ -398,8 +399,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     def _disabled(self) -> list[str]:
         return [name for name, state in self.switches.states.items() if state is False]
 
-    def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
-        return Switched(names, self.revision, self.tag, [*began])
+    def _switched(self, names: list[str], began: Sequence[str] = (), until: float | None = None) -> Switched:
+        return Switched(names, self.revision, self.tag, [*began], until)
 
     async def _switch(
         self, names: Sequence[str], to: Switch, who: str, seconds: float | None = None

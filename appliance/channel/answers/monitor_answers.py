@@ -155,3 +155,4 @@ class Switched(msgspec.Struct, frozen=True):
     began: Annotated[
         list[str], doc("monitors that entered or left shadow mode and are in their initial state")
     ] = []
+    until: Annotated[Moment | None, doc("when they are enabled again automatically; null: no end")] = None

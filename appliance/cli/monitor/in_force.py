@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from msgspec.structs import asdict
 from rich.table import Column
 
+from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitor_answers import MonitorState, Replacement, Switched
@@ -235,14 +235,15 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
     if appliance.as_json:
         say_json(
             {
-                **asdict(body),
+                **in_full(body),
                 "enabled": word == "enabled",
                 "trial": word == _SHADOW,
                 "shadow": word == _SHADOW,
             }
         )
         return
-    say(f"{word}: {', '.join(body.names) or 'no change'}")
+    end = "" if body.until is None else f", until {moment(body.until)}"
+    say(f"{word}: {', '.join(body.names) or 'no change'}{end}")
     if body.began:
         say(f"{', '.join(body.began)} started in the initial state", "yellow")
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import hashlib
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -69,7 +70,8 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     """After a restart the monitor comes back; an operator's switch, or a removal, ends the time."""
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
-    await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
+    switched = await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
+    assert switched.until == monitors.returns.until("b") == pytest.approx(time.time() + 3600, abs=60)
     again = await desk.monitors()
     assert again.returns.until("a") == pytest.approx(monitors.returns.until("a"), abs=5)
     await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")  # shorter than before
@@ -80,7 +82,8 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
         while not later.switches.enabled("a"):
             await asyncio.sleep(0.01)
     await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
-    assert (await later.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]  # now without an end
+    endless = await later.switch(admin.MonitorSwitch(["a"], False), "eve")
+    assert (endless.names, endless.until) == (["a"], None)
     assert (later.switches.states["a"], later.returns.until("a")) == (False, None)
 
 
