@@ -9,7 +9,7 @@ from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotat
 from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket
-from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.connection.target import Appliance, speaks, speaks_here
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json
 from rosmop.tool.terminal import say
@@ -19,7 +19,7 @@ _Name = Annotated[
 ]
 
 
-@speaks
+@speaks_here
 def add(
     appliance: Appliance,
     name: Annotated[
@@ -42,7 +42,7 @@ def add(
     _say_new(appliance.answer_or_exit(TokenAdd(name, role, seconds)))
 
 
-@speaks
+@speaks_here
 def rotate(
     appliance: Appliance,
     name: _Name,

@@ -40,24 +40,6 @@ State = Annotated[
         readable=False,  # the user needs only search permission
     ),
 ]
-Api = Annotated[
-    str | None,
-    typer.Option(
-        "--api",
-        metavar="URL",
-        envvar="ROSRV_API_URL",
-        help=f"Use REST instead; put the access token into {TOKEN}",
-    ),
-]
-ApiCa = Annotated[
-    Path | None,
-    typer.Option(
-        "--api-ca",
-        metavar="FILE",
-        envvar="ROSRV_API_CA",
-        help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
-    ),
-]
 _P = ParamSpec("_P")
 
 
@@ -121,17 +103,23 @@ def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, Non
     return speaks_with(Json)(verb)
 
 
+def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
+    """Like `speaks`, for a verb that REST does not offer: its help has no --api, whose use gets the reason."""
+    return speaks_with(Json, over_rest=False)(verb)
+
+
 def speaks_with(
-    json: Any,
+    json: Any, *, over_rest: bool = True
 ) -> Callable[[Callable[Concatenate[Appliance, _P], None]], Callable[_P, None]]:
     """Like `speaks`, with this annotation of --json."""
+    places = _places(hidden=not over_rest)
 
     def speaking(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
         own = inspect.signature(verb, eval_str=True)
 
         @functools.wraps(verb)
         def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
-            context, state, api, authority = (kwargs.pop(place.name) for place in _PLACES)
+            context, state, api, authority = (kwargs.pop(place.name) for place in places)
             as_json = kwargs.pop("as_json")
             appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
             verb(replace(appliance, as_json=as_json), *args, **kwargs)  # type: ignore[arg-type]  # as above
@@ -140,7 +128,7 @@ def speaks_with(
         its_json = inspect.Parameter(
             "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=json
         )
-        parameters = [*list(own.parameters.values())[1:], its_json, *_PLACES]
+        parameters = [*list(own.parameters.values())[1:], its_json, *places]
         asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
         asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
             "return": None
@@ -150,15 +138,31 @@ def speaks_with(
     return speaking
 
 
-_PLACES = [
-    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-    for name, default, annotation in (
-        ("context", inspect.Parameter.empty, typer.Context),
-        ("state", DEFAULT_STATE, State),
-        ("api", None, Api),
-        ("api_ca", None, ApiCa),
+def _places(*, hidden: bool) -> list[inspect.Parameter]:
+    """Return the options that choose an appliance; `hidden`: the help leaves those for REST out."""
+    api = typer.Option(
+        "--api",
+        metavar="URL",
+        envvar="ROSRV_API_URL",
+        help=f"Use REST instead; put the access token into {TOKEN}",
+        hidden=hidden,
     )
-]
+    authority = typer.Option(
+        "--api-ca",
+        metavar="FILE",
+        envvar="ROSRV_API_CA",
+        help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
+        hidden=hidden,
+    )
+    return [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for name, default, annotation in (
+            ("context", inspect.Parameter.empty, typer.Context),
+            ("state", DEFAULT_STATE, State),
+            ("api", None, Annotated[str | None, api]),
+            ("api_ca", None, Annotated[Path | None, authority]),
+        )
+    ]
 
 
 def _chosen(context: typer.Context, state: Path, api: str | None, authority: Path | None) -> Appliance:
