@@ -176,7 +176,7 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """Run the load without or with the recorder; with `kills`, kill its processes meanwhile.
+    """Run the load without or with the recorder; with `kills`, kill its processes during the load.
 
     The recorder records the seconds before the request, and some after it.
     """

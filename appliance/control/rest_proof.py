@@ -94,7 +94,7 @@ class RequestAuthenticator:
                 good = row.keys is not None and reading_hash(shown) == row.keys.reading
             else:
                 good = await self._is_token(shown, parsed[1], row)
-            if good and self._tokens.usable_row(row.id) is not None:  # the token may have ended meanwhile
+            if good and self._tokens.usable_row(row.id) is not None:  # the token may have ended since
                 return row
         raise UnprovenError("no valid token was presented")
 

@@ -173,7 +173,7 @@ class TokenOrders:
         try:
             await self._store.settled()
         except StoreError:
-            if self._rows[row.id] is row:  # not revoked meanwhile
+            if self._rows[row.id] is row:  # not revoked since
                 self._keep(*earlier)
                 self._end(row, who, "was not rotated; the earlier ones stay valid")
             raise

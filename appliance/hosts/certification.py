@@ -2,7 +2,7 @@
 
 Invariants:
 
-1. An enrolment or renewal fails if its name is revoked meanwhile, whether an operator or the host started it.
+1. An enrolment or renewal fails if its name is revoked before it ends, whether an operator or the host started it.
 2. Every certificate that is issued or revoked is recorded.
 """
 

@@ -1,7 +1,7 @@
 """Serve a host's own requests: enrol with a one-time token, renew its certificate through its tunnel.
 
 1. A token is used up before the authority is asked. If no certificate is issued, the token becomes valid again, so that
-   its bearer can correct the request. It stays used if its name was revoked meanwhile.
+   its bearer can correct the request. It stays used if its name was revoked in between.
 2. A host that renews must send from the virtual address of its name and prove that it has the name's present key. The
    firewall accepts that address through IPsec only.
 3. The present certificate stays valid until the host reports that it has installed the next one. If the host loses its

@@ -1,6 +1,6 @@
 """Remove IPsec states and policies, with their keys, that a killed charon left in the kernel.
 
-With these leftovers the kernel still accepts packets, even from a host that was revoked meanwhile. So they are removed
+With these leftovers the kernel still accepts packets, even from a host that was revoked since. So they are removed
 before charon starts again, and when the appliance ends. Only the appliance's own leftovers are removed: the states of
 ESP in UDP on port 4500, which only charon uses, and the policies from and to the appliance's tunnel address.
 """

@@ -1,7 +1,7 @@
 """Run the recorder process: its lifeline, its link to control, and a thread that does the work.
 
 The process has no network. It reads the relays' memory and the audit log, and writes recordings. The recorder outlives
-control: meanwhile, its reports wait in the recording store.
+control; without control, its reports wait in the recording store.
 """
 
 import asyncio

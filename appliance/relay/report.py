@@ -1,7 +1,7 @@
 """Reports to control: connections, refusals, lost publishers, traffic.
 
 Without a link, the counters continue, and refusals are counted. A new control gets both counts, and the connections
-that are open or have ended meanwhile.
+that are open or have ended since.
 
 Invariants:
 - `TrafficReported` is sent at most once per `report_every`.

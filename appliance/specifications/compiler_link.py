@@ -141,7 +141,7 @@ class SpecificationCompiler:
         raise SpecificationsRefusedError([_ENDED])
 
     async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
-        """Ask, and end the compiler if the order is withdrawn meanwhile. Raises the errors of `Link.ask`."""
+        """Ask, and end the compiler if the order is withdrawn before the answer. Raises the errors of `Link.ask`."""
         asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
         try:
             while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:

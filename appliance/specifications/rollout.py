@@ -31,7 +31,7 @@ Switch = bool | Literal["shadow"]
 """Whether the actions of a monitor take effect; in shadow mode they are only reported."""
 
 _RELAY_SECONDS = 15.0
-_TRIES = 5  # attempts, because affected nodes may come and go meanwhile
+_TRIES = 5  # attempts, because affected nodes may come and go during each
 _SILENT = f"a relay does not answer within {_RELAY_SECONDS:g} s"
 
 

@@ -95,7 +95,7 @@ class WriteAhead:
             os.ftruncate(descriptor, 0)
 
     def sync(self) -> None:
-        """Flush the file to the disk; other threads may append meanwhile. Raises `OSError`."""
+        """Flush the file to the disk, while other threads may append. Raises `OSError`."""
         with self._descriptor() as descriptor:
             own = os.dup(descriptor)
         try:

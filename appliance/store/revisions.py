@@ -44,7 +44,7 @@ class Revisions(ABC, Generic[R]):
     """The revisions of the policy or of the specifications; only one change is made at a time.
 
     A change can have a time limit: unless confirmed, it is rolled back automatically, even if the control process or
-    the appliance restarts meanwhile. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried
+    the appliance restarts. A rollback that raises `refusal` or `StoreError` changes nothing, and is tried
     again after `_AGAIN_SECONDS`, because the operators may be absent.
     """
 

@@ -20,7 +20,7 @@ log = structlog.get_logger()
 async def end_all(slots: Sequence[ProcessSlot], process_died: asyncio.Event) -> None:
     """End every process; processes that outlive control come last.
 
-    `process_died` is set after each death, when its slot is free. No process may start meanwhile.
+    `process_died` is set after each death, when its slot is free. No process may start during the shutdown.
     """
     for slot in slots:
         if slot.due is not None:

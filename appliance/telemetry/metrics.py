@@ -92,7 +92,7 @@ METRICS = (
     _gauge("rosrv_rosmaster_reachable", "1 while the ROS master answers"),
     _gauge("rosrv_delivery_queue", "calls to nodes that wait to be sent"),
     _gauge("rosrv_tunnel_up", "1 while the tunnel of an enrolled host is up", "host"),
-    _gauge("rosrv_tunnel_age_seconds", "age of the SA; 0 while there is none", "host"),
+    _gauge("rosrv_tunnel_age_seconds", "age of the SA; 0 without an SA", "host"),
     _gauge("rosrv_tunnel_bytes", "bytes of the current SA: in (from the host), out", "host", "direction"),
     _gauge(
         "rosrv_host_certificate_expiry_seconds",

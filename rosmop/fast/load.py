@@ -13,7 +13,7 @@ def prepare() -> None:
 
 
 def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
-    """Return the specifications of a part and its fast path, for `MonitorSet.of`. Without data there are none.
+    """Return the specifications of a part and its fast path, for `MonitorSet.of`; without data, return an empty set.
 
     Raises `msgspec.ValidationError` or `msgspec.DecodeError` if the data are not a part.
     """

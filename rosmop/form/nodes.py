@@ -413,7 +413,7 @@ class LimitDepth(FormNode, frozen=True):
 
 
 class Drop(FormNode, frozen=True):
-    """Drop the message, if there is one; at a deadline there is none."""
+    """Drop the message; a deadline has no message."""
 
     site: int
 

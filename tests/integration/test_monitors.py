@@ -125,7 +125,7 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
 def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """Meanwhile no message is lost, and the first changed message directly follows the last unchanged one."""
+    """No message is lost, and the first changed message directly follows the last unchanged one."""
     assert appliance.rosrv("monitor", "enable", "words", "--shadow").stdout == "shadow mode: words\n"
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")

@@ -71,7 +71,7 @@ def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) ->
 
 
 def test_a_silent_topic_ends_and_blocks_no_other_request(appliance: Appliance, ros: RosSession) -> None:
-    """A silent topic ends the command with status 1 after the time limit; meanwhile other requests are answered."""
+    """A silent topic ends the command with status 1 after the time limit; until then other requests are answered."""
     ros.listener("roscpp", "/quiet", name="ear").wait_for(event="ready")
     eventually(
         lambda: appliance.rosrv("topic", "info", "/quiet", check=False).returncode == 0, lambda: "no topic"

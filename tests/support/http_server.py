@@ -194,7 +194,7 @@ async def serving(
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Wait until the condition holds; the loop runs meanwhile."""
+    """Wait until the condition holds, while the loop runs."""
     async with asyncio.timeout(WAIT):
         while not condition():
             await asyncio.sleep(0.01)

@@ -65,6 +65,11 @@ HABITS = (
     Habit(r"\b(?:held|holds?) (?:\w+ )?against\b", "compare with", "It is held against the formula."),
     Habit(r"\bput back\b", "restore, register again", "A node is put back."),
     Habit(r"\bbelongs? into\b", "belongs in", "It belongs into the policy."),
+    Habit(
+        r"\bmeanwhile\b(?!-)|\bMeanwhile\b",
+        "in the meantime, while, since",
+        "Its host was revoked meanwhile.",
+    ),
     Habit(r"\bso many\b", "the number", "So it has so many slices."),
     Habit(
         r"\bnode proxy\b|\bnode proxies\b|\bouter face\b|\binner face\b", "proxy endpoint", "The outer face."

@@ -45,7 +45,7 @@ class Host(msgspec.Struct, frozen=True):
     last_seen: Annotated[Moment | None, doc("when a packet last arrived through its tunnel")]
     token_expires: Annotated[Moment | None, doc("when its one-time token expires; null: none")]
     ports: PortsSeen
-    token_by: Annotated[str, doc("who made its one-time token; empty: there is none")] = ""
+    token_by: Annotated[str, doc("who made its one-time token; empty: it has no token")] = ""
 
 
 class Machine(msgspec.Struct, frozen=True):

@@ -43,6 +43,6 @@ class Inventory(msgspec.Struct, frozen=True):
     parts: list[Part]
     parts_list: Annotated[
         str | None,
-        doc("SHA-256 of the list of all parts (CycloneDX) that an image has; null: there is none"),
+        doc("SHA-256 of the list of all parts (CycloneDX) that an image has; null: no image"),
     ]
     in_use: Annotated[InUse | None, doc("null: no running appliance was queried")] = None

@@ -119,7 +119,7 @@ def disable(
 ) -> None:
     """Disable monitors: messages pass them unchanged, and their variables keep their values.
 
-    With --for they are enabled again automatically, even if the appliance restarts meanwhile.
+    With --for they are enabled again automatically, even if the appliance restarts.
 
     Example: rosrv monitor disable safeTrigger --for 10m
     """

@@ -76,7 +76,7 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
     """Fetch the recordings of a period and the recorder's memory, oldest first. The audit log records it.
 
-    The files stay open in the block, so that a recording removed meanwhile remains readable.
+    The files stay open in the block, so that a recording that is removed remains readable.
     Exits with status 1 if nothing was recorded or the appliance rejects the request.
     """
     found: list[tuple[Span, Recording]] = []

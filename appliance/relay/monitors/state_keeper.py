@@ -5,7 +5,7 @@ Invariants:
   published. Therefore no subscriber sees an effect of a state that can be lost.
 - Unchanged state is not written.
 - A state is reused only if it was written since the machine started, or before an orderly end of the appliance. It is
-  not reused if the machine's clock was set meanwhile. A state that is not reused is `lost`, with the reason.
+  not reused if the machine's clock was set after it was written. A state that is not reused is `lost`, with the reason.
 """
 
 import time

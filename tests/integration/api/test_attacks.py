@@ -177,7 +177,7 @@ def test_hostile_json_is_rejected(rest: Rest, path: str, body: bytes) -> None:
 
 
 def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> None:
-    """Exploding formulas and endless blocks are answered in time; other clients are answered meanwhile."""
+    """Exploding formulas and endless blocks are answered in time, and so are other clients."""
     events = "\n".join(f"event e{one}() /a std_msgs/Bool '{{}}' {{ }}" for one in range(14))
     sometime = " and ".join(f"<>(e{one} and <>e{one + 1})" for one in range(12))
     bombs = [

@@ -74,7 +74,7 @@ def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
 
 
 def test_a_hanging_api_is_replaced(appliance: Appliance) -> None:
-    """An api that does not answer its supervisor is replaced; RVMaster answers meanwhile."""
+    """An api that does not answer its supervisor is replaced, while RVMaster answers."""
     assert appliance.rest().get("/healthz").status == 200
     pid = appliance.pids("api")[0]
     os.kill(pid, signal.SIGSTOP)

@@ -218,7 +218,7 @@ async def test_a_reload_overtaken_by_another_change_is_refused(
 async def test_hosts_changed_during_the_tests_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A host whose certificate is revoked meanwhile has no rights by its old address."""
+    """A host whose certificate is revoked during the load has no rights by its old address."""
     appliance = Appliance(tmp_path)
     slow = Slow(monkeypatch, appliance)
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}

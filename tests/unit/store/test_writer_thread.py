@@ -305,7 +305,7 @@ class _Gate:
 
 
 def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thread that has the descriptor's number writes to that file, also if another thread closes it meanwhile."""
+    """A thread that has the descriptor's number writes to that file, also if another thread closes it by then."""
     gate = _Gate()
     monkeypatch.chdir(tmp_path)
     flags = {name: getattr(os, name) for name in ("O_RDWR", "O_CREAT", "O_APPEND", "O_CLOEXEC")}

@@ -167,7 +167,7 @@ async def test_a_slow_start_is_waited_for_and_reported(
 
 @pytest.mark.parametrize("wanted", [False, True])
 def test_a_process_on_demand_may_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
-    """The end of such a process is not a failure or a restart; a new one starts only if requested meanwhile."""
+    """The end of such a process is not a failure or a restart; a new one starts only if it was requested before."""
     role = Role(name="compiler", user="rosrv-compiler", part="compiler", entry="m:f", on_demand=True)
     asyncio.run(_end_by_themselves(made(tmp_path, role), monkeypatch, wanted))
 

@@ -352,7 +352,7 @@ async def test_a_multicall_equals_its_parts_one_by_one() -> None:
 
 
 async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
-    """A host receives a namespace that appeared meanwhile only if it may read all of it."""
+    """A host receives a namespace that appeared after the decision only if it may read all of it."""
     site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
     put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not have it yet
     answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")

@@ -1,4 +1,4 @@
-"""After a change of the policy every right is decided again, whatever the nodes do meanwhile."""
+"""After a change of the policy every right is decided again, whatever the nodes do during the change."""
 
 import pytest
 

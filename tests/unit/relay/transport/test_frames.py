@@ -114,7 +114,7 @@ def test_a_torn_frame_is_never_part_of_a_batch() -> None:
 
 
 def test_receivers_share_the_scratch_area_without_mixing_their_bytes() -> None:
-    """A torn frame of one connection survives the data that another connection receives meanwhile."""
+    """A torn frame of one connection survives the data that another connection receives before its rest."""
     scratch, budget = Scratch(), share(1 << 30)
     one, other = FrameReceiver(scratch, LIMIT, budget), FrameReceiver(scratch, LIMIT, budget)
     data = frame(100, 1)
