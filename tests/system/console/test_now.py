@@ -77,9 +77,9 @@ def test_times_in_alarms_are_the_readers(opened: Callable[..., Reader]) -> None:
 
 
 def test_many_denials_turn_the_state_to_a_warning(
-    opened: Callable[..., Reader], attempt: Callable[..., Any]
+    appliance: Appliance, opened: Callable[..., Reader], attempt: Callable[..., Any]
 ) -> None:
-    """The first card gives the reason and leads to the denials."""
+    """The first card gives the reason and leads to the denials; `rosrv status` has the same warning."""
     page = opened().go("now")
     for number in range(12):
         attempt(
@@ -88,6 +88,8 @@ def test_many_denials_turn_the_state_to_a_warning(
     card = page.get_by_role("region", name="Health").get_by_role("link").first
     expect(card).to_contain_text("In service, with warnings")
     expect(card).to_contain_text(re.compile(r"\d+ denials in the last minute"))
+    [attention] = appliance.status()["attention"]
+    assert re.fullmatch(r"\d+ denials in the last minute; rosrv audit summary --since 1m", attention)
     card.click()
     expect(page).to_have_url(re.compile("/console/audit.*decision=deny"))
 
