@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import RollbackDue, doc
 from appliance.channel.answers.monitor_answers import MonitorState, Tag
 
 
@@ -85,4 +85,4 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
     kept: Annotated[
         list[str], doc("files that a reload left in force although the folder does not have them")
     ] = []
-    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")] = None
+    confirm_by: RollbackDue = None

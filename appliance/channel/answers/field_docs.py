@@ -18,3 +18,6 @@ Moment = Annotated[float, doc("seconds since the epoch", extra_json_schema={UNIT
 
 NanoMoment = Annotated[int, doc("nanoseconds since the epoch", extra_json_schema={UNIT: "nanoseconds"})]
 """A moment of a message, for whom the digits of a float are too few."""
+
+RollbackDue = Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
+"""The end of the time in which a change is to be confirmed."""

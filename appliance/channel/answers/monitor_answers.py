@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, RollbackDue, doc
 
 Tag = Annotated[
     str,
@@ -56,7 +56,7 @@ class Monitors(msgspec.Struct, frozen=True):
     who: str
     note: str
     loaded: Moment
-    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
+    confirm_by: RollbackDue
     folder: Annotated[str | None, doc("the folder that `reload` reads; null: no folder was given at start")]
     differs_from_folder: bool
     warnings: list[str]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.answers.field_docs import Moment, RollbackDue, doc
 
 
 class PolicyRevision(msgspec.Struct, frozen=True):
@@ -65,7 +65,7 @@ class Loaded(msgspec.Struct, frozen=True):
     replaced: int
     warnings: list[str]
     revoked: Annotated[int, doc("number of registrations and connections that were revoked")]
-    confirm_by: Annotated[Moment | None, doc("when it is rolled back automatically unless confirmed")]
+    confirm_by: RollbackDue
 
 
 class PolicyConfirmed(msgspec.Struct, frozen=True):
