@@ -85,7 +85,7 @@ test-package: ## what is installed: the package's life in a virtual machine, ima
 	@scripts/setup --package
 	$(PYTEST) tests/package --quiet --durations=15
 
-wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl, and the versions that were tested
+wheel: setup ## the wheel of this architecture, for pipx: dist/rosrv_appliance-VERSION-….whl, and the versions that were tested
 	$(BIN)/python -m hatchling build --target wheel
 	$(MAKE) --silent --no-print-directory constraints > dist/rosrv_appliance-$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')-constraints.txt
 

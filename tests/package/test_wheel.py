@@ -25,11 +25,12 @@ def rosrv() -> Iterator[Path]:
     pipx = need_program("pipx", "pipx")
     subprocess.run(["make", "--silent", "wheel"], cwd=ROOT, check=True, capture_output=True)
     built = ROOT / "dist" / f"rosrv_appliance-{__version__}"
+    wheel = next(built.parent.glob(f"{built.name}-cp311-abi3-*.whl"))
     folder = Path(tempfile.mkdtemp(prefix="rosrv-wheel-"))
     folder.chmod(0o755)  # the appliance's processes run as other users
     subprocess.run(
         [pipx, "install", "--python", "/usr/bin/python3",
-         f"--pip-args=--only-binary :all: --constraint {built}-constraints.txt", f"{built}-py3-none-any.whl"],
+         f"--pip-args=--only-binary :all: --constraint {built}-constraints.txt", str(wheel)],
         env=os.environ | {"PIPX_HOME": str(folder / "pipx"), "PIPX_BIN_DIR": str(folder / "bin")},
         check=True,
     )  # fmt: skip

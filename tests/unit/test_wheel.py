@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.tags import sys_tags
 
 from appliance import __version__
+from distribution.extension import IN_PLACE
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -96,6 +98,20 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
         expected.add(place + (rest if top == "docs" else path))
     assert expected - names == set()
     assert not [name for name in names if name.startswith("rosmop/tests")]
+
+
+def test_it_contains_the_compiled_module(wheel: Path) -> None:
+    """The module is included. The wheel is for this architecture, each Python from 3.11 on, and this glibc or newer."""
+    assert re.fullmatch(
+        r"rosrv_appliance-[0-9.]+-cp311-abi3-manylinux_2_\d+_(x86_64|aarch64)\.whl", wheel.name
+    )
+    assert wheel in map(
+        wheel.with_name, (f"{wheel.name.partition('-cp311')[0]}-{tag}.whl" for tag in sys_tags())
+    )
+    with zipfile.ZipFile(wheel) as archive:
+        assert archive.read(str(IN_PLACE.relative_to(ROOT))) == IN_PLACE.read_bytes()
+        facts = archive.read(f"{wheel.name.partition('-cp311')[0]}.dist-info/WHEEL").decode()
+    assert "Root-Is-Purelib: false" in facts
 
 
 def test_a_missing_compiler_differs_from_a_wrong_source(tmp_path: Path) -> None:
