@@ -18,8 +18,10 @@ from pathlib import Path
 from appliance import __version__
 from appliance.configuration.inventory import RUNS
 from appliance.supervisor.users import NUMERIC_IDS
+from distribution import extension
 from distribution.checkout import ROOT, facts, revision, time_of_commit
 from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment
+from distribution.extension import IN_PLACE, ExtensionError
 from distribution.man import write_pages
 
 HERE = ROOT / "distribution"
@@ -81,8 +83,10 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     _make_virtual(library)
     for package in ("appliance", "roswire", "rosmop"):
         _copy(
-            ROOT / package, library / "common" / package, "tests", "docs", "README.md", "Makefile", "*.toml"
-        )
+            ROOT / package, library / "common" / package,
+            "tests", "docs", "README.md", "Makefile", "*.toml", IN_PLACE.name,
+        )  # fmt: skip
+    shutil.copyfile(extension.build(architecture.triplet), library / "common" / IN_PLACE.relative_to(ROOT))
     shipped = root / "usr/share/rosrv"
     for folder in ("examples", "monitors", "policies"):
         _copy(ROOT / folder, shipped / folder)
@@ -177,7 +181,11 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(
             f"package: building for {name}; dpkg's output is in build/package/{name}/build.log\n"
         )
-        made = build(ARCHITECTURES[name], moment=moment)
+        try:
+            made = build(ARCHITECTURES[name], moment=moment)
+        except ExtensionError as error:
+            sys.stderr.write(f"package: {error}\n")
+            return 1
         sys.stdout.write(f"{made.relative_to(ROOT)}  {made.stat().st_size >> 20} MB\n")
     return 0
 

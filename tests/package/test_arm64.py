@@ -7,9 +7,19 @@ import pytest
 
 from distribution.checkout import ROOT
 from distribution.environment import ARCHITECTURES, INTERPRETERS, make_environment
+from distribution.extension import build
 from tests.support.requirements import need_program
 
+EM_AARCH64 = 183
 pytestmark = pytest.mark.timeout(900)
+
+
+def test_the_compiled_module_is_built_for_arm64() -> None:
+    """The relay's module is built as a library for arm64, with the function that Python calls to load it."""
+    need_program("aarch64-linux-gnu-gcc", "gcc-aarch64-linux-gnu")
+    made = build(ARCHITECTURES["arm64"].triplet).read_bytes()
+    assert int.from_bytes(made[18:20], "little") == EM_AARCH64
+    assert b"PyInit_pump" in made
 
 
 def test_every_locked_package_exists_for_arm64(tmp_path: Path) -> None:
@@ -20,7 +30,7 @@ def test_every_locked_package_exists_for_arm64(tmp_path: Path) -> None:
     make_environment(tmp_path / "tree", ARCHITECTURES["arm64"], work)
     libraries = [path for path in (tmp_path / "tree").rglob("*.so*") if path.is_file()]
     assert len(libraries) > 20
-    assert {int.from_bytes(path.read_bytes()[18:20], "little") for path in libraries} == {183}  # EM_AARCH64
+    assert {int.from_bytes(path.read_bytes()[18:20], "little") for path in libraries} == {EM_AARCH64}
     for version in INTERPRETERS:
         tag = f"cpython-{version.replace('.', '')}-aarch64-linux-gnu"
         assert list((tmp_path / "tree" / f"lib/python{version}/site-packages").glob(f"libxtwrapper.{tag}.so"))

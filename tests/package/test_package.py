@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from distribution.deb import LIBRARY
+from distribution.environment import ARCHITECTURES
+from distribution.extension import IN_PLACE, build
 from tests.package.conftest import SLOW_SECONDS, build_later, clean_machine, elsewhere
 from tests.support.machine import Done, Machine
 from tests.support.machine_disk import ROOT
@@ -125,6 +128,16 @@ def test_the_life_of_the_package(machine: Machine) -> None:
     others = ("/var/lib/dpkg/*", "/var/log/*", "*rosrv-agent*", "*rosrv.agent*")
     left = machine.run("find", *looked, *(word for path in others for word in ("-not", "-path", path))).output
     assert left == "", left
+
+
+def test_it_contains_the_compiled_module(package: Path, tmp_path: Path) -> None:
+    """The package has the relay's module for its own architecture, once for both versions of Python."""
+    subprocess.run(["dpkg-deb", "--extract", str(package), str(tmp_path)], check=True)
+    module = IN_PLACE.relative_to(ROOT)
+    assert [*tmp_path.rglob("pump*.so")] == [tmp_path / LIBRARY / "common" / module]
+    assert (tmp_path / LIBRARY / "common" / module).read_bytes() == build(
+        ARCHITECTURES["amd64"].triplet
+    ).read_bytes()
 
 
 def test_lintian_finds_no_error(package: Path) -> None:
