@@ -28,6 +28,15 @@ RUN python3 -m venv /opt/rosrv \
  && find /opt/rosrv/lib -type d -name tests -prune -exec rm -rf {} + \
  && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} + \
  && find /opt/rosrv/lib -name direct_url.json -delete
+# The relay's compiled module, with the locked Cython, which stays here.
+COPY requirements-bootstrap.lock /build/
+COPY distribution/extension.py /build/distribution/
+COPY appliance/relay/transport/pump.pyx /build/appliance/relay/transport/
+RUN awk '/^[a-z]/ { taken = /^cython==/ } taken' /build/requirements-bootstrap.lock > /build/cython.lock \
+ && python3 -m venv /build/cython \
+ && /build/cython/bin/pip install --quiet --no-cache-dir --require-hashes --only-binary :all: --disable-pip-version-check \
+        -r /build/cython.lock \
+ && /build/cython/bin/python /build/distribution/extension.py
 COPY appliance /opt/rosrv/lib/python3.11/site-packages/appliance
 COPY roswire /opt/rosrv/lib/python3.11/site-packages/roswire
 COPY rosmop /opt/rosrv/lib/python3.11/site-packages/rosmop
@@ -36,6 +45,7 @@ COPY monitors /build/etc/monitors
 # Rights and times of a checkout are its owner's. He may keep his files to himself (umask 077): the processes' users
 # read them all the same; and when he fetched them is nothing that an image is to say.
 RUN cd /opt/rosrv/lib/python3.11/site-packages \
+ && cp /build/appliance/relay/transport/*.so appliance/relay/transport/ \
  && chmod -R u=rwX,go=rX appliance roswire rosmop /build/etc \
  && find appliance roswire rosmop /build/etc -exec touch {} + \
  && printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.supervisor.users import NUMERIC_IDS
+from distribution.extension import IN_PLACE
 from tests.support.docker import APPLIANCE, BASE, DEMO, ROOT
 from tests.system.containers.conftest import Site
 
@@ -79,6 +80,20 @@ def test_there_is_no_compiler_and_no_way_to_fetch_programs(
     ]
     assert tools == []
     assert not any("/site-packages/pip/" in path for path, _entry, _secret in contents)
+
+
+def test_it_has_the_compiled_module_but_no_cython(
+    contents: list[tuple[str, tarfile.TarInfo, bool]], site: Site
+) -> None:
+    """The image has the relay's module, built from this checkout's source, and not what builds it."""
+    assert not any(
+        re.search(r"/cython|extension\.py|pump\.c$", path, re.I) for path, _entry, _secret in contents
+    )
+    load = "from appliance.relay.transport import pump; print(pump.__file__)"
+    packages = "/opt/rosrv/lib/python3.11/site-packages"
+    assert (
+        run(site, "/opt/rosrv/bin/python", "-P", "-c", load) == f"{packages}/{IN_PLACE.relative_to(ROOT)}\n"
+    )
 
 
 def test_nothing_of_the_build_is_left(contents: list[tuple[str, tarfile.TarInfo, bool]]) -> None:
