@@ -1,4 +1,4 @@
-# cython: language_level=3, boundscheck=True, wraparound=False, initializedcheck=True, freethreading_compatible=False
+# cython: language_level=3, boundscheck=True, wraparound=False, initializedcheck=True, nonecheck=True, freethreading_compatible=False
 """Take whole small frames from a publisher to its subscribers while only the common work has to be done for them.
 
 Theory of operation:
@@ -215,6 +215,7 @@ cdef class ModuleCall:
         self._flags, (self._first, self._second) = place.flags, place.cells
         if len(wanted) != _OPTIONS or len(native.cells) > _PARTS:
             raise ValueError(f"too much for a step: {len(wanted)} bytes of options, {len(native.cells)} parts of a state")
+        self._parts = 0
         for at, size in native.cells:
             self._at[self._parts], self._size[self._parts] = at, size
             self._parts += 1
