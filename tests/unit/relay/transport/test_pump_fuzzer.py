@@ -1,0 +1,23 @@
+"""The pump under mistreatment, with AddressSanitizer and UndefinedBehaviorSanitizer (docs/dev/assurance.md)."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from distribution.checkout import ROOT
+from tests.support.examples import examples
+
+
+@pytest.mark.timeout(600)
+def test_no_bytes_and_no_order_of_calls_harm_memory() -> None:
+    """Mutated frames, closed descriptors, replaced memory and nonsense from a module cause no error in memory."""
+    seed = int.from_bytes(os.urandom(4))
+    command = [sys.executable, "-m", "tests.support.pump_fuzzer", str(seed), f"{examples(6)}e6"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{' '.join(command)}:\n{done.stderr[-5000:]}"
+    counts = {name: int(number) for number, name in re.findall(r"^ *(\d+)  (.+)$", done.stdout, re.MULTILINE)}
+    assert {"left: judged", "left: received", "left: sent", "left: unarmed", "module"} <= counts.keys()
+    assert counts["bytes at subscribers"] > 10_000
