@@ -273,7 +273,7 @@ class DataPlane:
         if interceptor.intercepts(topic):
             point = ObservationPoint(relayed.key, topic, relayed.host, relayed.name)
             pipeline = TopicPipeline(interceptor, point)
-            relayed.monitor(pipeline.through, wanted=wanted, judge=pipeline.judge, call=pipeline.module_call)
+            relayed.monitor(pipeline.through, wanted=wanted, call=pipeline.module_call)
         else:
             relayed.monitor(None, wanted=wanted)
 

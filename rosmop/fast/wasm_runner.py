@@ -461,7 +461,15 @@ class WasmLane:
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
             frame = view[position:following]
-            walked = self.process_start(frame, len(frame), time_ns, prepared)
+            walked = self._process_beginning(frame, self._shown, time_ns, prepared)
+            if (
+                walked is not None
+                and not (walked.position or walked.paused)
+                and self._shown < min(len(frame), BEGINNING)
+            ):
+                walked = self._process_beginning(frame, BEGINNING, time_ns, prepared)
+                if walked is None or walked.position:
+                    self._shown = BEGINNING
             if walked is not None:
                 if not walked.position:
                     paused = walked.paused
@@ -477,35 +485,19 @@ class WasmLane:
             position = following
         return BatchResult(position, run, dropped, told, sooner, output, paused)
 
-    def process_start(
-        self, start: memoryview, size: int, time_ns: int, prepared: BatchOptions
-    ) -> BatchResult | None:
-        """See `FastLane`."""
-        walked = self._process_beginning(start, size, self._shown, time_ns, prepared)
-        if (
-            walked is not None
-            and not (walked.position or walked.paused)
-            and self._shown < min(size, BEGINNING)
-        ):
-            walked = self._process_beginning(start, size, BEGINNING, time_ns, prepared)
-            if walked is None or walked.position:
-                self._shown = BEGINNING
-        return walked
-
     def _process_beginning(
-        self, frame: memoryview, whole: int, shown: int, time_ns: int, prepared: BatchOptions
+        self, frame: memoryview, shown: int, time_ns: int, prepared: BatchOptions
     ) -> BatchResult | None:
-        """Process one frame of `whole` bytes; the module gets only its first `shown` bytes."""
-        size, before = min(whole, shown), prepared.changed.copy()
+        """Process one frame; the module gets only its first `shown` bytes."""
+        size, before = min(len(frame), shown), prepared.changed.copy()
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
         _LENGTH.pack_into(area, 0, size - 4)
-        _TIME.pack_into(self._memory, REST, whole - size)
+        _TIME.pack_into(self._memory, REST, len(frame) - size)
         try:
             walked = self.process_batch(area, 0, 0, [], time_ns, prepared)
         finally:
             _TIME.pack_into(self._memory, REST, 0)
-            _LENGTH.pack_into(frame, 0, whole - 4)  # the frame may begin where `area` does
         if prepared.changed != before:
             frame[4:size] = area[4:]
         return walked

@@ -176,14 +176,6 @@ class FastLane(Protocol):
     def native(self) -> NativeCall | None:
         """Return how to call the module for batches in `Lanes.area`; None if its state is more than numbers."""
 
-    def process_start(
-        self, start: memoryview, size: int, time_ns: int, prepared: BatchOptions
-    ) -> BatchResult | None:
-        """Process a frame of `size` bytes by its `start`, which has at least 8 KiB.
-
-        The result is that of `process_batch`. The position 0 means that the frame is left to the engine.
-        """
-
     def process_message(
         self, message: Buffer, time_ns: int, prepared: BatchOptions, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:

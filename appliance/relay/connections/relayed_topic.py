@@ -6,10 +6,9 @@ the appliance) needs it, and a short time longer.
 
 Subscribers stay connected when the upstream is lost. Their publication stays valid until the control process withdraws
 it, which happens when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that
-closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once.
-Subscribers are cut if the publisher returns with another type, md5sum, definition or latching flag, because they must
-read the new header. They are also cut if the publisher's connection ends within a large frame that is passed on in
-pieces (`large_frames`). All other frames are passed on whole.
+closed its connection, and roscpp waits up to 20 s. Over the kept connections, messages continue at once. Frames are
+passed on whole (`frames`), so no subscriber gets a torn frame. Subscribers are cut only if the publisher returns with
+another type, md5sum, definition or latching flag, because they must read the new header.
 
 Subscribers get only messages that monitors pass on, and the relay latches only these. Messages that monitors publish
 have no upstream and bypass monitors (`published`). The first messages of a new publisher are kept for subscribers that
@@ -31,7 +30,6 @@ from typing import Protocol
 from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
-from appliance.relay.connections.large_frames import FrameInPieces, PieceSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
@@ -39,12 +37,11 @@ from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 
-_WHOLE = 8  # messages that are received whole after one that monitors needed whole
 _ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
 
 
-class TopicSubscriber(PieceSubscriber, Protocol):
+class TopicSubscriber(Protocol):
     """A subscriber, as its topic uses it."""
 
     host: str
@@ -55,6 +52,9 @@ class TopicSubscriber(PieceSubscriber, Protocol):
 
     missed: bool
     """Whether its rate limit dropped the last message for it."""
+
+    behind_since: float | None
+    """When its queue first became so long that it is behind; None once it has caught up completely."""
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
@@ -134,9 +134,6 @@ def _no_call() -> ModuleCall | None:
 Through = Callable[[Batch], Batch | None]
 """Passes frames through monitors; returns the frames that are passed on, or None."""
 
-Judge = Callable[[memoryview, int, int], bool | None]
-"""Decides a frame by its start, size and number: whether it is passed on, or None if monitors need the whole frame."""
-
 
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
@@ -180,7 +177,6 @@ class RelayedTopic:
         self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = (
             None  # a batch, and the subscribers that still need it
         )
-        self._begun: FrameInPieces | None = None
         self._recording: RingStream | ExcludedStream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
@@ -198,8 +194,6 @@ class RelayedTopic:
         self._paused = False
         self._connected = False
         self.through: Through | None = None
-        self._judge: Judge | None = None
-        self._whole_until = 0  # the number of the next message that monitors may decide by its start
         self._taps: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
@@ -269,9 +263,7 @@ class RelayedTopic:
         """
         if self._latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._recording is not None or self._startup_replay is not None:
-            return None
-        if self._waits is not None or self._begun is not None:
+        if self._recording is not None or self._startup_replay is not None or self._waits is not None:
             return None
         call = None
         if self.through is not None:
@@ -304,15 +296,15 @@ class RelayedTopic:
         through: Through | None,
         *,
         wanted: bool,
-        judge: Judge | None = None,
         call: Callable[[], ModuleCall | None] = _no_call,
     ) -> None:
         """Pass messages `through` monitors from the next batch on (None: bypass them).
 
-        With `wanted`, the topic stays connected for monitors even without a subscriber. Without `judge`, monitors need
-        all frames whole. `call` returns how the pump passes small frames through them (None: it cannot now).
+        With `wanted`, the topic stays connected for monitors even without a subscriber. `call` returns how the pump
+        passes small frames through them (None: it cannot now).
         """
-        self.through, self._judge, self._call = through, judge, call
+        self.through = through
+        self._call = call
         self.differs()
         if wanted == self._wanted:
             return
@@ -351,9 +343,6 @@ class RelayedTopic:
 
     def upstream_closed(self) -> None:
         """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
-        begun, self._begun = self._begun, None
-        if begun is not None:
-            begun.tear(self._served)
         self._end_recording()
         self.hand_out(divided=False)
         self._latch(None)
@@ -398,51 +387,6 @@ class RelayedTopic:
         if behind:
             self._pause_or_trim()
         self.counters.delayed(self._clock() - since, batch.messages)
-
-    def takes_pieces(self, size: int) -> bool:
-        """Whether a frame of `size` bytes may be passed on in pieces (`large_frames`)."""
-        return (
-            (
-                self.through is None
-                or (self._judge is not None and self.counters.following >= self._whole_until)
-            )
-            and not (self._taps or self._latching or self.flow.limits)
-            and self._startup_replay is None
-            and self._waits is None
-            and (self._recording is None or not self._recording.keeps)
-            and 0 < len(self._served) <= _ROW
-            and all(member.ready_for(size) for member in self._each())
-        )
-
-    def pass_piece(self, piece: memoryview, left: int, since: float) -> bool:
-        """Pass on a piece, received at `since`, of a frame of which `left` bytes are still to come.
-
-        Return False for the first piece of a frame that monitors need whole.
-        """
-        begun = self._begun
-        if begun is None:
-            passes = (
-                True
-                if self._judge is None
-                else self._judge(piece, len(piece) + left, self.counters.following)
-            )
-            if passes is None:
-                self._whole_until = self.counters.following + _WHOLE
-                return False
-            self._withheld = self._withheld or not passes
-            begun = self._begun = FrameInPieces(self._each() if passes else ())
-        if begun.pass_on(piece, self._served):
-            self._pause_or_trim()
-        if left:
-            return True
-        self._begun = None
-        if self._recording is not None:
-            self._recording.write(piece[:0], 1, self.counters.following)
-        self.counters.add(1, begun.size)
-        self._reported = False
-        if begun.members:
-            self.counters.delayed(self._clock() - since, 1)
-        return True
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         """Like `received`, for frames that were left for later."""

@@ -6,22 +6,18 @@ batches, cut at frame boundaries, whose memory other subscribers' queues share.
 Invariants:
 - Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
 - The rest of that frame counts as memory of the host. The buffer behind it is less than `LITTLE` times its size.
-- A frame that is passed on in pieces (`large_frames`) begins when no whole frame waits. Its unsent pieces are a part of
-  that rest. Small ones are joined, so that many tiny pieces take no more memory than is counted.
 - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
 """
 
 from collections import deque
-from itertools import chain, islice
 from math import ceil
 
 from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.transport.frames import LITTLE, PIECE, boundary_at, equal_frames
+from appliance.relay.transport.frames import LITTLE, boundary_at, equal_frames
 from appliance.relay.transport.memory import HostMemory
 
 _VECTORS = 64
 _BEHIND = 1 << 20
-_JOINED = 64 << 10  # bytes up to which a piece is joined with the previous ones
 
 
 class SendQueue:
@@ -31,16 +27,13 @@ class SendQueue:
         self._limit_messages = limits.queue_messages
         self._limit_size = limits.queue_bytes
         self._share = share
-        self._started: deque[memoryview] = deque()
-        self.begun = 0
-        """The unsent bytes of a frame that is sent in part."""
-
+        self._started: memoryview | None = None
         self._waiting: deque[tuple[memoryview, int]] = deque()
         self._messages = 0
         self._size = 0
 
     def __bool__(self) -> bool:
-        return bool(self._started or self._waiting)
+        return self._started is not None or bool(self._waiting)
 
     @property
     def messages(self) -> int:
@@ -57,9 +50,10 @@ class SendQueue:
         """Whether the queue is so long that the publisher should wait, if all other subscribers are behind as well."""
         return self._size >= _BEHIND or self.full
 
-    def ready_for(self, size: int) -> bool:
-        """Whether a frame of `size` bytes may begin: nearly everything is sent, and its unsent bytes could be kept."""
-        return not self._waiting and self.begun <= PIECE and not self._share.refusal(size)
+    @property
+    def begun(self) -> int:
+        """Return the unsent bytes of a frame that is sent in part."""
+        return 0 if self._started is None else len(self._started)
 
     @property
     def short(self) -> bool:
@@ -89,27 +83,27 @@ class SendQueue:
             self._count(messages, len(view))
 
     def begin(self, rest: memoryview) -> None:
-        """Queue the rest of a frame (or of the connection header), or its next piece, before all whole frames."""
+        """Put the rest of a frame (or of the connection header) at the head of the queue."""
+        self._started = _apart(rest)
         self._share.add(len(rest))
-        self.begun += len(rest)
-        while self._started and len(self._started[-1]) <= len(rest) < _JOINED:
-            rest = memoryview(b"".join((self._started.pop(), rest)))
-        self._started.append(_apart(rest))
 
     def vectors(self) -> list[memoryview]:
         """Return the views to send next, in order."""
-        return list(islice(chain(self._started, (view for view, _messages in self._waiting)), _VECTORS))
+        views = [] if self._started is None else [self._started]
+        for index, (view, _messages) in enumerate(self._waiting):
+            if index == _VECTORS:
+                break
+            views.append(view)
+        return views
 
     def advance(self, sent: int) -> None:
         """Remove the first `sent` bytes of `vectors()`, which the socket has taken."""
-        while sent and self._started:
-            part = self._started.popleft()
-            taken = min(sent, len(part))
+        if self._started is not None:
+            taken = min(sent, len(self._started))
             self._share.add(-taken)
-            self.begun -= taken
             sent -= taken
-            if taken < len(part):
-                self._started.appendleft(_apart(part[taken:]))
+            rest = self._started[taken:]
+            self._started = _apart(rest) if len(rest) else None
         while sent:
             view, messages = self._waiting.popleft()
             self._count(-messages, -len(view))
@@ -153,10 +147,10 @@ class SendQueue:
 
     def clear(self) -> None:
         """Forget everything; the subscriber is gone."""
-        self._share.add(-self._size - self.begun)
-        self._started.clear()
+        self._share.add(-self._size - (0 if self._started is None else len(self._started)))
+        self._started = None
         self._waiting.clear()
-        self._messages = self._size = self.begun = 0
+        self._messages = self._size = 0
 
     def _count(self, messages: int, size: int) -> None:
         self._messages += messages

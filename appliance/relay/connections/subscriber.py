@@ -8,7 +8,6 @@ Invariants:
 import errno
 import os
 import socket
-import struct
 from collections.abc import Callable, Mapping
 
 from appliance.relay.connections.relayed_topic import RelayedTopic
@@ -22,7 +21,6 @@ from appliance.relay.transport.rate_limit import RateAllowance
 from roswire.tcpros import encode_header
 
 _ANY = "*"
-_RESET = struct.pack("ii", 1, 0)
 
 
 class Subscriber:
@@ -82,21 +80,17 @@ class Subscriber:
             self.topic.key, self.topic.topic, "topic", self.host, self.caller_id
         )
         data = encode_header(header)
-        sent = self._offer(data)
-        if self._live and sent < len(data):
-            self._queue.begin(memoryview(data)[sent:])
-            self._write(True)
-        return self._live
-
-    def _offer(self, data: bytes | memoryview) -> int:
-        """Send without waiting, or cut the subscriber if that fails; return how many bytes the socket accepts."""
         try:
-            return self._send(data)
+            sent = self._send(data)
         except BlockingIOError:
-            pass
+            sent = 0
         except OSError as error:
             self._cut_by(error, "cannot be written to")
-        return 0
+            return False
+        if sent < len(data):
+            self._queue.begin(memoryview(data)[sent:])
+            self._write(True)
+        return True
 
     def deliver(self, batch: Batch) -> int:
         """Send the frames, or queue the bytes that the socket does not accept; return how many messages are dropped.
@@ -176,29 +170,6 @@ class Subscriber:
             return None
         flow.take(batch)
         return batch
-
-    def ready_for(self, size: int) -> bool:
-        """Whether a frame of `size` bytes may begin before it has arrived whole."""
-        return self._flow is None and self._queue.ready_for(size)
-
-    def extend(self, piece: Batch) -> None:
-        """Send the next piece of a frame, or queue the bytes that the socket does not accept."""
-        sent = 0 if self._writing else self._offer(piece.view)
-        if sent == len(piece.view) or not self._live:
-            return
-        if not self._writing:
-            self._write(True)
-        self._queue.begin(piece.rest(sent))
-        if self.behind_since is None:
-            self.behind_since = self._loop.clock()
-        if self._share.exhausted:
-            self.tear("its host has no memory left in the relay for the rest of a message")
-
-    def tear(self, reason: str) -> None:
-        """Cut the connection within a frame, by a reset: after a normal end, rospy would never connect again."""
-        if self._live:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-            self.cut(reason)
 
     @property
     def exhausted(self) -> bool:

@@ -20,7 +20,7 @@ from appliance.relay.connections.named_subscribers import NamedSubscribers, look
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, LoopTimer
-from appliance.relay.transport.frames import PIECE, SMALL, Batch, FrameReceiver
+from appliance.relay.transport.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.transport.memory import HeldBytes, StallDetector
 from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
@@ -49,7 +49,7 @@ class PublisherConnection(Upstream):
         self._limits = limits = context.limits
         self._weight = HeldBytes(context.memory.frames.of(topic.host))
         self._receiver = FrameReceiver(
-            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host), topic.takes_pieces
+            context.scratch, limits.message_bytes, context.memory.frames.of(topic.host)
         )
         self._stall = StallDetector(limits.stall_seconds)
         self._pumped = context.loop.pump.connection()
@@ -322,14 +322,6 @@ class PublisherConnection(Upstream):
             if rest is not None or self._receiver.more or self._topic.undelivered:
                 self._since = since
                 self._continue(rest)
-            return
-        piece = self._receiver.take_piece()
-        if piece is None:
-            return
-        if not self._topic.pass_piece(piece, self._receiver.left, since):
-            self._receiver.gather(piece)
-        elif len(piece) == PIECE and self._receiver.left and self._pause is None and not self._loop.over():
-            self._ready(READ)
 
     def _continue(self, rest: Batch | None) -> None:
         """Process received data until the quantum is used up; read from the publisher only when all is processed."""

@@ -54,33 +54,6 @@ class TopicPipeline:
         self._interceptor.keep(self._point[1])
         return judged
 
-    def judge(self, start: memoryview, size: int, number: int) -> bool | None:
-        """Decide a frame of `size` bytes by its start, which monitors may change; `number` is that of the message.
-
-        Return whether it is passed on, or None if monitors need the whole frame; then nothing has happened.
-        """
-        interceptor, monitors, now = self._interceptor, self._interceptor.monitors, self._interceptor.now()
-        lane = None if interceptor.blocked or monitors is None else monitors.lane(self._point[1])
-        if lane is None or lane is self._defect or monitors is None or not monitors.lane_ready(lane, now):
-            return None
-        prepared, counts = self._prepare(monitors, lane)
-        try:
-            walked = lane.process_start(start, size, now, prepared)
-        except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
-            self._failed(error, lane, now)
-            return None
-        if not counts.begun:
-            interceptor.observer.collect_later(counts)
-        if walked is not None:
-            if not walked.position:
-                return None
-            batch = Batch(start, 1, 0)
-            batch.first = number
-            self._account(walked, BatchProgress(batch, now), counts)
-            interceptor.schedule()
-        interceptor.keep(self._point[1])
-        return walked is None or not walked.run
-
     def _judged(self, batch: Batch) -> Batch | None:
         interceptor = self._interceptor
         now = batch.judged = batch.judged or interceptor.now()

@@ -11,15 +11,11 @@ returns all whole frames after each read as one `Batch`, without copying them:
   queue has kept it. A larger area is anonymous memory, so a declared length that is never sent costs only address
   space. While memory is short, no area is reused.
 
-- A large frame that is passed on in pieces (`connections/large_frames.py`) has no area: each piece is received into the
-  scratch area, and the last one ends with the frame.
-
-A batch always ends with a whole frame, so that other frames can follow it.
+Frames are passed on whole: the data sent to subscribers always ends with a whole frame.
 """
 
 import mmap
 import struct
-from collections.abc import Callable
 from math import ceil, gcd
 from typing import Literal
 
@@ -32,12 +28,6 @@ SMALL = 4 << 10
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
-
-PIECE = 256 << 10
-"""The bytes of a large frame that are passed on together; they stay in the processor's cache."""
-
-_START = 8 << 10  # the least bytes of the first piece, because monitors decide by them
-
 _KEEP_AREA = 8 << 20  # a camera image fits; new memory for each image costs four times all other work
 
 LITTLE = 8
@@ -175,19 +165,9 @@ class Scratch:
 
 
 class FrameReceiver:
-    """Receives frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver the batch.
+    """Receives frames. Repeat: call `buffer()`, receive into it, call `received(count)`, deliver the batch."""
 
-    `passes(size)`: whether a large frame of this size is passed on in pieces. If it is, `received` returns None, and
-    `take_piece` returns the next piece.
-    """
-
-    def __init__(
-        self,
-        scratch: Scratch,
-        limit: int,
-        share: HostMemory,
-        passes: Callable[[int], bool] = lambda _size: False,
-    ) -> None:
+    def __init__(self, scratch: Scratch, limit: int, share: HostMemory) -> None:
         self._scratch = scratch
         self._limit = limit
         self._share = share
@@ -200,18 +180,9 @@ class FrameReceiver:
         self._idle = True
         self._unwalked: memoryview | None = None
         self._aside = 0
-        self._passes = passes
-        self._in_pieces = False  # whether the last frame was passed on in pieces
-        self._piece: memoryview | None = None
-        self.left = 0
-        """The bytes that are still to come of a frame that is passed on in pieces."""
 
     def buffer(self) -> memoryview:
         """Return the buffer for the next bytes of the connection."""
-        if self.left:
-            return self._scratch.area[: PIECE if self.left > PIECE + LARGE else self.left]
-        if self._area is not None and not self._filled and self._passes(self._target):
-            self.abandon()
         if self._area is not None:
             if self._delivered is not None and self._delivered.kept:
                 self._area = _new_area(self._target)
@@ -222,7 +193,7 @@ class FrameReceiver:
         if torn:
             scratch[: len(torn)] = torn
             return scratch[len(torn) :]
-        return scratch[:PIECE] if self._in_pieces else scratch
+        return scratch
 
     def received(self, count: int) -> Batch | None:
         """Take `count` received bytes in the buffer; return the frames that are now complete.
@@ -231,18 +202,9 @@ class FrameReceiver:
         and if the publisher's host has no memory left for an unfinished frame.
         """
         self._idle = False
-        if self.left:
-            self.left -= count
-            self._piece = self._scratch.area[:count]
-            return None
         if self._area is not None:
             return self._received_in_area(self._area, count)
-        return self._walk(self._scratch.area, len(self._torn) + count, owned=False, whole=False)
-
-    def take_piece(self) -> memoryview | None:
-        """Return the piece that has just been received, if any; it is valid until the next call of `buffer`."""
-        piece, self._piece = self._piece, None
-        return piece
+        return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
 
     def hand_over(self) -> bytes:
         """Return the incomplete frame, which the pump continues."""
@@ -260,11 +222,6 @@ class FrameReceiver:
         self._idle, self._torn = False, bytes(area[size:end])
         self._count(len(self._torn))
         return Batch(area[:size], messages, None)
-
-    def gather(self, start: memoryview) -> None:
-        """Receive a frame whole after all; `start` is its first piece."""
-        self._begin_area(len(start) + self.left, start)
-        self.left = 0
 
     @property
     def more(self) -> bool:
@@ -294,9 +251,8 @@ class FrameReceiver:
 
     @property
     def small(self) -> bool:
-        """Whether the next bytes probably begin or continue a small frame, and no received frames are left."""
-        large = self._area is not None or self._in_pieces or self.left
-        return not large and self._unwalked is None and len(self._torn) <= SMALL
+        """Whether the next bytes begin a frame or continue a small one, and no received frames are left."""
+        return self._area is None and self._unwalked is None and len(self._torn) <= SMALL
 
     @property
     def unfinished(self) -> int:
@@ -315,7 +271,6 @@ class FrameReceiver:
         self._share.add(-self._aside)
         self._unwalked, self._aside = None, 0
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
-        self._piece, self.left = None, 0
 
     def _count(self, size: int) -> None:
         """Count the bytes that are held for this connection."""
@@ -323,11 +278,9 @@ class FrameReceiver:
             self._share.add(size - self._counted)
             self._counted = size
 
-    def _walk(self, buffer: memoryview, end: int, *, owned: bool, whole: bool = True) -> Batch | None:
-        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them.
-
-        Unless frames are needed `whole`, a large frame at the beginning may be passed on in pieces.
-        """
+    def _walk(self, buffer: memoryview, end: int, *, owned: bool) -> Batch | None:
+        """Return all whole frames in `buffer[:end]`; keep the incomplete one after them."""
+        limit = self._limit
         need = 0
         stride, messages = equal_frames(buffer, end)
         position = stride * messages
@@ -348,7 +301,9 @@ class FrameReceiver:
             return Batch(buffer[:position], messages, last, owned=owned)
         if position < end:
             if position + 4 <= end and need > LARGE:
-                self._begin(need, buffer[position:end], whole=whole or messages > 0)
+                if need - 4 > limit:
+                    raise _too_long(need - 4, limit)
+                self._begin_area(need, buffer[position:end])
             else:
                 self._torn = bytes(buffer[position:end])
         if self._area is None and len(self._torn) != self._counted:
@@ -357,19 +312,7 @@ class FrameReceiver:
                 raise _no_memory()
         if not messages:
             return None
-        self._in_pieces = False
         return Batch(buffer[:position], messages, last, owned=owned, stride=stride)
-
-    def _begin(self, need: int, start: memoryview, *, whole: bool) -> None:
-        """Begin a large frame of `need` bytes; `start` is the part received so far."""
-        if need - 4 > self._limit:
-            raise _too_long(need - 4, self._limit)
-        if whole or self._share.exhausted or not self._passes(need):
-            self._begin_area(need, start)
-        elif len(start) < _START:
-            self._torn = bytes(start)
-        else:
-            self._in_pieces, self._piece, self.left = True, start, need - len(start)
 
     def _begin_area(self, need: int, start: memoryview) -> None:
         """Continue a frame of `need` bytes in its own area; `start` is the part received so far."""

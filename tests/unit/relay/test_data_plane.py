@@ -452,13 +452,10 @@ def test_memory_is_given_back(world: World) -> None:
 
 
 def test_a_publisher_that_stalls_in_a_large_message_is_cut() -> None:
-    """The stalled message's memory is released; a slow publisher that makes progress is not cut.
-
-    The topic is latching, so its messages are received whole.
-    """
+    """The stalled message's memory is released; a slow publisher that makes progress is not cut."""
     patient = World(replace(LIMITS, stall_seconds=0.5))
     subscriber = patient.connect(encode_header(ASK))
-    publisher = patient.upstream(HEADER | {"latching": "1"})
+    publisher = patient.upstream()
     patient.gets_header(subscriber)
     message = encode_frame(bytes(MIB))
     for start in range(0, MIB, MIB // 4):

@@ -122,21 +122,3 @@ def test_a_connection_that_ends_within_a_message_is_no_longer_recorded(memory: i
     story.topic.tap(lambda _batch: story.topic.upstream_closed(), latched=False)
     story.receive(batch(bytes(100_000)))
     assert kept(memory) == []
-
-
-def test_a_recorded_topic_gets_whole_frames_and_an_excluded_one_a_mark_for_each_frame(memory: int) -> None:
-    """A large frame of an excluded topic is passed on in pieces, and its time is recorded once, at its end."""
-    story = Story(recorded=given(memory))
-    story.join()
-    story.topic.upstream_opened(HEADER)
-    assert not story.topic.takes_pieces(1 << 20)
-    other = Story(recorded=given(memory, never=("/chatter",)))
-    member = other.join()
-    other.topic.upstream_opened(HEADER)
-    assert other.topic.takes_pieces(8)
-    for left in (4, 0):
-        other.topic.pass_piece(memoryview(b"1234"), left, other.now)
-    other.receive(batch(b"next"))
-    reader = RingReader(memoryview(mmap.mmap(memory, 0, prot=mmap.PROT_READ)))
-    marks = [one.first for found in reader.read(*EVER) for one in found.batches]
-    assert (member.received[:8], marks) == (b"12341234", [1, 2])

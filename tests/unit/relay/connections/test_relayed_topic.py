@@ -94,18 +94,6 @@ class RecordedMember:
         """Return False: there is always memory."""
         return False
 
-    def ready_for(self, _size: int) -> bool:
-        """Whether the test has not made it slow."""
-        return self.behind_since is None
-
-    def extend(self, piece: Batch) -> None:
-        """Record a piece of a frame."""
-        self.received += bytes(piece.view)
-
-    def tear(self, reason: str) -> None:
-        """Record the reason."""
-        self.was_cut = reason
-
     @property
     def full(self) -> bool:
         """Whether the test made it slow."""
@@ -559,50 +547,3 @@ def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
         None: 2,
     }
     assert row.delay_seconds == pytest.approx(18.003)
-
-
-def test_a_frame_goes_in_pieces_only_while_nothing_needs_it_whole() -> None:
-    """Each of these makes the relay receive it whole, until it is over."""
-    story = Story(fresh=False)
-    topic = story.topic
-    assert not topic.takes_pieces(1 << 20), "no subscriber"
-    member = story.join()
-    topic.upstream_opened(HEADER)
-    assert topic.takes_pieces(1 << 20)
-    tap = story.refused.append
-    topic.tap(tap, latched=False)  # type: ignore[arg-type]  # it gets no batch here
-    assert not topic.takes_pieces(1 << 20)
-    topic.untap(tap)  # type: ignore[arg-type]  # the same
-    limit = SharedRateLimit(FlowLimit(messages=2), story.now).of("")
-    topic.flow.set(limit, None)
-    assert not topic.takes_pieces(1 << 20)
-    topic.flow.set(None, None)
-    topic.monitor(lambda batch: batch, wanted=True)
-    assert not topic.takes_pieces(1 << 20)
-    topic.monitor(None, wanted=False)
-    member.behind_since = story.now
-    assert not topic.takes_pieces(1 << 20)
-    member.behind_since = None
-    crowd = [story.join() for _ in range(16)]
-    assert not topic.takes_pieces(1 << 20), "too many subscribers for one turn"
-    topic.leave(crowd[0])
-    assert topic.takes_pieces(1 << 20)
-    topic.upstream_closed()
-    topic.upstream_opened(HEADER | {"latching": "1"})
-    assert not topic.takes_pieces(1 << 20)
-
-
-def test_a_frame_in_pieces_pauses_the_publisher_while_all_subscribers_are_behind() -> None:
-    """The pause ends as for other messages; a subscriber that keeps up prevents it."""
-    story = Story(fresh=False)
-    members = [story.join(), story.join()]
-    story.topic.upstream_opened(HEADER)
-    members[0].behind_since = story.now
-    story.topic.pass_piece(memoryview(b"12345678"), 8, story.now)
-    assert "pause 0.05" not in story.upstream.asked
-    members[1].behind_since = story.now
-    story.topic.pass_piece(memoryview(b"12345678"), 0, story.now)
-    assert story.upstream.asked[-1] == "pause 0.05"
-    story.topic.relieve()
-    assert story.upstream.asked[-1] == "resume"
-    assert [member.received for member in members] == [b"1234567812345678"] * 2

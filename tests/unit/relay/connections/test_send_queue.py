@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from appliance.relay.connections.send_queue import SendQueue
 from appliance.relay.relay_limits import RelayLimits
-from appliance.relay.transport.frames import LITTLE, PIECE
+from appliance.relay.transport.frames import LITTLE
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 
@@ -51,14 +51,13 @@ class NaiveOutbox:
 
 
 batches = st.lists(st.integers(0, 40), min_size=1, max_size=8)
-pieces = st.binary(min_size=1, max_size=40)
-steps = st.lists(st.one_of(batches, pieces, st.floats(0, 1), st.none()), max_size=30)
+steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 
 
 @settings(max_examples=examples(300))
 @given(steps)
-def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | bytes | float | None]) -> None:
-    """For anything queued whole or in pieces, partly sent and trimmed, bytes, counts and used memory are the same."""
+def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
+    """For anything queued, partly sent and trimmed, bytes, counts and used memory are the same."""
     budget = share(1 << 30)
     queue, naive, number = SendQueue(LIMITS, budget), NaiveOutbox(), 0
     for step in script:
@@ -69,11 +68,6 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | byt
             sent = int(step * total)
             queue.advance(sent)
             naive.advance(sent)
-        elif isinstance(step, bytes):
-            if queue.ready_for(len(step)):
-                queue.begin(memoryview(step))
-                naive.started += step
-            assert queue.ready_for(len(step)) == (not naive.frames)
         else:
             frames = [frame(size, number + index) for index, size in enumerate(step)]
             number += len(frames)
@@ -134,26 +128,3 @@ def test_the_rest_of_a_connection_header_goes_first() -> None:
     queue.append(memoryview(frame(4)), 1)
     assert b"".join(queue.vectors()) == b"header" + frame(4)
     assert queue.messages == 1
-
-
-def test_a_frame_may_begin_if_little_is_unsent_and_the_host_has_memory_for_it() -> None:
-    """Otherwise it is queued whole, so that it can be dropped."""
-    queue = SendQueue(LIMITS, share(2 * PIECE))
-    assert queue.ready_for(2 * PIECE)
-    assert not queue.ready_for(2 * PIECE + 1)
-    queue.begin(memoryview(bytes(PIECE)))
-    assert queue.ready_for(PIECE)
-    queue.begin(memoryview(b"x"))
-    assert not queue.ready_for(1)
-    queue.clear()
-    queue.append(memoryview(frame(4)), 1)
-    assert not queue.ready_for(1)
-
-
-def test_tiny_pieces_are_joined() -> None:
-    """A frame that arrives byte by byte is not kept as thousands of objects."""
-    queue, data = SendQueue(LIMITS, share(1 << 30)), bytes(range(256)) * 16
-    for number in range(len(data)):
-        queue.begin(memoryview(data)[number : number + 1])
-    assert len(queue.vectors()) <= len(data).bit_length()
-    assert b"".join(queue.vectors()) == data

@@ -17,7 +17,7 @@ from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
-from appliance.relay.transport.frames import Batch, FrameReceiver, Scratch
+from appliance.relay.transport.frames import FrameReceiver, Scratch
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.logics.interface import ClockedRun, FiniteRun
@@ -66,7 +66,6 @@ class Monitored:
         known: Definitions,
         *,
         together: bool,
-        by_start: bool = False,
         on_fault: Any = "drop",
         shadows: Collection[str] = (),
         restarted: bool = False,
@@ -87,7 +86,6 @@ class Monitored:
         self.interceptor.over = lambda: False
         self.interceptor.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[tuple[str, str], TopicPipeline] = {}
-        self._starts = by_start
         compiled, make = compiled_from(texts, known), on_module if together else MonitorSet.of
         self.set = make(compiled, on_fault, shadows=shadows)
         self.interceptor.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
@@ -113,25 +111,10 @@ class Monitored:
         batch.first = first
         place = ObservationPoint("key", traffic.topic, "10.0.0.7", publisher)
         lane = self._lanes.setdefault((traffic.topic, publisher), TopicPipeline(self.interceptor, place))
-        left = self._by_start(lane, traffic, first, scratch) if self._starts else lane.through(batch)
+        left = lane.through(batch)
         if left is None:
             return 0, b"", b""
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
-
-    def _by_start(self, lane: TopicPipeline, traffic: Traffic, first: int, scratch: Scratch) -> Batch | None:
-        """Judge each message like a large one, by its start; those that are needed whole follow the usual path."""
-        passed: list[bytes] = []
-        for number, body in enumerate(traffic.bodies(), first):
-            frame = scratch.area[: 4 + len(body)]
-            frame[:] = struct.pack("<I", len(body)) + body
-            passes = lane.judge(frame, len(frame), number)
-            batch: Batch | None = Batch(frame, 1, 0)
-            if batch is not None and passes is None:
-                batch.first = number
-                batch = lane.through(batch)
-            if batch is not None and passes is not False:
-                passed.append(bytes(batch.view))
-        return Batch(memoryview(bytearray(b"".join(passed))), len(passed), None) if passed else None
 
     def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
         """Judge requests or replies one by one, and return the same as `through`, with errors for refused ones."""
@@ -177,28 +160,25 @@ class Monitored:
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
           switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
-    """Send the same traffic as batches, as single messages and by their starts; fail at the first difference."""
-    ways = [
-        Monitored(texts, known, together=together, by_start=by_start, on_fault=on_fault)
-        for together, by_start in ((False, False), (True, False), (True, True))
-    ]
+    """Send the same traffic as batches and as single messages; fail at the first difference."""
+    ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
     try:
         for number, traffic in enumerate(all_traffic):
             for way in ways:
                 way.time += 700_000
                 if switched is not None and number in (switched[0], switched[0] + 3):
                     way.interceptor.switch(switched[1], number != switched[0])
-            one, together, by_start = (way.through(traffic) for way in ways)
-            assert one == together == by_start, f"batch {number} of {traffic.topic}"
-            assert ways[0].published == ways[1].published == ways[2].published
-            one_state, state, last_state = (way.state() for way in ways)
-            assert one_state == state == last_state, f"after batch {number} of {traffic.topic}"
+            one, together = (way.through(traffic) for way in ways)
+            assert one == together, f"batch {number} of {traffic.topic}"
+            assert ways[0].published == ways[1].published
+            one_state, state = (way.state() for way in ways)
+            assert one_state == state, f"after batch {number} of {traffic.topic}"
             if number % 4 == 3:
-                one_told, told, last_told = (way.told() for way in ways)
-                assert one_told == told == last_told
-        one_told, told, last_told = (way.told() for way in ways)
-        assert one_told == told == last_told
-        assert ways[0].rows() == ways[1].rows() == ways[2].rows()
+                one_told, told = (way.told() for way in ways)
+                assert one_told == told
+        one_told, told = (way.told() for way in ways)
+        assert one_told == told
+        assert ways[0].rows() == ways[1].rows()
     finally:
         for way in ways:
             way.close()

@@ -75,37 +75,6 @@ def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int
     assert budget.used == 0
 
 
-@settings(max_examples=examples(150))
-@given(sizes, cut_sizes, st.lists(st.booleans(), min_size=1))
-def test_large_frames_in_pieces_leave_the_stream_as_it_is(
-    lengths: list[int], cuts: list[int], answers: list[bool]
-) -> None:
-    """Pieces belong to one large frame and hold no memory, whichever frames are passed on in pieces."""
-    data = b"".join(frame(size, index) for index, size in enumerate(lengths))
-    budget, asked = share(1 << 30), iter(answers * (len(data) + 1))
-    one = FrameReceiver(Scratch(), LIMIT, budget, lambda _size: next(asked))
-    found, begun, position, turn = b"", 0, 0, 0
-    while position < len(data):
-        buffer = one.buffer()
-        count = min(len(buffer), max(cuts[min(turn, len(cuts) - 1)], len(data) // 2000), len(data) - position)
-        buffer[:count] = data[position : position + count]
-        position, turn = position + count, turn + 1
-        batch, piece = one.received(count), one.take_piece()
-        if piece is not None:
-            assert batch is None
-            begun = begun or struct.unpack_from("<I", piece)[0] + 4
-            assert begun > LARGE
-            assert budget.used == 0
-            found += piece
-            begun = one.left and begun
-        elif batch is not None:
-            assert not begun
-            found += batch.view
-    assert found == data
-    one.abandon()
-    assert (one.left, budget.used) == (0, 0)
-
-
 def test_a_torn_frame_is_never_part_of_a_batch() -> None:
     """A batch ends with a whole frame, so a dying publisher tears no stream."""
     one, _budget = receiver()
