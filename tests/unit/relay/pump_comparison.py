@@ -309,6 +309,7 @@ class PumpComparison:
         self._statement = self._statements[texts]
         self._ordered = any("/other" in text for text in texts)
         for side in self.both:
+            side.engine.interceptor.tick()  # what was counted since the last second belongs to the earlier monitors
             side.state(structs.replace(self._statements[texts], revision=self._revision))
             side.answered(self._revision)
         self._settle()
