@@ -232,8 +232,7 @@ inline answer_policy() {
     }
 }
 
-/* = appliance/master/graph/graph.py RosGraph.revoked
-   = appliance/master/graph/revocation.py Revocation._take_back */
+/* = appliance/master/graph/graph.py RosGraph.revoked */
 inline revoke_publication(p) {
     may_publish[p] = false;
     if

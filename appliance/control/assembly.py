@@ -58,23 +58,28 @@ def assemble(base: Foundation) -> Parts:
         faces=ends.faces,
         addresses=ends.addresses,
     )
-    registration = RegistrationCalls(
+    parameters = ParameterCalls(
         ends.rosmaster,
+        core.parameters,
+        core.graph,
+        ends.enactor,
+        core.rights,
+        int(base.settings.limits.offload_bytes),
+    )
+    registration = RegistrationCalls(
         core.registry,
         core.graph,
         ends.enactor,
-        ends.faces,
         arrivals,
         ends.relay,
         core.mediation,
         core.gate,
-        core.rights,
+        parameters,
     )
     publisher = OwnPublisher(
         core.registry,
         core.graph,
         ends.enactor,
-        ends.enactor.entries,
         name=settings.publish_as,
         inner_port=base.port(INNER),
         wanted=lambda: (
@@ -113,7 +118,6 @@ def assemble(base: Foundation) -> Parts:
             core.registry,
             ends.faces,
             core.graph,
-            core.revocation,
             ends.enactor,
             core.parameters,
             base.trail,
@@ -176,9 +180,6 @@ def _make_calls(
         stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
         unseen=settings.publish_as if settings.hide_publisher else None,
     )
-    parameters = ParameterCalls(
-        ends.rosmaster, core.parameters, core.graph, ends.enactor, core.rights, offload
-    )
     execution = Execution(
         gate=core.gate,
         policy=core.policy,
@@ -186,14 +187,14 @@ def _make_calls(
         registry=core.registry,
         enactor=ends.enactor,
         liveness=ends.liveness,
-        parameters=parameters,
+        parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,
         large=offload,
         large_writes=LargeWrites(offload, base.quota_class),
     )
     pipeline = Pipeline(
         execution,
-        Multicall(execution, parameters, trail, offload=offload),
+        Multicall(execution, registration.parameters, trail, offload=offload),
         addresses=ends.addresses,
         trail=trail,
         limits=value_limits(settings),
@@ -201,4 +202,4 @@ def _make_calls(
         bulk=bulk_turns(base.quota_class),
         processor=base.listener_limits.time,
     )
-    return pipeline, master_table(registration, lookups, parameters, monitor_calls)
+    return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

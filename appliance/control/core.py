@@ -18,6 +18,7 @@ from appliance.policy.policy import Policy
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import PARAMETER_BYTES
 from appliance.specifications.specification_manager import SpecificationManager
+from roswire.parameter_tree import Tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +54,13 @@ def make_core(base: Foundation) -> Core:
         stand_ins=settings.mediation == "full",
     )
     rights = ParameterRights(policy, base.trail)
-    graph = RosGraph(registry, grants, mediation, may_read_value=rights.may_read_value)
-    limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
     parameters = _make_mirror(base)
+
+    def tree() -> Tree:
+        return parameters.tree
+
+    graph = RosGraph(registry, grants, mediation, tree, may_read_value=rights.may_read_value)
+    limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
     return Core(
         policy=policy,
         registry=registry,
@@ -66,7 +71,7 @@ def make_core(base: Foundation) -> Core:
         graph=graph,
         gate=CallGate(policy, registry, limits),
         parameters=parameters,
-        revocation=Revocation(registry, grants, graph, policy, lambda: parameters.tree),
+        revocation=Revocation(registry, grants, graph, policy, tree),
         monitors=monitors,
     )
 

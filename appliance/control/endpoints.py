@@ -10,7 +10,6 @@ from appliance.control.foundation import INNER, RVMASTER, Current, Foundation
 from appliance.control.listener_limits import value_limits
 from appliance.control.recording_orders import RecordingOrders
 from appliance.master import rosout
-from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
@@ -80,7 +79,6 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
     rosmaster = RosMaster(
         settings.rosmaster_port,
         limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
-        small={call.name for call in MASTER_CALLS.values() if call.small},
     )
     faces = ProxyEndpoints(
         core.registry,
@@ -89,7 +87,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         serve=lambda incarnation: handler()(incarnation),  # noqa: PLW0108 - it is set later
         server=base.listener_limits.server,
     )
-    entries = MasterRegistrations(rosmaster, faces.inner_uri)
+    entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)
     enactor = Enactor(
         core.graph,
         entries,

@@ -13,7 +13,7 @@ def test_many_histories() -> None:
 
 
 def test_faults_of_the_core_are_found() -> None:
-    """Several hundred histories find each fault, mostly within the first ones."""
-    found = dict(line.rsplit(": ", 1) for line in said("--mutants", "400"))
+    """A thousand histories find each fault, mostly within the first ones."""
+    found = dict(line.rsplit(": ", 1) for line in said("--mutants", "1200"))
     assert set(found) == set(MUTANTS)
     assert "None" not in found.values()

@@ -119,9 +119,16 @@ class HiddenMaster:
         self.parameters: dict[str, Value] = {"run_id": "1"}
         self.pid = 4711
 
-    async def call(self, method: str, *params: Value) -> Answer:
-        """Carry out one call, which takes a turn of the loop."""
+    async def call(self, method: str, *params: Value) -> Value:
+        """Carry out one call, or the calls of a multicall, which takes a turn of the loop."""
         await asyncio.sleep(0)
+        if method == "system.multicall":
+            parts = cast(list[dict[str, Any]], params[0])
+            return [[self.carry_out(part["methodName"], *part["params"])] for part in parts]
+        return self.carry_out(method, *params)
+
+    def carry_out(self, method: str, *params: Value) -> Answer:
+        """Carry out one call."""
         self.calls.append((method, *params))
         for beginning in ("register", "unregister"):
             kind = _TABLES.get(method.removeprefix(beginning))
@@ -185,9 +192,6 @@ class Inner:
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         return self._registry.find(caller.caller_id, caller.peer.host, api.text)
-
-    def unassigned_uri(self) -> str:
-        return node_uri("127.0.0.1", _INNER_PORT, "/nobody/")
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
         known = self.known(caller, api)
@@ -282,14 +286,18 @@ class ControlParts:
         trail = cast(Any, self.records)
         rights = ParameterRights(lambda: self.current, trail)
         self.graph = RosGraph(
-            self.registry, self.grants, cast(Any, self.mediation), may_read_value=rights.may_read_value
+            self.registry,
+            self.grants,
+            cast(Any, self.mediation),
+            lambda: self.parameters.tree,
+            may_read_value=rights.may_read_value,
         )
         self.revocation = Revocation(
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
         )
         self.rosmaster = RosMaster(1, limits=XmlRpcLimits(), hold=1.0)
         self.rosmaster.calls = cast(Any, self.hidden)
-        self.entries = MasterRegistrations(self.rosmaster, self.faces.inner_uri)
+        self.entries = MasterRegistrations(self.rosmaster, self.registry, self.faces.inner_uri)
         self.enactor = Noted(
             self.graph,
             self.entries,
@@ -306,7 +314,6 @@ class ControlParts:
             self.registry,
             cast(Any, self.faces),
             self.graph,
-            self.revocation,
             self.enactor,
             self.parameters,
             trail,
@@ -389,9 +396,16 @@ class ControlParts:
         return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
-        """Register at `rosmaster`, and in control's registry."""
-        await self.entries.make(node, NodeRegistration(kind, resource, detail, 0))
+        """Register in control's registry, and at `rosmaster`."""
         self.enactor.carry_out(self.graph.registered(node, kind, resource, detail))
+        await self.settle()
+
+    def fill_queue(self) -> None:
+        """Shut the door, and fill the queue of changes: registering calls then wait for the next round."""
+        self.rosmaster.shut()
+        node = self.node("/filler", 999)
+        for number in range(1024):
+            self.entries.make(node, NodeRegistration(Kind.PUBLICATION, f"/filler_{number}", "t", number))
 
     def reload(self, text: str) -> int:
         """Put this policy in force; return the number of revocations."""

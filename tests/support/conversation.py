@@ -13,7 +13,6 @@ Actions (`Conversation.say`):
     `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
     a round                                                         of the reconcile loop
     `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
-    `ROSMaster sets /speed 3`                                       a value that control has not set
     state                                                           what control and the ROS master have
     given LINE                                                      another action, whose effects are not listed
 
@@ -42,10 +41,10 @@ from appliance.master.graph.effects import (
     PlaceGrant,
     PlaceNode,
     PlaceResource,
-    PutBack,
+    RegisterAtMaster,
     RevokeGrant,
-    TakeBack,
     TellNode,
+    UnregisterAtMaster,
     WithdrawNode,
     WithdrawResource,
     WriteRecord,
@@ -160,8 +159,6 @@ class Conversation:
             case ["ROSMaster", "has", name, kind, resource, "of", owner]:
                 uri = parts.faces.inner_uri(self._node(owner))
                 await parts.hidden.call(_REGISTER[Kind(kind)], name, resource, "type", uri)
-            case ["ROSMaster", "sets", key, value]:
-                parts.hidden.parameters[key[1:]] = json.loads(value)
             case [name, *happening]:
                 await self._node_event(self._node(name), happening)
         return []
@@ -272,9 +269,9 @@ class Conversation:
             case PlaceGrant(row) | RevokeGrant(row):
                 whose = self._names[row.key]
                 text = f"{_WORDS[type(effect)]} {row.caller_id} of {row.host} {row.kind} {row.resource} of {whose}"
-            case PutBack(_, registrations):
-                text = f"ROSMaster: {name} has {', '.join(f'{one.kind} {one.resource}' for one in registrations)} again"
-            case TakeBack(_, one):
+            case RegisterAtMaster(_, one):
+                text = f"ROSMaster: {name} has {one.kind} {one.resource}"
+            case UnregisterAtMaster(_, one):
                 text = f"ROSMaster: {name} has {one.kind} {one.resource} no more"
             case WriteRecord():
                 text = f"record {effect.event}: {effect.caller_id} {effect.category} {effect.resource}"

@@ -54,6 +54,7 @@ from appliance.master.reconcile import arrivals as arrivals_module
 from appliance.master.reconcile import liveness as liveness_module
 from appliance.master.reconcile.arrivals import Arrivals
 from appliance.master.reconcile.enactor import Enactor, restore
+from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.reconcile.reminders import Reminders
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -237,11 +238,18 @@ class Master(HiddenMaster):
         super().__init__()
         self._world = world
 
-    async def call(self, method: str, *params: Value) -> Answer:
+    async def call(self, method: str, *params: Value) -> Value:
         await self._world.some_time()
         breaks = self._world.faulty and self._world.rng.random() < 0.04
         if breaks and self._world.rng.random() < 0.5:
             raise RefusedError("nobody is there")
+        answer = await super().call(method, *params)
+        await self._world.some_time()
+        if breaks:
+            raise BrokenOffError("the connection ended")
+        return answer
+
+    def carry_out(self, method: str, *params: Value) -> Answer:
         if (
             method in ("registerPublisher", "registerSubscriber")
             and self.nodes.get(str(params[0]), params[-1]) != params[-1]
@@ -249,11 +257,7 @@ class Master(HiddenMaster):
             for table in self.tables.values():  # as `rosmaster` does with a node that has another URI
                 for holders in table.values():
                     holders.pop(str(params[0]), None)
-        answer = await super().call(method, *params)
-        await self._world.some_time()
-        if breaks:
-            raise BrokenOffError("the connection ended")
-        return answer
+        return super().carry_out(method, *params)
 
 
 class Reach:
@@ -648,6 +652,22 @@ class World:
             text = f"{name} of {host} has {topic}, which the policy does not grant"
             self.errors.append(BrokenPromiseError(text))
 
+    def check_master(self) -> None:
+        """Assert that `rosmaster` has exactly the registrations of live nodes."""
+        faces = self.control.faces
+        wanted = {
+            (one.kind, one.resource, node.name, faces.inner_uri(node))
+            for node, one in self.control.registry.in_order()
+        }
+        there = {
+            (kind, resource, name, uri)
+            for kind, table in self.master.tables.items()
+            for resource, holders in table.items()
+            for name, uri in holders.items()
+        }
+        if there != wanted:
+            raise BrokenPromiseError(f"rosmaster has {there - wanted} and lacks {wanted - there}")
+
     def check_connected(self) -> None:
         """Assert that live subscribers are connected to exactly the live publishers that the policy allows."""
         holders = {}
@@ -738,6 +758,7 @@ async def _run(world: World) -> None:
     if world.errors:
         raise world.errors[0]
     world.check_connected()
+    world.check_master()
 
 
 def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
@@ -756,6 +777,10 @@ def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
 def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
     """Do nothing, in place of a removed part."""
     return []
+
+
+async def _no_round(_reconciler: Reconciler) -> None:
+    """Do nothing, in place of a comparison."""
 
 
 def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
@@ -777,7 +802,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
         "uri_for",
         lambda node, _told, hidden: node.real_uri,
     ),
-    "a reload takes back no registration": (Revocation, "_take_back", _nothing),
+    "a reload takes back no registration": (RosGraph, "revoked", _nothing),
     "a reload takes back no grant": (Revocation, "_revoke", _nothing),
     "what a policy took is not put back": (Revocation, "returned", _nothing),
     "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
@@ -788,6 +813,7 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "the relay is not told of a grant": (Enactor, "carry_out", _without(PlaceGrant)),
     "the relay is not told what is revoked": (Enactor, "carry_out", _without(RevokeGrant)),
     "the relay is not told who publishes": (Enactor, "carry_out", _without(PlaceResource)),
+    "a round leaves the ROS master as it is": (Reconciler, "_compare", _no_round),
     "a node that comes back is placed nowhere": (Enactor, "carry_out", _without(PlaceNode)),
 }
 """Faults of the core: the replaced attribute, and its replacement."""

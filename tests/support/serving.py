@@ -79,9 +79,7 @@ def serving(
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(
-            RegistrationCalls(
-                rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
-            ),
+            RegistrationCalls(registry, graph, enactor, arrivals, relay, mediation, gate, parameters),
             LookupCalls(
                 registry,
                 graph,

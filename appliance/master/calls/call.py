@@ -231,7 +231,6 @@ class RosCall(Generic[S]):
     denial      the value in a denial; it has the type of the call's result, because client libraries check the type
     command     the name of the call in the policy, if `policy/commands` does not derive the name
     tells       the answer is the value of the ROS parameter, which may be a large tree
-    small       parameters and answer are a few names, so concurrent calls are sent to the ROS master as one call
     in_run      adjacent calls with this flag in a multicall are decided, recorded and carried out together
     """
 
@@ -242,7 +241,6 @@ class RosCall(Generic[S]):
     denial: Value = 0
     command: str | None = None
     tells: bool = False
-    small: bool = False
     in_run: bool = False
     identity: Identity = field(init=False)  # the check of the caller_id
     resource: int | None = field(init=False)  # the index of the parameter that is the call's resource

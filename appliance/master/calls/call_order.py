@@ -1,7 +1,8 @@
 """Serialise overlapping calls: registrations of the same name, and writes of overlapping parameter keys.
 
-The registry gets a registration only after the ROS master's answer. If two hosts registered a free name at the same
-time, both would be allowed, and the later host would take the name away. So registering calls of a name wait for each
+A registering call may wait after its decision: for its record, for its ports, for earlier changes that the ROS master
+gets. If two hosts registered a free name at the same time, both would be allowed, and the later host would take the
+name away. So registering calls of a name wait for each
 other, and are decided in their turn. A call that need not wait enters without a switch of tasks, so its decision is
 still valid.
 

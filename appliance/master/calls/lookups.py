@@ -19,8 +19,8 @@ from roswire.xmlrpc import Value
 class LookupCalls:
     """The lookup calls. They are answered from the registry, with the URIs of proxies.
 
-    The registry has all registrations that the ROS master accepted and the policy allows, even while the ROS master is
-    away. `port` is RVMaster's port. `stop(reason)` ends the appliance. `getSystemState` omits the publisher `unseen`.
+    The registry has all registrations that the policy allows, even while the ROS master is away.
+    `port` is RVMaster's port. `stop(reason)` ends the appliance. `getSystemState` omits the publisher `unseen`.
     """
 
     registry: Registry

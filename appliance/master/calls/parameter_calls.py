@@ -59,17 +59,20 @@ class ParameterCalls:
 
     async def get_param(self, caller: Caller, key: str) -> Answer:
         """`getParam(caller_id, key)`."""
+        answer = await self.read(caller, key)
+        hidden = self.rights.hidden(caller, "getParam", key, answer)
+        return answer if hidden is None else [0, hidden, 0]
+
+    async def read(self, caller: Caller, key: str) -> Answer:
+        """Return the answer to `getParam` for a caller that may read everything."""
         there, _ = standing_at(self.mirror.tree, key)
         if not self.rosmaster.reachable or (
             isinstance(there, dict) and weigh(there, self.large) >= self.large
         ):
-            answer = await self.rosmaster.call("getParam", caller.caller_id, key)
-        elif there is None:
-            answer = [-1, f"Parameter [{key}] is not set", 0]
-        else:
-            answer = [1, f"Parameter [{key}]", settled(there)]
-        hidden = self.rights.hidden(caller, "getParam", key, answer)
-        return answer if hidden is None else [0, hidden, 0]
+            return await self.rosmaster.call("getParam", caller.caller_id, key)
+        if there is None:
+            return [-1, f"Parameter [{key}] is not set", 0]
+        return [1, f"Parameter [{key}]", settled(there)]
 
     async def has_param(self, caller: Caller, key: str) -> Answer:
         """`hasParam(caller_id, key)`."""

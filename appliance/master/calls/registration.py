@@ -1,7 +1,8 @@
 """Carry out the calls that register and unregister topics, services, and subscriptions to parameters.
 
-A registration is on disk before its node gets the answer. A ROS 1 node never registers twice, and control and the ROS
-master may die at the same time.
+RVMaster answers them from its registry. Before the answer, the change is in the registry, and in the store: a ROS 1
+node never registers twice, and control and the ROS master may die at the same time. The ROS master gets the change
+after the answer (`reconcile/entries.py`). The texts of the answers are those of the ROS master.
 """
 
 from dataclasses import dataclass
@@ -9,101 +10,82 @@ from dataclasses import dataclass
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.gate import CallGate
-from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
+from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
 from appliance.master.graph.mediation import Mediation
-from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.graph.revocation import CALLS
-from appliance.master.reconcile.arrivals import Arrivals, EvictionGuard
+from appliance.master.graph.registry import Durable, Incarnation, Kind, Life, Registry
+from appliance.master.reconcile.arrivals import Arrivals
 from appliance.master.reconcile.enactor import Enactor
-from appliance.master.reconcile.entries import NO_SERVICE, stand_in
-from appliance.master.rosmaster import RosMaster
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationCalls:
-    """Forward registering calls to the ROS master with the node's inner URI. Accepted calls change the graph."""
+    """Change the graph by the calls of nodes, and answer them.
 
-    rosmaster: RosMaster
+    A call waits at its beginning, if the changes before it wait for the ROS master. Then it changes the graph and is
+    answered without another wait.
+    """
+
     registry: Registry
     graph: RosGraph
     enactor: Enactor
-    faces: ProxyEndpoints
     arrivals: Arrivals
     relay: RelayControl
     mediation: Mediation
     gate: CallGate
-    rights: ParameterRights
+    parameters: ParameterCalls
 
     async def register_publisher(
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
-        with await self._registering(caller, caller_api) as node:
-            inner = self.faces.inner_uri(node)
-            answer = await self.rosmaster.call(
-                "registerPublisher", caller.caller_id, topic, topic_type, inner
-            )
-            if answer[0] == 1:
-                self.enactor.carry_out(self.graph.registered(node, Kind.PUBLICATION, topic, topic_type))
-                hidden = self.mediation.hides_publishers(topic)
-                answer[2] = list(self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden))
-            return answer
+        node = await self._registering(caller, caller_api)
+        self.enactor.carry_out(self.graph.registered(node, Kind.PUBLICATION, topic, topic_type))
+        hidden = self.mediation.hides_publishers(topic)
+        subscribers = self.registry.uris_for(node, Kind.SUBSCRIPTION, topic, hidden=hidden)
+        return [1, f"Registered [{node.name}] as publisher of [{topic}]", list(subscribers)]
 
     async def register_subscriber(
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
-        with await self._registering(caller, caller_api) as node:
-            inner = self.faces.inner_uri(node)
-            answer = await self.rosmaster.call(
-                "registerSubscriber", caller.caller_id, topic, topic_type, inner
-            )
-            if answer[0] == 1:
-                self.enactor.carry_out(self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type))
-                answer[2] = list(self.graph.list_for(node, topic))
-            return answer
+        node = await self._registering(caller, caller_api)
+        self.enactor.carry_out(self.graph.registered(node, Kind.SUBSCRIPTION, topic, topic_type))
+        return [1, f"Subscribed to [{topic}]", list(self.graph.list_for(node, topic))]
 
     async def register_service(
         self, caller: Caller, service: str, service_api: ApiUri, caller_api: ApiUri
     ) -> Answer:
         """`registerService(caller_id, service, service_api, caller_api)`."""
-        with await self._registering(caller, caller_api) as node:
-            inner = self.faces.inner_uri(node)
-            answer = await self.rosmaster.call(
-                "registerService", caller.caller_id, service, stand_in(node), inner
-            )
-            if answer[0] == 1:
-                self.enactor.carry_out(
-                    self.graph.registered(node, Kind.SERVICE, service, str(service_api.uri.port))
-                )
-            return answer
+        node = await self._registering(caller, caller_api)
+        port = str(service_api.uri.port)
+        self.enactor.carry_out(self.graph.registered(node, Kind.SERVICE, service, port))
+        return [1, f"Registered [{node.name}] as provider of [{service}]", 1]
 
     async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`subscribeParam(caller_id, caller_api, key)`."""
-        with await self._registering(caller, caller_api) as node:
-            told = (caller.caller_id, self.faces.inner_uri(node), key)
-            answer = await self.rosmaster.call("subscribeParam", *told)
-            hidden = self.rights.hidden(caller, "subscribeParam", key, answer)
-            if hidden is not None:
-                await self.rosmaster.call("unsubscribeParam", *told)
-                return [0, hidden, 0]
-            if answer[0] == 1:
-                self.enactor.carry_out(self.graph.registered(node, Kind.PARAMETER, key, ""))
-            return answer
+        read = await self.parameters.read(caller, key)
+        hidden = self.parameters.rights.hidden(caller, "subscribeParam", key, read)
+        if hidden is not None:
+            return [0, hidden, 0]
+        if read[0] == 0:  # the ROS master failed
+            return read
+        node = await self._registering(caller, caller_api)
+        self.enactor.carry_out(self.graph.registered(node, Kind.PARAMETER, key, ""))
+        return [1, f"Subscribed to parameter [{key}]", read[2] if read[0] == 1 else {}]
 
     async def unregister_publisher(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
         """`unregisterPublisher(caller_id, topic, caller_api)`."""
-        return await self._unregister(caller, Kind.PUBLICATION, topic, caller_api)
+        return await self._unregister_topic(caller, Kind.PUBLICATION, topic, caller_api)
 
     async def unregister_subscriber(self, caller: Caller, topic: str, caller_api: ApiUri) -> Answer:
         """`unregisterSubscriber(caller_id, topic, caller_api)`."""
-        return await self._unregister(caller, Kind.SUBSCRIPTION, topic, caller_api)
+        return await self._unregister_topic(caller, Kind.SUBSCRIPTION, topic, caller_api)
 
     async def unregister_service(self, caller: Caller, service: str, service_api: ApiUri) -> Answer:
         """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
+        await self.enactor.entries.room()
         port = service_api.uri.port
         provider = next(
             (
@@ -118,29 +100,34 @@ class RegistrationCalls:
             ),
             None,
         )
-        uri = stand_in(provider) if provider is not None else NO_SERVICE
-        answer = await self.rosmaster.call("unregisterService", caller.caller_id, service, uri)
-        _speak_as_asked(answer, uri, service_api)
-        if answer[0] == 1 and provider is not None:
-            self.enactor.carry_out(self.graph.unregistered(provider, Kind.SERVICE, service))
-        return answer
+        other = f"[{service_api.text}] is no longer the current service api handle for [{service}]"
+        return self._unregistered(caller, provider, Kind.SERVICE, service, other)
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
-        """`unsubscribeParam(caller_id, caller_api, key)`."""
-        node = self.arrivals.known(caller, caller_api)
-        inner = self.faces.inner_uri(node) if node is not None else self.faces.unassigned_uri()
-        answer = await self.rosmaster.call("unsubscribeParam", caller.caller_id, inner, key)
-        if answer[0] == 1 and node is not None:
-            self.enactor.carry_out(self.graph.unregistered(node, Kind.PARAMETER, key))
-        return answer
+        """`unsubscribeParam(caller_id, caller_api, key)`: the ROS master's answer is always the same."""
+        await self.enactor.entries.room()
+        self._unregistered(caller, self.arrivals.known(caller, caller_api), Kind.PARAMETER, key, "")
+        return [1, f"Unsubscribe to parameter [{key}]", 1]
 
-    async def _unregister(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
+    async def _unregister_topic(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
+        await self.enactor.entries.room()
         node = self.arrivals.known(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
-        inner = self.faces.inner_uri(node) if node is not None else self.faces.unassigned_uri()
-        answer = await self.rosmaster.call(CALLS[kind][1], caller.caller_id, topic, inner)
-        _speak_as_asked(answer, inner, caller_api)
-        if answer[0] == 1 and node is not None:
-            self.enactor.carry_out(self.graph.unregistered(node, kind, topic))
+        other = f"[{caller.caller_id}] is not a known provider of [{topic}]"
+        return self._unregistered(caller, node, kind, topic, other)
+
+    def _unregistered(
+        self, caller: Caller, node: Incarnation | None, kind: Kind, resource: str, other: str
+    ) -> Answer:
+        """Remove a registration of a node. The answer is `other` if the node does not have the registration."""
+        name = caller.caller_id
+        if self.registry.holder(name) is None:
+            answer: Answer = [1, f"[{name}] is not a registered node", 0]
+        elif node is None or node.life is not Life.LIVE or (kind, resource) not in node.registrations:
+            answer = [1, other, 0]
+        else:
+            answer = [1, f"Unregistered [{name}] as provider of [{resource}]", 1]
+        if node is not None:
+            self.enactor.carry_out(self.graph.unregistered(node, kind, resource))
         return answer
 
     def _by_lookup_uri(self, caller: Caller, api: ApiUri) -> Incarnation | None:
@@ -149,15 +136,16 @@ class RegistrationCalls:
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None
 
-    async def _registering(self, caller: Caller, api: ApiUri) -> EvictionGuard:
-        """Return a guard that prevents the eviction of the registering incarnation.
+    async def _registering(self, caller: Caller, api: ApiUri) -> Incarnation:
+        """Return the registering incarnation.
 
         If the host is at its limit, a new incarnation replaces an unused or lost incarnation of the host.
         """
+        await self.enactor.entries.room()
         evicted = self.gate.to_make_room(caller, api)
         if evicted is not None:
             self.enactor.carry_out(self.graph.forgotten(evicted))
-        return EvictionGuard(await self.arrivals.incarnation_for(caller, api))
+        return await self.arrivals.incarnation_for(caller, api)
 
 
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
@@ -173,8 +161,3 @@ def given_up(registry: Registry, denied: Attempt) -> list[Durable]:
         if by_port or incarnation.api_text == asked.text:
             kept += registry.unshelve(incarnation, shelved.kind, shelved.resource)
     return kept
-
-
-def _speak_as_asked(answer: Answer, told: str, asked: ApiUri) -> None:
-    """Replace the inner URI in the ROS master's text by the caller's URI."""
-    answer[1] = str(answer[1]).replace(told, asked.text)

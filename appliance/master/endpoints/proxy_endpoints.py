@@ -35,14 +35,6 @@ class ProxyEndpoints:
         """Return the URI by which the ROS master knows the incarnation."""
         return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
-    def unassigned_uri(self) -> str:
-        """Return a master-side URI without an incarnation, for unregistering a node that was never registered."""
-        return node_uri("127.0.0.1", self.inner_port, "/nobody/")
-
-    def by_inner_uri(self, text: str) -> Incarnation | None:
-        """Return the incarnation with this master-side URI, or None."""
-        return self.registry.by_key(text.rstrip("/").rpartition("/")[2])
-
     async def open(self, incarnation: Incarnation) -> None:
         """Serve the proxy endpoint of an incarnation. If this fails, close its ports and raise `NoPortError`."""
         try:

@@ -123,16 +123,16 @@ class RevokeGrant:
 
 
 @dataclass(frozen=True, slots=True)
-class PutBack:
-    """Make restored registrations of a node at the ROS master, in their turn."""
+class RegisterAtMaster:
+    """Make a registration of a node at the ROS master, after all earlier changes there."""
 
     node: Incarnation
-    registrations: tuple[NodeRegistration, ...]
+    registration: NodeRegistration
 
 
 @dataclass(frozen=True, slots=True)
-class TakeBack:
-    """End a revoked registration of a node at the ROS master, in its turn."""
+class UnregisterAtMaster:
+    """End a registration of a node at the ROS master, after all earlier changes there."""
 
     node: Incarnation
     registration: NodeRegistration
@@ -174,8 +174,8 @@ Effect = (
     | EraseGrant
     | PlaceGrant
     | RevokeGrant
-    | PutBack
-    | TakeBack
+    | RegisterAtMaster
+    | UnregisterAtMaster
     | UsePorts
     | WriteRecord
 )

@@ -1,7 +1,8 @@
 """Change the registry, and return the effects: updates for nodes, relayed topics, records.
 
 Every change of the graph is a method here, so that no change lacks its effects. The method changes the registry and the
-grants, and returns the effects. The caller passes the effects to `enactor`.
+grants, and returns the effects. The caller passes the effects to `enactor`. The effects `RegisterAtMaster` and
+`UnregisterAtMaster` describe every change of the registrations of live nodes, in order.
 
 Lists of publishers come from the registry at the time of the change, and values of parameters from the call that set
 them. Later calls of the ROS master's notification threads are ignored, because they can be outdated, wrong, or partial
@@ -22,7 +23,9 @@ from appliance.master.graph.effects import (
     PlaceGrant,
     PlaceNode,
     PlaceResource,
+    RegisterAtMaster,
     TellNode,
+    UnregisterAtMaster,
     WithdrawNode,
     WithdrawResource,
     WriteRecord,
@@ -37,6 +40,7 @@ from appliance.policy.rate_limits import LimitScope
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.store.state_file import PermissionRow
+from roswire.parameter_tree import Tree, standing_at
 from roswire.xmlrpc import Value
 
 _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
@@ -44,24 +48,31 @@ _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 @dataclass(frozen=True, slots=True)
 class RosGraph:
-    """Change the graph. `may_read_value(node, key, value)` returns whether a node may read a parameter's value."""
+    """Change the graph. `may_read_value(node, key, value)` returns whether a node may read a parameter's value.
+
+    `tree` returns the present parameters.
+    """
 
     registry: Registry
     grants: Grants
     mediation: Mediation
+    tree: Callable[[], Tree]
     may_read_value: Callable[[Incarnation, str, Value], bool]
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
-        """Record a registration that the ROS master accepted."""
+        """Add a registration to a node."""
         effects = self._take_name(incarnation)
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
             effects += self.returned(incarnation)
         if kind is Kind.SERVICE:
             for provider in list(self.registry.registered(Kind.SERVICE, resource)):
-                if provider is not incarnation:  # the ROS master keeps only the last provider of a service
+                if (
+                    provider is not incarnation
+                ):  # like the ROS master, keep only the last provider of a service
                     effects += self.unregistered(provider, Kind.SERVICE, resource)
         new = (kind, resource) not in incarnation.registrations
         effects += self.registry.register(incarnation, kind, resource, detail)
+        effects.append(RegisterAtMaster(incarnation, incarnation.registrations[kind, resource]))
         if kind in _CARRIED:
             effects.append(PlaceResource(incarnation, kind, resource, detail))
         if kind is Kind.PUBLICATION:
@@ -72,10 +83,12 @@ class RosGraph:
         return effects
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Effects:
-        """Record that a registration has ended at the ROS master."""
-        effects: Effects = [*self.registry.unregister(incarnation, kind, resource)]
-        if not effects:
+        """Remove a registration of a node, if the node has it, or else the withdrawn one."""
+        registration = incarnation.registrations.get((kind, resource))
+        if registration is None:
             return [*self.registry.unshelve(incarnation, kind, resource)]
+        effects = _at_master(incarnation, [registration])
+        effects += self.registry.unregister(incarnation, kind, resource)
         if kind in _CARRIED:
             effects.append(WithdrawResource(incarnation, kind, resource))
         if kind is Kind.PUBLICATION:
@@ -106,7 +119,11 @@ class RosGraph:
         if kind is Kind.SERVICE and self._others_offer(incarnation, resource):
             return [*self.registry.unshelve(incarnation, kind, resource)]
         effects = self.registered(incarnation, kind, resource, registration.detail)
-        return effects + self.remind(incarnation, resource) if kind is Kind.SUBSCRIPTION else effects
+        if kind is Kind.SUBSCRIPTION:
+            effects += self.remind(incarnation, resource)
+        elif kind is Kind.PARAMETER:
+            effects += self._tell_parameter(incarnation, resource)
+        return effects
 
     def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
         return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
@@ -127,6 +144,7 @@ class RosGraph:
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host
         return [
+            *_at_master(incarnation, lost),
             *self.registry.replace(incarnation, time.monotonic()),
             TellNode(incarnation, NodeCall("shutdown", (reason,))),
             *self._tell_withdrawn(lost),
@@ -142,6 +160,7 @@ class RosGraph:
     def lost(self, incarnation: Incarnation, why: str) -> Effects:
         """Suspend the registrations of a node that no longer answers, until it returns."""
         return [
+            *_at_master(incarnation, incarnation.in_order()),
             *self.registry.overshadow(incarnation, time.monotonic()),
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
@@ -161,6 +180,7 @@ class RosGraph:
         effects += self.registry.revive(incarnation, time.monotonic())
         effects.append(PlaceNode(incarnation))
         for registration in incarnation.in_order():
+            effects.append(RegisterAtMaster(incarnation, registration))
             if registration.kind is Kind.PUBLICATION:
                 effects += self.tell(registration.resource)
             elif registration.kind is Kind.SUBSCRIPTION:
@@ -169,12 +189,14 @@ class RosGraph:
             # The policy withdrew these while the node was away, or earlier without reaching the node.
             if kind is Kind.SUBSCRIPTION:
                 effects.append(_emptied(incarnation, topic))
+        effects += self.tell_parameters(incarnation)
         return [*effects, _record("node returned", f"{incarnation.name} answers again", incarnation)]
 
     def forgotten(self, incarnation: Incarnation) -> Effects:
         """Forget an incarnation permanently."""
         registrations = list(incarnation.registrations.values())
-        effects: Effects = [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]
+        effects = _at_master(incarnation, registrations)
+        effects += [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]
         if self.registry.holder(incarnation.name) is None:
             for registration in registrations:
                 if registration.kind is Kind.SUBSCRIPTION:
@@ -306,11 +328,18 @@ class RosGraph:
                     effects.append(TellNode(subscriber, calls[update.key]))
         return effects
 
-    def tell_parameter(self, subscriber: Incarnation, key: str, value: Value) -> Effects:
+    def tell_parameters(self, subscriber: Incarnation) -> Effects:
+        """Send a node the present values of the parameters that it subscribed to."""
+        keys = subscriber.resources(Kind.PARAMETER)
+        return [effect for key in keys for effect in self._tell_parameter(subscriber, key)]
+
+    def _tell_parameter(self, subscriber: Incarnation, key: str) -> Effects:
         """Send a node the present value of a parameter, if the node may read this value.
 
         The subscription was decided by the keys that existed then, so the right to read is checked again.
         """
+        present, _ = standing_at(self.tree(), key)
+        value = {} if present is None else settled(present)
         told = self.may_read_value(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
 
@@ -401,6 +430,13 @@ def _record(
 ) -> WriteRecord:
     about = node.name if resource is None else resource
     return WriteRecord(event, reason, str(node.host), node.name, category, about, severity)
+
+
+def _at_master(incarnation: Incarnation, ended: Iterable[NodeRegistration]) -> Effects:
+    """End these registrations at the ROS master, which has only those of live nodes."""
+    if incarnation.life is not Life.LIVE:
+        return []
+    return [UnregisterAtMaster(incarnation, registration) for registration in ended]
 
 
 def _list(subscriber: Incarnation, topic: str, uris: Iterable[str]) -> TellNode:

@@ -343,7 +343,7 @@ class Registry:
                 self._index(incarnation, registration)
 
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
-        """Record that the ROS master accepted a registration."""
+        """Add a registration to an incarnation."""
         kept: list[Durable] = []
         self.version += 1
         if incarnation.life is Life.SHADOW:  # the node was lost while its call was under way
@@ -445,12 +445,13 @@ class Registry:
             self._types[topic] = told
 
     def adopt_types(self, types: Iterable[tuple[str, str]]) -> None:
-        """Adopt the types of topics that the ROS master knew before control started."""
+        """Adopt the types of topics that the ROS master knew before control started, where no type is known."""
         self.version += 1
         for topic, told in types:
-            self._types[topic] = told
-            if not self._has_topic(topic):
-                self._remember_unused(topic)
+            if self.type_of(topic) == ANY_TYPE:
+                self._types[topic] = told
+                if not self._has_topic(topic):
+                    self._remember_unused(topic)
 
     def forget_types(self) -> None:
         """Forget topics without a node, because a new ROS master does not know them."""

@@ -7,7 +7,7 @@ rollback), they are registered again, because a ROS 1 node never registers twice
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from appliance.master.graph.effects import Effect, Effects, PutBack, TakeBack, UsePorts, WriteRecord
+from appliance.master.graph.effects import Effect, Effects, UsePorts, WriteRecord
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import RosGraph, revocation
 from appliance.master.graph.own_node import OWN, rosout_may_have
@@ -75,7 +75,7 @@ class Revocation:
             decision = self._decide(incarnation, registration.kind, registration.resource)
             if not decision.allowed:
                 call = "" if incarnation.own else CALLS[registration.kind][0]
-                effects += self._take_back(incarnation, registration, decision, call)
+                effects += self.graph.revoked(incarnation, registration, decision, call)
         for row in grants:
             decision = self._decide_grant(row)
             if not decision.allowed:
@@ -88,29 +88,22 @@ class Revocation:
         decision = Decision(False, None, reason)
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
-                effects += self._take_back(incarnation, registration, decision, "")
+                effects += self.graph.revoked(incarnation, registration, decision, "")
         for row in self.grants.all():
             if row.host == str(host):
                 effects += self._revoke(row, decision, "")
         return effects
 
     def returned(self, incarnation: Incarnation) -> Effects:
-        """Restore withdrawn registrations that are now granted, because a node never registers twice.
-
-        They are in the registry at once, so that the next change of the policy finds them. The ROS master gets them
-        later.
-        """
+        """Restore withdrawn registrations that are now granted, because a node never registers twice."""
         holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
             return []
         effects: Effects = []
-        back: list[NodeRegistration] = []
         for registration in sorted(incarnation.shelf.values(), key=lambda registration: registration.order):
             if self.may_have(incarnation, registration.kind, registration.resource):
                 effects += self.graph.granted_again(incarnation, registration)
-                if (registration.kind, registration.resource) in incarnation.registrations:
-                    back.append(registration)
-        return [*effects, PutBack(incarnation, tuple(back))] if back else effects
+        return effects
 
     def _registrations(self) -> list[tuple[Incarnation, NodeRegistration]]:
         """Return all registrations of live and lost nodes, in the order in which they were made."""
@@ -121,14 +114,6 @@ class Revocation:
             for registration in incarnation.registrations.values()
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
-
-    def _take_back(
-        self, incarnation: Incarnation, registration: NodeRegistration, decision: Decision, call: str
-    ) -> Effects:
-        effects = self.graph.revoked(incarnation, registration, decision, call)
-        if incarnation.life is Life.LIVE:  # otherwise the ROS master does not have the registration
-            effects.append(TakeBack(incarnation, registration))
-        return effects
 
     def _revoke(self, row: PermissionRow, decision: Decision, call: str) -> Effects:
         record = revocation(decision, row.host, row.caller_id, row.kind, row.resource, call=call)

@@ -46,9 +46,7 @@ class Arrivals:
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self.registry.holder(incarnation.name) is None:
-                # A lost node registers again before a check has found that it is back.
-                with EvictionGuard(incarnation):
-                    await self.liveness.revive(incarnation)
+                self.liveness.revive(incarnation)  # before a check has found that the node is back
                 return incarnation
             # Another incarnation took the name in the meantime, so this node starts as a new incarnation.
             self.enactor.carry_out(self.graph.forgotten(incarnation))

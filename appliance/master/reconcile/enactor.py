@@ -3,13 +3,10 @@
 After a restart, `restore` reads the registry from the store.
 """
 
-import asyncio
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import assert_never
-
-import structlog
 
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_ports import NodePorts
@@ -24,11 +21,11 @@ from appliance.master.graph.effects import (
     PlaceGrant,
     PlaceNode,
     PlaceResource,
-    PutBack,
+    RegisterAtMaster,
     RevokeGrant,
     SaveGrant,
-    TakeBack,
     TellNode,
+    UnregisterAtMaster,
     UsePorts,
     WithdrawNode,
     WithdrawResource,
@@ -51,12 +48,9 @@ from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.reconcile.entries import MasterRegistrations
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
-from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.store.state_file import IncarnationRow, RegistrationRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
-
-_log = structlog.get_logger()
 
 
 @dataclass(slots=True)
@@ -71,10 +65,9 @@ class Enactor:
     relay: RelayControl
     faces: ProxyEndpoints
     places: NodePorts
-    _last: asyncio.Task[None] | None = None  # the last call to the ROS master
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
-        """Carry out effects now, in this order. Calls to the ROS master are queued."""
+        """Carry out effects now, in this order. The ROS master gets its changes later, in this order."""
         for effect in effects:
             match effect:
                 case TellNode(node, call):
@@ -86,8 +79,10 @@ class Enactor:
                     self.faces.close(node)
                 case UsePorts(ports):
                     self.places.policy_changed(ports)
-                case PutBack() | TakeBack():
-                    self._last = asyncio.get_running_loop().create_task(self._tell_master(effect, self._last))
+                case RegisterAtMaster(node, registration):
+                    self.entries.make(node, registration)
+                case UnregisterAtMaster(node, registration):
+                    self.entries.end(node, registration)
                 case SaveGrant(row):
                     self.store.save_permission(row)
                 case EraseGrant(row):
@@ -128,43 +123,6 @@ class Enactor:
                 self.relay.revoke_grant(row)
             case _:
                 assert_never(effect)
-
-    # --- the ROS master ---
-
-    async def put_back(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
-        """Make a returned node's registrations at the ROS master. After a failure, the reconcile loop makes them."""
-        try:
-            values = await self.entries.put_back(node, registrations)
-        except CallFailedError as error:
-            _log_failed_call(node, error)
-            return
-        for key, value in values:
-            self.carry_out(self.graph.tell_parameter(node, key, value))
-
-    async def take_out(self, node: Incarnation, registrations: Sequence[NodeRegistration]) -> None:
-        """End a lost node's registrations at the ROS master. After a failure, the reconcile loop ends them."""
-        try:
-            await self.entries.end_lost(node, registrations)
-        except CallFailedError as error:
-            _log_failed_call(node, error)
-
-    async def _tell_master(self, effect: PutBack | TakeBack, before: asyncio.Task[None] | None) -> None:
-        if before is not None:
-            await asyncio.wait([before])
-        if isinstance(effect, PutBack):
-            await self.put_back(effect.node, effect.registrations)
-            return
-        node, taken = effect.node, effect.registration
-        if (taken.kind, taken.resource) in node.registrations:  # the registration was granted again
-            return
-        try:
-            await self.entries.end(node, taken.kind, taken.resource)
-        except CallFailedError as error:
-            _log_failed_call(node, error)
-
-
-def _log_failed_call(node: Incarnation, error: CallFailedError) -> None:
-    _log.warning("a call to the ROS master failed", node=node.name, error=str(error))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,21 +1,35 @@
-"""Make, end and restore registrations at the hidden ROS master, with the node's inner URI.
+"""Forward the changes of the registry to the hidden ROS master, in order, behind the answers to nodes.
 
-Services are registered with a stand-in URI. Clients never get this URI.
+A registering call is answered from the registry, once the change is stored. The ROS master gets the change afterwards,
+with the node's inner URI; services get a stand-in URI. Clients never get these URIs. Invariants:
+
+1. No answer to a node depends on a forwarded change. All reads of the graph are answered from the registry.
+2. The ROS master gets the changes in the order of the registry. One request is under way at a time.
+3. A round of the reconcile loop compares the ROS master with the registry. The changes that waited then are part of the
+   registry, so they are dropped (`start_round`). Later changes follow after the round.
+4. A change that fails is not repeated. It shuts the door, and the next round removes the difference. The same holds
+   after the death of control: its registry is stored.
+5. At most `_MOST_WAITING` changes wait. Beyond that, registering calls wait (`room`). Changes that no node called for,
+   such as a revocation, do not wait.
 """
 
-from collections.abc import Callable, Iterable
+import asyncio
+from collections import deque
+from collections.abc import Callable
 
-from appliance.master.caller import Answer
-from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration
+import structlog
+
+from appliance.master.graph.registry import Incarnation, Kind, NodeRegistration, Registry
 from appliance.master.graph.revocation import CALLS
-from appliance.master.rosmaster import RosMaster, together
+from appliance.master.rosmaster import LARGEST_MULTICALL, RosMaster, Wanted
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.uris import service_uri
-from roswire.xmlrpc import Value
 
 NAME = "/master"
-NO_SERVICE = "rosrpc://nobody:1"
-"""The stand-in URI if no node is known."""
+_GATHER_SECONDS = 0.02  # the ROS master serves gathered changes in half the processor time
+_MOST_WAITING = 1024  # a tenth of a second of the ROS master's time
+
+_log = structlog.get_logger()
 
 
 class MasterRegistrations:
@@ -24,70 +38,78 @@ class MasterRegistrations:
     `pid` is the process id of the ROS master that has all registrations. It is None before the first such process.
     """
 
-    def __init__(self, rosmaster: RosMaster, inner_uri: Callable[[Incarnation], str]) -> None:
+    def __init__(
+        self, rosmaster: RosMaster, registry: Registry, inner_uri: Callable[[Incarnation], str]
+    ) -> None:
         self._rosmaster = rosmaster
+        self._registry = registry
         self._inner_uri = inner_uri
+        self._waiting: deque[Wanted] = deque()
+        self._sending: asyncio.Task[None] | None = None
+        self._has_room = asyncio.Event()
         self.pid: int | None = None
 
-    async def make(self, node: Incarnation, registration: NodeRegistration) -> Answer:
-        """Make a registration of a node, even while the door is shut."""
-        name, inner, resource = node.name, self._inner_uri(node), registration.resource
+    def make(self, node: Incarnation, registration: NodeRegistration) -> None:
+        """Make a registration of a node, after all changes that wait."""
+        self._forward(self.call_to_make(node, registration))
+
+    def end(self, node: Incarnation, registration: NodeRegistration) -> None:
+        """End a registration of a node, after all changes that wait."""
+        kind, resource = registration.kind, registration.resource
+        told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
+        if kind is Kind.PARAMETER:  # only this call has the reverse order
+            told.reverse()
+        self._forward((CALLS[kind][1], (node.name, *told)))
+
+    async def room(self) -> None:
+        """Wait until there is room for another change. Raises `CallFailedError` if there is none for too long."""
+        if len(self._waiting) < _MOST_WAITING:
+            return
+        async with self._rosmaster.patience():
+            while len(self._waiting) >= _MOST_WAITING:
+                self._has_room.clear()
+                await self._has_room.wait()
+
+    def start_round(self) -> list[tuple[Incarnation, NodeRegistration]]:
+        """Return the registrations that the ROS master must have, in order. Drop the changes that led to them."""
+        self._waiting.clear()
+        self._has_room.set()
+        return list(self._registry.in_order())
+
+    def call_to_make(self, node: Incarnation, registration: NodeRegistration) -> Wanted:
+        """Return the call that makes a registration of a node at the ROS master."""
+        inner, resource = self._inner_uri(node), registration.resource
         told = {
             Kind.PUBLICATION: (resource, registration.detail, inner),
             Kind.SUBSCRIPTION: (resource, registration.detail, inner),
             Kind.SERVICE: (resource, stand_in(node), inner),
             Kind.PARAMETER: (inner, resource),
         }[registration.kind]
-        return await self._rosmaster.call_now(CALLS[registration.kind][0], name, *told)
+        return CALLS[registration.kind][0], (node.name, *told)
 
-    async def end(self, node: Incarnation, kind: Kind, resource: str) -> None:
-        """End a registration of a node, because the node is gone or may no longer have the registration."""
-        told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
-        if kind is Kind.PARAMETER:  # only this call has the reverse order
-            told.reverse()
-        await self._rosmaster.call(CALLS[kind][1], node.name, *told)
+    def _forward(self, call: Wanted) -> None:
+        self._waiting.append(call)
+        if self._sending is None or self._sending.done():
+            self._sending = asyncio.get_running_loop().create_task(self._send())
 
-    async def end_lost(self, node: Incarnation, registrations: Iterable[NodeRegistration]) -> None:
-        """End the registrations of a lost node one by one. Stop if the node is live again."""
-        for registration in registrations:
-            if node.life is Life.LIVE:
-                return
-            await self.end(node, registration.kind, registration.resource)
-
-    async def put_back(
-        self, node: Incarnation, registrations: Iterable[NodeRegistration]
-    ) -> list[tuple[str, Value]]:
-        """Make the former registrations of a returned node again, once the ROS master is reachable.
-
-        Registrations that were withdrawn in the meantime are left out. If the node is no longer live, all are left out,
-        because the ROS master would then end the later life of the node.
-
-        Return the parameters that the node subscribed to, with their values: the node missed their changes, and the ROS
-        master reports each change only once. Raises `CallFailedError`; the reconcile loop then runs a round.
-        """
-
-        async def put(registration: NodeRegistration) -> tuple[str, Value] | None:
-            if (
-                node.life is not Life.LIVE
-                or (registration.kind, registration.resource) not in node.registrations
-            ):
-                return None
-            code, _, value = await self.make(node, registration)
-            return (
-                (registration.resource, value) if registration.kind is Kind.PARAMETER and code == 1 else None
-            )
-
-        try:
-            async with self._rosmaster.alone():
-                if (await self._rosmaster.call_now("getPid", NAME))[2] != self.pid:
-                    raise CallFailedError(
-                        "the ROS master was restarted: the next round registers everything again"
+    async def _send(self) -> None:
+        while self._waiting:
+            if len(self._waiting) < LARGEST_MULTICALL:
+                await asyncio.sleep(_GATHER_SECONDS)
+            await self._rosmaster.opened()
+            part = [self._waiting.popleft() for _ in range(min(len(self._waiting), LARGEST_MULTICALL))]
+            self._has_room.set()
+            try:
+                answers = await self._rosmaster.call_once(part)
+            except CallFailedError as error:
+                _log.warning("changes did not reach the ROS master", number=len(part), error=str(error))
+                continue
+            for (method, params), answer in zip(part, answers, strict=True):
+                if isinstance(answer, CallFailedError) or answer[0] != 1:
+                    _log.error(
+                        "the ROS master rejected a change", call=method, of=params[:2], answer=str(answer)
                     )
-                values = await together(put(registration) for registration in registrations)
-        except CallFailedError:
-            self._rosmaster.doubtful.set()
-            raise
-        return [value for value in values if value is not None]
+                    self._rosmaster.doubtful.set()
 
 
 def stand_in(node: Incarnation) -> str:

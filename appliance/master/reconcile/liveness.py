@@ -19,7 +19,7 @@ from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RELAY_NAME
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.graph.registry import Incarnation, Life, Registry
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Address
@@ -193,17 +193,15 @@ class Liveness:
             presence = Presence.ANSWERS
         return Probe(incarnation, presence, patience)
 
-    async def revive(self, incarnation: Incarnation) -> None:
+    def revive(self, incarnation: Incarnation) -> None:
         """Restore a shadow with all its registrations, because its node registers again."""
         self._answered[incarnation.key] = time.monotonic()
         self._processes.pop(incarnation.key, None)
-        await self._bring_back(incarnation)
+        self._bring_back(incarnation)
 
-    async def _bring_back(self, incarnation: Incarnation) -> None:
+    def _bring_back(self, incarnation: Incarnation) -> None:
         self.enactor.carry_out(self.graph.returned(incarnation))
-        registrations = incarnation.in_order()
         self.enactor.carry_out(self.revocation.returned(incarnation))
-        await self.enactor.put_back(incarnation, registrations)
 
     async def look(self, incarnation: Incarnation) -> None:
         """Check a node, and carry out the consequences."""
@@ -221,13 +219,13 @@ class Liveness:
         if incarnation.life is Life.LIVE:
             refused = there is None
             if refused or (not there and now - since >= self.settings.silent):
-                await self._lose(incarnation, why)
+                self._lose(incarnation, why)
         else:
-            await self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
+            self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
         if there and incarnation.life is Life.LIVE:
-            await self._make_up(incarnation)
+            self._make_up(incarnation)
 
-    async def _make_up(self, incarnation: Incarnation) -> None:
+    def _make_up(self, incarnation: Incarnation) -> None:
         """Send a node the updates that it missed."""
         missed = self.watchlist.to_make_up(incarnation, self.settings.interval)
         if missed is None:
@@ -235,13 +233,8 @@ class Liveness:
         absent = {topic: publishers for _, topic, publishers in self.graph.absent([incarnation])}
         for topic in sorted(missed.topics):
             self.enactor.carry_out(self.graph.renew(incarnation, topic, absent.get(topic, ())))
-        subscribed = [
-            registration
-            for registration in incarnation.registrations.values()
-            if registration.kind is Kind.PARAMETER
-        ]
-        if missed.parameters and subscribed:
-            await self.enactor.put_back(incarnation, subscribed)
+        if missed.parameters:
+            self.enactor.carry_out(self.graph.tell_parameters(incarnation))
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""
@@ -276,16 +269,14 @@ class Liveness:
         elif process != before:
             raise RefusedError(f"process {process} answers in place of {before}")
 
-    async def _lose(self, incarnation: Incarnation, why: str) -> None:
+    def _lose(self, incarnation: Incarnation, why: str) -> None:
         if not incarnation.registrations and not incarnation.shelf:
             if time.monotonic() - incarnation.touched > _IDLE_SECONDS:
                 self._forget(incarnation)
             return
-        registrations = list(incarnation.registrations.values())
         self.enactor.carry_out(self.graph.lost(incarnation, why))
-        await self.enactor.take_out(incarnation, registrations)
 
-    async def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
+    def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
         age = time.monotonic() - incarnation.changed
         if incarnation.life is Life.REPLACED:
             if refused or age > _REPLACED_SECONDS:
@@ -293,7 +284,7 @@ class Liveness:
         elif age > self.settings.shadow:
             self._forget(incarnation)
         elif answered and self.registry.occupant(incarnation.name) is None:
-            await self._bring_back(incarnation)
+            self._bring_back(incarnation)
 
     def _forget(self, incarnation: Incarnation) -> None:
         self.enactor.carry_out(self.graph.forgotten(incarnation))

@@ -3,10 +3,9 @@
 The same loop handles all failures: the ROS master died, control died, a call was interrupted.
 
 - A new ROS master gets everything again, in the original order. Calls wait at the door (`rosmaster.py`) until then.
-- A registration that is wanted but not seen is made again.
-- A registration that is seen but not wanted is adopted if two conditions hold: it has the key of a known incarnation,
-  and the policy in force grants it. In this case, control died before it saved the registration. Otherwise, the
-  registration is ended. A registration at the ROS master is not a right: the policy may have withdrawn it just before.
+- A registration that is wanted but not seen is made again: it was answered, but not forwarded (`entries.py`).
+- A registration that is seen but not wanted is ended: its end was answered, but not forwarded. It is never adopted,
+  because the registry is stored before the ROS master gets a change.
 - After a rebuild, and after a relay starts, every subscriber gets each of its lists of publishers once. After a restart
   of control, every node gets the values of the parameters that it subscribed to.
 """
@@ -20,16 +19,15 @@ import structlog
 
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.parameter_updates import settled
-from appliance.master.graph.registry import Kind, Life, Registry
-from appliance.master.graph.revocation import CALLS, Revocation
+from appliance.master.graph.registry import Kind, Registry
+from appliance.master.graph.revocation import CALLS
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reconcile.enactor import Enactor
-from appliance.master.reconcile.entries import NAME, NO_SERVICE, MasterRegistrations, stand_in
-from appliance.master.rosmaster import RosMaster, together
+from appliance.master.reconcile.entries import NAME, MasterRegistrations
+from appliance.master.rosmaster import RosMaster
 from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.telemetry.audit_trail import AuditTrail
-from roswire.parameter_tree import Tree, standing_at
+from roswire.parameter_tree import Tree
 
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1
@@ -46,7 +44,6 @@ class Reconciler:
     registry: Registry
     faces: ProxyEndpoints
     graph: RosGraph
-    revocation: Revocation
     enactor: Enactor
     parameters: ParameterMirror
     trail: AuditTrail
@@ -90,18 +87,13 @@ class Reconciler:
                 types = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
                 self.registry.adopt_types(cast(list[tuple[str, str]], types))
                 await self._compare()
-                self._tell_parameters()
+                for (
+                    node
+                ) in self.registry.live():  # an earlier control process may not have sent the last values
+                    self.enactor.carry_out(self.graph.tell_parameters(node))
             else:
                 await self._rebuild()
             self.entries.pid = cast(int, pid)
-
-    def _tell_parameters(self) -> None:
-        """Send the values of parameters that an earlier control process may not have sent."""
-        for node, registration in self.registry.in_order():
-            if registration.kind is Kind.PARAMETER:
-                value, _ = standing_at(self.parameters.tree, registration.resource)
-                told = {} if value is None else settled(value)
-                self.enactor.carry_out(self.graph.tell_parameter(node, registration.resource, told))
 
     # --- a new ROS master ---
 
@@ -111,7 +103,8 @@ class Reconciler:
         await self.rosmaster.call_now("setParam", NAME, "/", tree)
         self.parameters.replace(tree)
         self.registry.forget_types()
-        made = len(await together(self.entries.make(*pair) for pair in self.registry.in_order()))
+        wanted = self.entries.start_round()
+        made = len(await self.rosmaster.all_now([self.entries.call_to_make(*pair) for pair in wanted]))
         self.enactor.carry_out(self.graph.tell_everybody())
         if made:
             text = (
@@ -123,27 +116,32 @@ class Reconciler:
 
     async def _compare(self) -> None:
         seen = await self._seen()
+        uris = await self._addresses("lookupNode", {name for _kind, _resource, name in seen})
         wanted = {
             (registration.kind, registration.resource, incarnation.name): (incarnation, registration)
-            for incarnation, registration in self.registry.in_order()
+            for incarnation, registration in self.entries.start_round()
             if registration.kind
             is not Kind.PARAMETER  # the ROS master does not list subscribers to parameters
         }
-        uris = await self._inner_uris({name for _kind, _resource, name in seen})
-        missing = await together(
-            self.entries.make(*pair)
+        missing = [
+            self.entries.call_to_make(*pair)
             for key, pair in wanted.items()
             if key not in seen or uris.get(pair[0].name) != self.faces.inner_uri(pair[0])
-        )
+        ]
+        await self.rosmaster.all_now(missing)
         extra = sorted(entry for entry in seen if entry not in wanted)
-        if extra:
-            rows = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
-            types = dict(cast(list[tuple[str, str]], rows))
-            await together(
-                self._settle(kind, what, name, uris.get(name), types) for kind, what, name in extra
-            )
+        offered = await self._addresses(
+            "lookupService", {resource for kind, resource, _name in extra if kind is Kind.SERVICE}
+        )
+        await self.rosmaster.all_now(
+            [
+                (CALLS[kind][1], (name, resource, uri))
+                for kind, resource, name in extra
+                if (uri := offered.get(resource) if kind is Kind.SERVICE else uris.get(name)) is not None
+            ]
+        )
         if missing or extra:
-            text = f"{len(missing)} registrations were made again, {len(extra)} adopted or removed"
+            text = f"{len(missing)} registrations were made again, {len(extra)} removed"
             self.trail.happened("reconciled", text, made=len(missing), settled=len(extra))
 
     async def _seen(self) -> Seen:
@@ -160,30 +158,8 @@ class Reconciler:
             for name in holders
         }
 
-    async def _inner_uris(self, nodes: set[str]) -> dict[str, str]:
-        names = sorted(nodes)
-        answers = await asyncio.gather(*(self.rosmaster.call_now("lookupNode", NAME, name) for name in names))
-        return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
-
-    async def _settle(
-        self, kind: Kind, resource: str, name: str, inner: str | None, types: dict[str, str]
-    ) -> None:
-        incarnation = self.faces.by_inner_uri(inner) if inner is not None else None
-        if (
-            incarnation is not None
-            and incarnation.life is Life.LIVE
-            and kind is not Kind.SERVICE
-            and incarnation.name == name
-            and (kind, resource) not in incarnation.shelf
-            and self.revocation.may_have(incarnation, kind, resource)
-        ):
-            adopted = self.graph.registered(incarnation, kind, resource, types.get(resource, "*"))
-            self.enactor.carry_out(adopted)
-            return
-        # The ROS master does not know the real port of a service. So a service that was not saved is unregistered.
-        call = self.rosmaster.call_now
-        if kind is Kind.SERVICE:
-            uri = stand_in(incarnation) if incarnation is not None else NO_SERVICE
-            await call("unregisterService", name, resource, uri)
-        elif inner is not None:
-            await call(CALLS[kind][1], name, resource, inner)
+    async def _addresses(self, method: str, names: set[str]) -> dict[str, str]:
+        """Return the URIs of nodes, or of services, at the ROS master."""
+        asked = sorted(names)
+        answers = await self.rosmaster.all_now([(method, (NAME, name)) for name in asked])
+        return {name: str(answer[2]) for name, answer in zip(asked, answers, strict=True) if answer[0] == 1}

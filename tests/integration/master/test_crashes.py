@@ -15,6 +15,7 @@ from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT
+from tests.support.waiting import eventually
 
 POLICY = OPEN_POLICY
 BURST = 60
@@ -113,8 +114,79 @@ def test_both_killed_at_once(working: Field) -> None:
         burst.all_there()
 
 
+def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
+    """The ROS master hangs and nodes are answered: after the death of control, it gets what was answered."""
+    appliance, robot = working.appliance, working.robot
+    rosmaster = appliance.pids("rosmaster")[0]
+    with Impostor(robot, answering([1, "", 4711])) as node:
+
+        def registered(method: str, topic: str) -> None:
+            kind = ["std_msgs/String"] if method == "registerPublisher" else []
+            answer = working.call(robot, method, "/answered", topic, *kind, node.uri)
+            assert answer[0] == 1, answer
+
+        registered("registerPublisher", "/ended")
+        known = len(
+            appliance.audit("--event", "reconciled")
+        )  # meanwhile the ROS master gets this registration
+        os.kill(rosmaster, signal.SIGSTOP)
+        try:
+            registered("registerPublisher", "/under_way")
+            control = appliance.pids("control")[0]
+            registered("registerPublisher", "/answered_only")
+            registered("unregisterPublisher", "/ended")
+            os.kill(control, signal.SIGKILL)
+        finally:
+            os.kill(rosmaster, signal.SIGCONT)
+        records = appliance.recorded("--event", "reconciled", count=known + 1)
+        detail = max(records, key=lambda record: record["sequence"])["detail"]
+        assert (detail["made"] >= 1, detail["settled"]) == (True, 1), detail
+        publishers = dict(map(tuple, working.call(robot, "getSystemState", "/looker")[2][0]))
+        assert [publishers.get(topic) for topic in ("/under_way", "/answered_only", "/ended")] == [
+            ["/answered"],
+            ["/answered"],
+            None,
+        ]
+        working.call(robot, "setParam", "/looker", "/round", 1)  # it waits for the end of the round
+        appliance.kill("control")
+        working.call(robot, "setParam", "/looker", "/round", 2)
+        registered("registerPublisher", "/ended")
+        appliance.recorded(count=2, event="registered", resource="/ended")
+        assert (
+            len(appliance.audit("--event", "reconciled")) == known + 1
+        )  # the second round found no difference
+
+
+def test_rosmaster_killed_with_a_full_queue(working: Field) -> None:
+    """Calls are answered until a thousand changes wait for the ROS master; a new ROS master gets all of them."""
+    wanted = [f"/full/topic_{number}" for number in range(1600)]
+    rosmaster = working.appliance.pids("rosmaster")[0]
+    answers: list[Any] = []
+    with Impostor(working.robot, answering([1, "", 4711])) as node:
+
+        def register() -> None:
+            with xmlrpc.client.ServerProxy(working.master) as server:
+                for start in range(0, len(wanted), 50):
+                    calls: Any = xmlrpc.client.MultiCall(server)
+                    for topic in wanted[start : start + 50]:
+                        calls.registerPublisher("/full", topic, "std_msgs/String", node.uri)
+                    answers.extend(calls())
+
+        registering = threading.Thread(target=working.robot.run, args=(register,), daemon=True)
+        os.kill(rosmaster, signal.SIGSTOP)
+        registering.start()
+        eventually(lambda: len(answers) >= 1000, "a thousand calls are answered")
+        assert registering.is_alive()
+        os.kill(rosmaster, signal.SIGKILL)
+        registering.join(LIMIT)
+        assert [answer[0] for answer in answers] == [1] * len(wanted)
+        working.appliance.recorded("--event", "reconciled")
+        publishers = dict(map(tuple, working.call(working.robot, "getSystemState", "/looker")[2][0]))
+        assert [topic for topic in wanted if publishers.get(topic) != ["/full"]] == []
+
+
 def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:
-    """A stopped `rosmaster` delays calls; no call fails, and it is not killed."""
+    """A stopped `rosmaster` delays writes of parameters; no call fails, and it is not killed."""
     pid = working.appliance.pids("rosmaster")[0]
     with Burst(working, "/burst_stopped") as burst:
         os.kill(pid, signal.SIGSTOP)

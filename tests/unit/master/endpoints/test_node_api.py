@@ -78,7 +78,7 @@ async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
     for node in (dead, heir, dead):
         await street.look(node)
     assert (dead.life, heir.life) == (Life.SHADOW, Life.LIVE)
-    await street.liveness.revive(dead)
+    street.liveness.revive(dead)
     await street.look(dead)
     await street.look(dead)
     assert dead.life is Life.LIVE

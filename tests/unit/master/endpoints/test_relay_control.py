@@ -122,7 +122,11 @@ class World:
             own_call=cast(Any, None),
         )
         self.graph = RosGraph(
-            self.registry, self.grants, cast(Any, _UNUSED), may_read_value=lambda _node, _key, _value: True
+            self.registry,
+            self.grants,
+            cast(Any, _UNUSED),
+            dict,
+            may_read_value=lambda _node, _key, _value: True,
         )
         self.enactor = Enactor(
             self.graph,

@@ -1,0 +1,210 @@
+"""Registering calls are answered from the registry; the ROS master gets their changes afterwards, in order."""
+
+import asyncio
+from typing import Any, cast
+
+import pytest
+
+from appliance.master.graph.registry import Kind
+from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError, UnansweredError
+from tests.support.control_parts import ControlParts
+
+pytestmark = pytest.mark.anyio
+TYPE = "std_msgs/String"
+
+
+def uri(number: int = 1) -> str:
+    """Return the URI of a node."""
+    return f"http://10.0.0.5:{4000 + number}/"
+
+
+class Requests:
+    """A ROS master that notes its requests. `held` delays them, and `failure` replaces their answers."""
+
+    def __init__(self, world: ControlParts) -> None:
+        self._hidden = world.hidden
+        self.methods: list[str] = []
+        self.held = asyncio.Event()
+        self.held.set()
+        self.failure: Exception | None = None
+        self.answer: Any = None
+        self.at_once = self.most = 0
+        world.rosmaster.calls = cast(Any, self)
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """Answer one request."""
+        self.methods.append(method)
+        self.at_once += 1
+        self.most = max(self.most, self.at_once)
+        try:
+            await self.held.wait()
+            answer = await self._hidden.call(method, *params)
+        finally:
+            self.at_once -= 1
+        if self.failure is not None:
+            raise self.failure
+        return answer if self.answer is None else self.answer
+
+
+async def started() -> tuple[ControlParts, Requests]:
+    """Return control after its first round, and its ROS master."""
+    world = await ControlParts.begun()
+    requests = Requests(world)
+    world.hidden.calls.clear()
+    return world, requests
+
+
+def changes(world: ControlParts) -> list[tuple[Any, Any]]:
+    """Return the changes that the ROS master carried out, with their topics."""
+    return [(call[0], call[2]) for call in world.hidden.calls if "egister" in str(call[0])]
+
+
+async def test_a_node_does_not_wait_for_the_ros_master() -> None:
+    """The answers come from the registry, with the ROS master's texts; the ROS master gets the changes in order."""
+    world, requests = await started()
+    requests.held.clear()
+    answers = [
+        await world.ask("registerPublisher", "/n", "/t", TYPE, uri()),
+        await world.ask("registerSubscriber", "/ear", "/t", TYPE, uri(2)),
+        await world.ask("registerService", "/n", "/s", "rosrpc://10.0.0.5:99", uri()),
+        await world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99"),
+        await world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99"),
+        await world.ask("unregisterPublisher", "/n", "/t", uri()),
+        await world.ask("unregisterPublisher", "/n", "/t", uri()),
+        await world.ask("unregisterSubscriber", "/ear", "/other", uri(2)),
+    ]
+    outer = world.registry.all()[0].outer_uri("10.0.0.1")
+    assert answers == [
+        [1, "Registered [/n] as publisher of [/t]", []],
+        [1, "Subscribed to [/t]", [outer]],
+        [1, "Registered [/n] as provider of [/s]", 1],
+        [1, "Unregistered [/n] as provider of [/s]", 1],
+        [1, "[rosrpc://10.0.0.5:99] is no longer the current service api handle for [/s]", 0],
+        [1, "Unregistered [/n] as provider of [/t]", 1],
+        [1, "[/n] is not a registered node", 0],
+        [1, "[/ear] is not a known provider of [/other]", 0],
+    ]
+    assert changes(world) == []
+    requests.held.set()
+    await world.settle()
+    assert changes(world) == [
+        ("registerPublisher", "/t"),
+        ("registerSubscriber", "/t"),
+        ("registerService", "/s"),
+        ("unregisterService", "/s"),
+        ("unregisterPublisher", "/t"),
+    ]
+    assert requests.methods == ["system.multicall"]
+
+
+async def test_many_changes_go_in_order_in_few_requests() -> None:
+    """One request is under way at a time, with at most 64 changes."""
+    world, requests = await started()
+    node = world.node("/n")
+    for number in range(200):
+        world.enactor.carry_out(world.graph.registered(node, Kind.PUBLICATION, f"/t{number}", TYPE))
+        if number % 2:
+            world.enactor.carry_out(world.graph.unregistered(node, Kind.PUBLICATION, f"/t{number}"))
+    await world.settle()
+    topics = {number: ["registerPublisher", "unregisterPublisher"][: 1 + number % 2] for number in range(200)}
+    assert changes(world) == [(call, f"/t{number}") for number, calls in topics.items() for call in calls]
+    assert (requests.methods, requests.most) == (["system.multicall"] * 5, 1)
+
+
+@pytest.mark.parametrize(
+    "failure", [BrokenOffError("gone"), UnansweredError("late"), CallFailedError("fault")]
+)
+async def test_a_failed_change_is_not_repeated(failure: Exception) -> None:
+    """The door is shut until a round has removed the difference; later changes follow after the round."""
+    world, requests = await started()
+    requests.failure = failure
+    await world.ask("registerPublisher", "/n", "/t", TYPE, uri())
+    await asyncio.wait_for(world.rosmaster.doubtful.wait(), 10)
+    assert not world.rosmaster.reachable
+    world.hidden.restart()
+    await world.ask("registerPublisher", "/n", "/later", TYPE, uri())
+    world.hidden.calls.clear()
+    requests.failure = None
+    await world.round()
+    await world.settle()
+    assert changes(world) == [("registerPublisher", "/t"), ("registerPublisher", "/later")]
+
+
+async def test_a_rejected_change_causes_a_round() -> None:
+    """A part of the multicall fails: the others took effect, and the reconcile loop is woken."""
+    world, requests = await started()
+    requests.answer = [[[1, "", []]], {"faultCode": 1, "faultString": "no such thing"}, [[-1, "invalid", 0]]]
+    world.rosmaster.doubtful.clear()
+    for number in range(3):
+        await world.ask("registerPublisher", "/n", f"/t{number}", TYPE, uri())
+    await world.settle()
+    assert (world.rosmaster.doubtful.is_set(), world.rosmaster.reachable) == (True, True)
+
+
+async def test_calls_wait_while_too_many_changes_wait() -> None:
+    """They are answered once a round has given the ROS master the registry, which then has the change."""
+    world, _requests = await started()
+    world.fill_queue()
+    calls = [
+        asyncio.ensure_future(world.ask("registerPublisher", "/n", "/t", TYPE, uri())),
+        asyncio.ensure_future(world.ask("unregisterPublisher", "/n", "/other", uri())),
+        asyncio.ensure_future(world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99")),
+        asyncio.ensure_future(world.ask("unsubscribeParam", "/n", uri(), "/p")),
+    ]
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert not [call for call in calls if call.done()]
+    assert not [one for one in world.registry.all() if one.name == "/n"]
+    await world.round()
+    answers: list[Any] = await asyncio.gather(*calls)
+    assert [answer[0] for answer in answers] == [1] * 4
+    await world.settle()
+    assert world.hidden.has(Kind.PUBLICATION, "/t") == ["/n"]
+
+
+async def test_a_call_does_not_wait_forever() -> None:
+    """If the ROS master does not come back, the call fails, and nothing was registered."""
+    world, _requests = await started()
+    world.fill_queue()
+    answer: Any = await world.ask("registerPublisher", "/n", "/t", TYPE, uri())
+    assert answer == [0, "the ROS master does not answer; the appliance is restarting it", []]
+    assert not [one for one in world.registry.all() if one.name == "/n"]
+    await world.round()
+    await world.settle()
+
+
+async def test_a_round_replaces_the_waiting_changes() -> None:
+    """The queue has an old life of a node: it does not end what the round registers for the new life."""
+    world, _requests = await started()
+    old, new = world.node("/n", 1), world.node("/n", 2)
+    world.rosmaster.shut()
+    for node, topic in ((new, "/kept"), (old, "/old"), (new, "/new")):
+        if node is old:
+            world.enactor.carry_out(world.graph.lost(new, "away"))
+        world.enactor.carry_out(world.graph.registered(node, Kind.PUBLICATION, topic, TYPE))
+    world.hidden.calls.clear()
+    await world.round()
+    await world.settle()
+    assert changes(world) == [("registerPublisher", "/kept"), ("registerPublisher", "/new")]
+
+
+async def test_the_ros_master_has_what_the_registry_has() -> None:
+    """Replacements, losses, returns and services that change their provider reach the ROS master in order."""
+    world, _requests = await started()
+    for name, number in (("/a", 1), ("/b", 2), ("/a", 3), ("/c", 4)):
+        await world.ask("registerPublisher", name, "/t", TYPE, uri(number))
+        await world.ask("registerSubscriber", name, f"/of_{number}", TYPE, uri(number))
+        await world.ask("registerService", name, "/s", f"rosrpc://10.0.0.5:{number}", uri(number))
+    lost = next(one for one in world.registry.live() if one.name == "/c")
+    world.enactor.carry_out(world.graph.lost(lost, "away"))
+    await world.ask("registerService", "/b", "/s", "rosrpc://10.0.0.5:2", uri(2))
+    world.enactor.carry_out(world.graph.returned(lost))
+    await world.settle()
+    wanted = {(one.kind, one.resource, node.name) for node, one in world.registry.in_order()}
+    there = {
+        (kind, resource, name)
+        for kind, table in world.hidden.tables.items()
+        for resource, names in table.items()
+        for name in names
+    }
+    assert there == wanted
