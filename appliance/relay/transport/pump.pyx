@@ -216,7 +216,7 @@ cdef class ModuleCall:
         if len(wanted) != _OPTIONS or len(native.cells) > _PARTS:
             raise ValueError(f"too much for a step: {len(wanted)} bytes of options, {len(native.cells)} parts of a state")
         self._parts = 0
-        for at, size in native.cells:
+        for at, size in native.cells[:_PARTS]:
             self._at[self._parts], self._size[self._parts] = at, size
             self._parts += 1
 
@@ -366,7 +366,7 @@ cdef class PumpedConnection:
         self._kept = len(torn)
         memcpy(self._torn, <const char *>torn, self._kept)
         self._subscribers = 0
-        for one in subscribers:
+        for one in subscribers[:_SUBSCRIBERS]:
             self._to[self._subscribers] = one
             self._subscribers += 1
         self._descriptor, self._topic, self._module = descriptor, topic, module

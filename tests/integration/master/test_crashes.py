@@ -128,7 +128,7 @@ def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
         registered("registerPublisher", "/ended")
         known = len(
             appliance.audit("--event", "reconciled")
-        )  # meanwhile the ROS master gets this registration
+        )  # while this waits, the ROS master gets this registration
         os.kill(rosmaster, signal.SIGSTOP)
         try:
             registered("registerPublisher", "/under_way")
