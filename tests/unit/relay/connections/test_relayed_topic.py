@@ -4,6 +4,8 @@ import struct
 from collections.abc import Callable, Mapping
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
@@ -67,6 +69,7 @@ class RecordedMember:
         self.behind_since: float | None = None
         self.was_cut = ""
         self.trimmed = 0
+        self.descriptor = -1
         self._fits = fits
 
     def greet(self, header: Mapping[str, str]) -> bool:
@@ -83,11 +86,6 @@ class RecordedMember:
         """Record the frames that the pump has sent in part."""
         self.received += bytes(batch.view[sent:])
         return 0
-
-    @property
-    def descriptor(self) -> int:
-        """Return no socket."""
-        return -1
 
     @property
     def exhausted(self) -> bool:
@@ -547,3 +545,33 @@ def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
         None: 2,
     }
     assert row.delay_seconds == pytest.approx(18.003)
+
+
+@given(st.lists(st.tuples(st.sampled_from(range(9)), st.booleans()), max_size=30))
+def test_what_the_pump_relies_on_does_not_change_without_a_new_version(
+    operations: list[tuple[int, bool]],
+) -> None:
+    """Once the topic has said that frames need only the common work, this holds until `plain` changes."""
+    story = Story()
+    topic, members = story.topic, [story.join(f"/listener{number}") for number in range(3)]
+    for number, member in enumerate(members):
+        member.descriptor = 10 + number
+    taps = [lambda _batch: None, lambda _batch: None]
+    limit = SharedRateLimit(FlowLimit(messages=1), 0.0).of("a")
+    calls: list[Callable[[bool], object]] = [
+        lambda on: topic.upstream_opened(HEADER | {"latching": "01"[on]}),
+        lambda _on: topic.upstream_closed(),
+        lambda on: topic.join(members[0]) if on else topic.leave(members[0]),
+        lambda on: topic.join(members[1]) if on else topic.leave(members[1]),
+        lambda on: topic.tap(taps[0], latched=False) if on else topic.untap(taps[0]),
+        lambda on: topic.monitor((lambda frames: frames) if on else None, wanted=on),
+        lambda on: topic.limit(limit if on else None, None),
+        lambda _on: topic.received(batch(b"x"), story.now),
+        lambda _on: topic.tidy(),
+    ]
+    version, answer = topic.plain.number, topic.simple()
+    for operation, on in operations:
+        calls[operation](on)
+        if topic.plain.number == version and answer is not None:
+            assert topic.simple() == answer
+        version, answer = topic.plain.number, topic.simple()
