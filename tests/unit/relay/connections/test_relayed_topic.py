@@ -548,10 +548,10 @@ def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(range(9)), st.booleans()), max_size=30))
-def test_what_the_pump_relies_on_does_not_change_without_a_new_version(
+def test_an_answer_to_the_pump_holds_for_one_version(
     operations: list[tuple[int, bool]],
 ) -> None:
-    """Once the topic has said that frames need only the common work, this holds until `plain` changes."""
+    """If the topic says that frames need only the common work, this holds until `plain` changes."""
     story = Story()
     topic, members = story.topic, [story.join(f"/listener{number}") for number in range(3)]
     for number, member in enumerate(members):
