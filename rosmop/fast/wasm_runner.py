@@ -218,7 +218,8 @@ class ModuleState:
 
 def packed(prepared: BatchOptions) -> bytes:
     """Return the options as the module reads them."""
-    return _PREPARED.pack(prepared.source << 32, *prepared[1:4])
+    sender = prepared.source << 32
+    return _PREPARED.pack(sender, prepared.told, prepared.enabled, prepared.counted)
 
 
 def _entered(memory: memoryview, value: bytes, buffer: int) -> int:

@@ -20,6 +20,7 @@ from appliance.channel.messages import MonitorEvent
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail
+from appliance.telemetry.metrics import Meter
 from rosmop.run.outcomes import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
@@ -63,6 +64,7 @@ class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
 
     def __init__(self) -> None:
         self.records: list[AuditRecord] = []
+        self.meter = Meter()
 
     def happened(
         self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
