@@ -229,7 +229,11 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def recheck(self) -> None:
-        """Disconnect a publisher that the specifications now reject; retry a rejected one that they may now accept."""
+        """Disconnect a publisher that the specifications now reject; retry a rejected one that they may now accept.
+
+        A quiet publisher keeps no earlier module of the monitors in memory.
+        """
+        self._disarm()
         if self._socket is not None:
             reason = self._objection(self._header)
             if reason:
@@ -262,9 +266,7 @@ class PublisherConnection(Upstream):
         left = self._pumped.step()
         if left is None:
             return
-        torn = self._pumped.disarm()
-        if torn:
-            self._receiver.resume(torn)
+        self._disarm()
         if left.kind == UNARMED:
             try:
                 count = self._recv_into(self._buffer())
@@ -300,6 +302,12 @@ class PublisherConnection(Upstream):
             self._topic.sent(batch, left.since, left.number, left.sent)
         self._since = left.since
         self._continue(rest)
+
+    def _disarm(self) -> None:
+        """Take the next frames from the pump, with the incomplete one."""
+        torn = self._pumped.disarm()
+        if torn:
+            self._receiver.resume(torn)
 
     def _arm(self) -> None:
         """Leave the next frames to the pump if they need only the common work."""

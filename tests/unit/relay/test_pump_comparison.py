@@ -1,23 +1,50 @@
 """The pump does what the path in Python does (docs/dev/assurance.md)."""
 
-import os
+import gc
 
 import pytest
 
+from appliance.relay.transport.pump import ModuleCall
 from tests.support.examples import examples
-from tests.unit.relay.pump_comparison import PumpComparison
+from tests.support.stated import stated
+from tests.unit.relay.monitors.monitored import string
+from tests.unit.relay.pump_comparison import ComparedRelay, PumpComparison
+
+_SEED = 20261124
+_COUNTS = "counts() { int n; event e(std::string s) /chatter std_msgs/String '{data:s}' { n = n + 1; } }"
 
 
 @pytest.mark.timeout(600)
 def test_the_pump_has_the_same_effects_as_python() -> None:
     """Subscribers get the same bytes, and counts, effects and state of monitors are the same; both paths are used."""
-    seed = int.from_bytes(os.urandom(4))
-    comparison = PumpComparison(seed)
+    comparison = PumpComparison(_SEED)
     try:
         comparison.run(examples(18_000))
     except AssertionError as error:
-        raise AssertionError(f"python -m tests.unit.relay.pump_comparison {seed} 18000: {error}") from error
+        raise AssertionError(f"python -m tests.unit.relay.pump_comparison {_SEED} 18000: {error}") from error
     finally:
         comparison.close()
     done = comparison.done
     assert done["pump: without Python"] > 5 + done["plain: without Python"]
+
+
+def test_a_quiet_publisher_keeps_no_earlier_module() -> None:
+    """The call of a module is freed when other specifications are in force, before the next message."""
+    relay = ComparedRelay(pumped=True)
+    relay.subscribe("/chatter", "/listener")
+    relay.state(stated(1, [("counts.rv", _COUNTS)]))
+    relay.answered(1)
+    for _ in range(3):
+        relay.publishers["/chatter"].send(string("one"))
+        relay.expected["/chatter"] += 1
+        relay.take_all()
+    assert _calls()
+    relay.state(stated(2, []))
+    relay.answered(2)
+    assert _calls() == 0
+    relay.close()
+
+
+def _calls() -> int:
+    gc.collect()
+    return sum(isinstance(each, ModuleCall) for each in gc.get_objects())
