@@ -15,6 +15,7 @@ import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root
+from tests.support.rest import Rest
 from tests.support.waiting import allowed, eventually
 
 
@@ -124,6 +125,15 @@ def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
     assert times
     assert max(times) < allowed(3), times
     assert unchanged(appliance, control)
+    eventually(lambda: answers(rest), "REST takes a connection again: the flood held all of this address")
+
+
+def answers(rest: Rest) -> bool:
+    """Whether REST accepts a connection and answers."""
+    try:
+        return rest.get("/healthz").status == 200
+    except ConnectionError:
+        return False
 
 
 def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
