@@ -7,5 +7,5 @@ UNCONFIRMED = "not confirmed in time"
 
 
 def actor(who: str) -> str:
-    """Return an author as text; one that is not a person is the appliance."""
+    """Return an author as text. The appliance is the author of what no person did."""
     return f"the appliance ({who})" if who in (DISK, UNCONFIRMED) else who

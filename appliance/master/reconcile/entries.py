@@ -62,7 +62,7 @@ class MasterRegistrations:
         self._forward((CALLS[kind][1], (node.name, *told)))
 
     async def room(self) -> None:
-        """Wait until there is room for another change. Raises `CallFailedError` if there is none for too long."""
+        """Wait until the queue has room for another change. Raises `CallFailedError` after a long wait."""
         if len(self._waiting) < _MOST_WAITING:
             return
         async with self._rosmaster.patience():

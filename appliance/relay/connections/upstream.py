@@ -229,7 +229,7 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def recheck(self) -> None:
-        """Disconnect a publisher that the specifications now reject; retry a rejected one that they may now accept.
+        """Disconnect a publisher that the specifications now reject, or try a rejected one again.
 
         A quiet publisher keeps no earlier module of the monitors in memory.
         """

@@ -20,20 +20,23 @@ from math import ceil, gcd
 from typing import Literal
 
 from appliance.relay.transport.memory import HostMemory
+from appliance.relay.transport.pump import LARGE as _LARGE
+from appliance.relay.transport.pump import MOST as _MOST
+from appliance.relay.transport.pump import SMALL as _SMALL
 from appliance.relay.transport.pump import Pump
 from roswire.errors import LimitExceededError
 
-SMALL = 4 << 10
+SMALL = _SMALL
 """Unfinished data up to this size (bytes) on a connection is never refused."""
 
-LARGE = 128 << 10
+LARGE = _LARGE
 SCRATCH = 512 << 10
 _KEEP_AREA = 8 << 20  # a camera image fits; new memory for each image costs four times all other work
 
 LITTLE = 8
 """Data is copied if its buffer is at least this many times larger, so that the buffer can be freed."""
 
-MOST = 4096
+MOST = _MOST
 """The most frames of unequal length in one batch."""
 
 _MANY = 4  # frames

@@ -4,6 +4,9 @@ from typing import Final, NamedTuple, Protocol
 from rosmop.run.fast_path import BatchOptions, NativeCall
 
 SUBSCRIBERS: Final[int]
+SMALL: Final[int]
+LARGE: Final[int]
+MOST: Final[int]
 UNARMED: Final = 0
 RECEIVED: Final = 1
 JUDGED: Final = 2
@@ -67,8 +70,6 @@ class ModuleCall:
     def settle(self) -> None: ...
 
 class PumpedConnection:
-    @property
-    def armed(self) -> bool: ...
     def arm(
         self,
         descriptor: int,

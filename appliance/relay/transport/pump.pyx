@@ -12,7 +12,7 @@ Then it waits again. In every other case `wait` returns the ready descriptors to
 Python remains the definition of what happens. It arms a connection when it has found that the next frames need no
 other work. This holds for one version of the topic (`plain`) and of the monitors (`preparation`). Whatever changes one
 of them changes its version, and a step begins by comparing both. A step that meets anything else stops where it
-is: its handler gets a `Left` from `take_left` and goes on from there. A frame is never judged or sent twice.
+is: its handler gets a `Left` from `step` and goes on from there. A frame is never judged or sent twice.
 
 What a step leaves to Python, with what it has done so far:
 - `RECEIVED`: an error or end of the connection, a large frame, too many frames, a long incomplete frame, monitors that
@@ -20,7 +20,7 @@ What a step leaves to Python, with what it has done so far:
 - `JUDGED`: the module was called and wants more than changes in place. Its answer, or its trap, is passed on.
 - `SENT`: a subscriber did not accept everything. It and the later subscribers are left.
 
-Bounds: a step makes one `recv` of at most the scratch area and at most `MOST_SUBSCRIBERS` sends; the module's work is
+Bounds: a step makes one `recv` of at most the scratch area and at most `SUBSCRIBERS` sends; the module's work is
 bounded by its fuel. `wait` returns when a step took longer than `LITTLE`, so that its payer is charged, and when the
 deadline of a timer has passed. If several descriptors are ready, Python divides the processor time among their payers.
 
@@ -32,7 +32,6 @@ from outside are those of the module's function (`rosmop.run.fast_path.NativeCal
 from cpython.exc cimport PyErr_CheckSignals
 from cpython.list cimport PyList_GetItem
 from libc.errno cimport EAGAIN, EINTR, errno
-from libc.math cimport ceil
 from libc.stdint cimport int64_t, uint8_t, uint32_t, uint64_t, uintptr_t
 from libc.string cimport memcmp, memcpy
 from libc.time cimport time_t
@@ -87,11 +86,12 @@ cdef enum:
     _SENT = 3
 
 SUBSCRIBERS = _SUBSCRIBERS
+SMALL, LARGE, MOST = _SMALL, _LARGE, _FRAMES
 UNARMED, RECEIVED, JUDGED, SENT = _UNARMED, _RECEIVED, _JUDGED, _SENT
 LITTLE = 1e-4
 """Seconds of a step that are not charged, because no other descriptor was ready when it began."""
 
-cdef int64_t _LITTLE = 100_000
+cdef int64_t _LITTLE = int(LITTLE * 1e9)
 cdef int64_t _NEVER = (1 << 63) - 1
 cdef int64_t _TOLD = 1 << 60  # this bit and the higher ones of an answer want more work (rosmop/fast/abi.py)
 cdef int64_t _ADDRESS = 0xFFFFFFFF
@@ -381,12 +381,8 @@ cdef class PumpedConnection:
         torn, self._kept = self._torn[: self._kept], 0
         return torn
 
-    @property
-    def armed(self) -> bool:
-        """Whether a step is possible now."""
-        return self._is_armed()
-
     cdef bint _is_armed(self) except -1:
+        """Whether a step is possible now."""
         if self._plain is None or self._plain.number != self._version:
             return False
         return self._module is None or self._module._preparation.number == self._module._version

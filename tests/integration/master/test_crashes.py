@@ -126,9 +126,8 @@ def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
             assert answer[0] == 1, answer
 
         registered("registerPublisher", "/ended")
-        known = len(
-            appliance.audit("--event", "reconciled")
-        )  # while this waits, the ROS master gets this registration
+        # Reading the log takes longer than the 20 ms after which the ROS master gets this registration.
+        known = len(appliance.audit("--event", "reconciled"))
         os.kill(rosmaster, signal.SIGSTOP)
         try:
             registered("registerPublisher", "/under_way")
