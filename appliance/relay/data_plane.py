@@ -332,6 +332,7 @@ class DataPlane:
         if self._own.get(topic) is publisher:
             del self._own[topic]
         publisher.close()  # its remaining subscribers get nothing more
+        self.interceptor.invalidate_prepared()  # its pipeline's counts are collected once more, and then freed
         self._cut_members(relayed, reason)
 
     def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:

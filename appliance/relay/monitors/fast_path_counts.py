@@ -24,7 +24,7 @@ class FastPathCounts:
         self.lane = lane
         self.point = point
         self.begun = False
-        """Whether counting has begun and the observer collects these counts."""
+        """Whether the observer will collect these counts."""
         self.changed: dict[int, int] = {}
         """The number of changed messages by writers, added up by walks (`BatchOptions`)."""
         self._call: ModuleCall | None = None
@@ -47,16 +47,19 @@ class FastPathCounts:
         return sum(walked.dropped)
 
     def take(self) -> tuple[list[_Count], dict[tuple[str, ...], int], list[_Count]]:
-        """Return and reset three counts: drops by event, changed messages by the events that changed them, verdicts."""
+        """Return and reset three counts: drops by event, changed messages by the events that changed them, verdicts.
+
+        While the pump may go on counting, the counts stay `begun`.
+        """
         if self._call is not None:
             self._call.settle()
         changed = {self.lane.writers(who): count for who, count in self.changed.items()}
         dropped, told = self._dropped, self._told
+        self.begun = self._call is not None and self._call.valid
         self._clear()
         return dropped, changed, told
 
     def _clear(self) -> None:
-        self.begun = False
         self.changed.clear()
         self._dropped: list[_Count] = [_NONE] * len(self.lane.events)
         self._told: list[_Count] = [_NONE] * len(self.lane.verdicts)

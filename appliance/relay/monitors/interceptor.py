@@ -92,7 +92,7 @@ class Interceptor:
         self._time_budgets: dict[ObservationPoint, TimeBudget] = {}
         """The time budgets of points; `tick` removes those that have recovered."""
         self._prepared: dict[tuple[ObservationPoint, str], BatchOptions] = {}
-        """The prepared options for requests and replies, valid until the next `preparation`: at most a second."""
+        """The prepared options for requests and replies, for a second, or until the next `preparation`."""
         self._timer: LoopTimer | None = None
         self._due: int | None = None
         self._loader = Loader(loop, self.loaded, self.holder_of)
@@ -353,10 +353,15 @@ class Interceptor:
         return ServiceVerdict(body)
 
     def tick(self) -> None:
-        """Send the counts of this second; called once a second."""
-        self.invalidate_prepared()
+        """Send the counts of this second; called once a second.
+
+        What is prepared stays valid if the second had no event: the next one of each kind will be reported in full.
+        """
         self.observer.tick(self.now())
         self.shadow.tick()
+        if self.observations.some:
+            self.invalidate_prepared()
+        self._prepared.clear()
         self.observations.tick()
         now = self.now()
         self._time_budgets = {

@@ -168,6 +168,11 @@ class Observations:
         """Whether such an event was already reported in this second, so the next one is only counted."""
         return self._key(kind, monitor, point, distinction) in self._told
 
+    @property
+    def some(self) -> bool:
+        """Whether there was an event in this second."""
+        return bool(self._told)
+
     def tick(self) -> None:
         """Send the counts of this second, and the state of the monitors if it changed."""
         for key, repeated in self._told.items():

@@ -296,7 +296,7 @@ class Observer:
                     )
             for writers, messages in changed.items():
                 self._again[writers, point] = self._again.get((writers, point), 0) + messages
-        self._owed.clear()
+        self._owed = [owed for owed in self._owed if owed.begun]
 
     def rows(self, monitors: MonitorSet, time: int) -> list[MonitorRow]:
         """Return the state and counters of the set's monitors in force, or of those in shadow mode."""

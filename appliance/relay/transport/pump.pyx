@@ -220,6 +220,14 @@ cdef class ModuleCall:
             self._at[self._parts], self._size[self._parts] = at, size
             self._parts += 1
 
+    @property
+    def valid(self) -> bool:
+        """Whether steps may make this call."""
+        return self._is_valid()
+
+    cdef bint _is_valid(self) noexcept:
+        return self._preparation.number == self._version
+
     def settle(self) -> None:
         """Add the changed messages that were counted here to the options' counts."""
         if self._times:
@@ -385,7 +393,7 @@ cdef class PumpedConnection:
         """Whether a step is possible now."""
         if self._plain is None or self._plain.number != self._version:
             return False
-        return self._module is None or self._module._preparation.number == self._module._version
+        return self._module is None or self._module._is_valid()
 
     def step(self) -> Left | None:
         """Perform a step, unless `Pump.wait` has just done so; return what is left to do (None: nothing)."""

@@ -47,6 +47,25 @@ def test_a_quiet_publisher_keeps_no_earlier_module() -> None:
         relay.close()
 
 
+def test_counters_that_are_read_between_messages_lose_no_event() -> None:
+    """The pump goes on counting after the counters were read, and an unchanged monitor keeps its counts at a load."""
+    relay = ComparedRelay(pumped=True)
+    try:
+        relay.subscribe("/chatter", "/listener")
+        relay.state(stated(1, [("counts.rv", _COUNTS)]))
+        relay.answered(1)
+        for _ in range(5):
+            relay.publishers["/chatter"].send(string("one"))
+            relay.expected["/chatter"] += 1
+            relay.take_all()
+            relay.totals()
+        relay.state(stated(2, [("counts.rv", _COUNTS), ("other.rv", _COUNTS.replace("counts", "other"))]))
+        relay.answered(2)
+        assert [row.events for row in relay.totals()["rows"]] == [5, 0]
+    finally:
+        relay.close()
+
+
 def _calls() -> set[int]:
     gc.collect()
     return {id(each) for each in gc.get_objects() if isinstance(each, ModuleCall)}
