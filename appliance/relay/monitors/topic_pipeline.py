@@ -79,15 +79,19 @@ class TopicPipeline:
 
     def module_call(self) -> ModuleCall | None:
         """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
-        interceptor = self._interceptor
-        if self._preparation != interceptor.preparation.number or self._lane is None:
+        interceptor, monitors = self._interceptor, self._interceptor.monitors
+        lane = None if monitors is None or interceptor.blocked else monitors.lane(self._point[1])
+        if monitors is None or lane is None or lane is self._defect:
             return None
-        assert self._prepared is not None  # noqa: S101  prepared with the lane
-        assert self._counts is not None  # noqa: S101  as well
-        if not self._counts.begun:
-            interceptor.observer.collect_later(self._counts)
+        if self._preparation != interceptor.preparation.number and not monitors.lane_ready(
+            lane, interceptor.now()
+        ):
+            return None
+        prepared, counts = self._prepare(monitors, lane)
+        if not counts.begun:
+            interceptor.observer.collect_later(counts)
         if self._called is None or self._called[0] != self._preparation:
-            native = self._lane.native()
+            native = lane.native()
             if native is None:
                 return None
             place = interceptor.cells_place(self._point[1]) if native.cells else NOT_KEPT
@@ -96,12 +100,12 @@ class TopicPipeline:
             call = ModuleCall(
                 interceptor.preparation,
                 native,
-                self._prepared,
+                prepared,
                 place,
                 offset=interceptor.offset,
                 until=self._until,
             )
-            self._counts.count_in(call)
+            counts.count_in(call)
             self._called = self._preparation, call
         return self._called[1]
 
