@@ -390,6 +390,7 @@ class RelayedTopic:
 
     def go_on(self, rest: Batch, since: float) -> Batch | None:
         """Like `received`, for frames that were left for later."""
+        self._reported = False
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
@@ -522,7 +523,7 @@ class RelayedTopic:
 
     def traffic(self) -> TopicTraffic | None:
         """Return the counters since the last call; None if nothing has changed."""
-        if self._reported and not self.counters.messages:
+        if self._reported and not self.counters.messages and not self._dropped:
             return None
         messages, size, counts, seconds = self.counters.take()
         row = TopicTraffic(

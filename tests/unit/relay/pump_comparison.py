@@ -46,7 +46,7 @@ from tests.unit.relay.world import LIMITS, LOOPBACK, Peer
 
 _TOPICS = ("/chatter", "/other")
 _MANY = replace(
-    LIMITS, queue_messages=1_000_000, queue_bytes=512 * MIB, retry_first=0.001, retry_longest=0.01, report_every=0.05,
+    LIMITS, queue_messages=1_000_000, queue_bytes=512 * MIB, retry_first=0.001, retry_longest=0.01, report_every=0.005,
     connections=1000, connections_per_host=1000,
 )  # fmt: skip
 _COUNT = """count() { int n; int m;
@@ -209,7 +209,7 @@ class PumpComparison:
         """Perform one random step with both relays, and compare."""
         steps = (
             (900, self._batch), (60, self._read), (12, self._leave), (8, self._join), (8, self._both_at_once),
-            (4, self._switch), (3, self._load), (5, self._break), (5, self._end), (5, self._large), (2, self._compare),
+            (8, self._switch), (5, self._load), (5, self._break), (5, self._end), (5, self._large), (10, self._compare),
         )  # fmt: skip
         (chosen,) = self._random.choices([step for _, step in steps], [weight for weight, _ in steps])
         chosen()
@@ -376,14 +376,21 @@ class PumpComparison:
             self._catch_up(name)
         for side in self.both:
             side.engine.interceptor.tick()  # reports the actions that were counted
+            side.engine.interceptor.observations.flush()
+        totals: list[dict[str, Any]] = []
+
+        def equal() -> bool:
+            totals[:] = [side.totals() for side in self.both]
+            return totals[0] == totals[1]
+
         one, other = self.both
         with contextlib.suppress(AssertionError):  # the message below is better
-            one.until(lambda: one.totals() == other.totals())
+            one.until(equal)
         if self._statement is not None:
             assert one.recovered(self._statement) == other.recovered(self._statement), (
                 "the states of monitors differ"
             )
-        for (what, value), another in zip(one.totals().items(), other.totals().values(), strict=True):
+        for (what, value), another in zip(totals[0].items(), totals[1].values(), strict=True):
             assert value == another, f"{what}: {value} by the pump, {another} without"
 
     @contextlib.contextmanager
