@@ -25,6 +25,8 @@ from appliance.supervisor.sandbox import landlock, seccomp
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 from appliance.supervisor.users import Account
 
+_INCOMPLETE = "the installation is incomplete: install the package again, or run 'make setup' in the sources"
+
 
 class LaunchPlan(msgspec.Struct, frozen=True):
     """The plan to start a child: JSON in the child's arguments, without secrets."""
@@ -68,7 +70,9 @@ def main() -> None:
             _execute(plan)
         else:
             _call(role, plan, secret)
-    except (OSError, ImportError, UnreachableError, seccomp.SeccompError) as error:
+    except ImportError as error:
+        _fail(plan.lifeline, f"{role} cannot be started: {error}; {_INCOMPLETE}")
+    except (OSError, UnreachableError, seccomp.SeccompError) as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
 

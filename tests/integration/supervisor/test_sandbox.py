@@ -18,7 +18,7 @@ import msgspec
 import pytest
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Lifeline, Walled
+from appliance.channel.messages import Failed, Lifeline, Walled
 from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.roles import Facts, Role, roles_of
 from appliance.supervisor.sandbox import landlock
@@ -119,25 +119,27 @@ class Place:
 
     def inside(self, role: Role, entry: str = "main") -> tuple[dict[str, Any], Walled]:
         """Return the results of this function of `trying` inside the role's sandbox, and the process's own report."""
+        done, (said, *_more) = self.start(role, f"{trying.__name__}:{entry}")
+        assert done.returncode == 0, done.stderr
+        assert isinstance(said, Walled)
+        return json.loads(done.stderr.splitlines()[-1]), said
+
+    def start(self, role: Role, entry: str) -> tuple[subprocess.CompletedProcess[str], list[Lifeline]]:
+        """Start a function in the role's sandbox; return the ended process and its reports."""
         here, there = socket.socketpair()
         facts = Facts(
             self.state.path, self.state.config, self.ports[0], "http://127.0.0.1:1", syslog_port=self.ports[0]
         )
         plan = ProcessSlot(role, 0).plan(facts, there.fileno())
         sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))
-        plan = msgspec.structs.replace(
-            plan, sandbox=sandbox, argv=(), entry=f"{trying.__name__}:{entry}", secret=None
-        )
+        plan = msgspec.structs.replace(plan, sandbox=sandbox, argv=(), entry=entry, secret=None)
         with here, there:
             done = subprocess.run(
                 [sys.executable, "-P", "-m", CHILD, role.name, msgspec.json.encode(plan).decode()],
                 env={"PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"], "HOME": plan.home},
                 pass_fds=(there.fileno(),), stderr=subprocess.PIPE, text=True, cwd="/", check=False, timeout=60,
             )  # fmt: skip
-            ((said, _), *_more) = Channel(here, Lifeline).receive()
-        assert done.returncode == 0, done.stderr
-        assert isinstance(said, Walled)
-        return json.loads(done.stderr.splitlines()[-1]), said
+            return done, [said for said, _fds in Channel(here, Lifeline).receive()]
 
     def outside(self, role: Role, account: Account) -> dict[str, Any]:
         """Return the results for the same user without a sandbox."""
@@ -247,3 +249,12 @@ def test_status_shows_the_relays_congestion_control(appliance: Appliance) -> Non
 
     allowed = Path("/proc/sys/net/ipv4/tcp_allowed_congestion_control").read_text().split()
     assert eventually(congestion, appliance.story) == ("cubic" if "cubic" in allowed else "reno")
+
+
+def test_an_incomplete_installation_names_the_remedy(place: Place) -> None:
+    """A process without one of its modules says how to get it."""
+    done, reports = place.start(place.roles["relay"], "appliance.relay.transport.absent:main")
+    assert done.returncode == 1
+    assert isinstance(reports[-1], Failed)
+    assert "No module named 'appliance.relay.transport.absent'; " in reports[-1].reason
+    assert "make setup" in reports[-1].reason
