@@ -355,7 +355,7 @@ class Interceptor:
     def tick(self) -> None:
         """Send the counts of this second; called once a second.
 
-        What is prepared stays valid if the second had no event: the next one of each kind will be reported in full.
+        Prepared options stay valid after a second without an event: the next one of each kind is reported in full.
         """
         self.observer.tick(self.now())
         self.shadow.tick()

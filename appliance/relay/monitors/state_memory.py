@@ -15,6 +15,8 @@ import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from appliance.relay.transport.pump import BASE, CELLS, HAS_CELLS
+
 MAGIC = b"rosrvMS1"
 MOST_SECTIONS = 100_000
 
@@ -24,7 +26,6 @@ _HEAD = struct.Struct("<II")  # length of the head, number of sections
 _ROW = struct.Struct("<III")  # for a section: its start in its half, space for `base`, size of `cells`
 _LENGTH = struct.Struct("<I")
 _FLAGS = 16  # bytes before the places of a section: the section's byte, and from byte 8 on the lengths of both bases
-_BASE, _CELLS, _HAS_CELLS = 1, 2, 4
 _LEAST_ROOM, _MOST_SPARE = 256, 8192
 
 Memory = Any
@@ -118,7 +119,7 @@ class _Section:
 
     @property
     def has_cells(self) -> bool:
-        return bool(self._memory[self._at] & _HAS_CELLS)
+        return bool(self._memory[self._at] & HAS_CELLS)
 
     @property
     def cells_place(self) -> CellsPlace:
@@ -127,20 +128,20 @@ class _Section:
     def write_base(self, base: bytes) -> bool:
         if len(base) > self._room:
             return False
-        into = self._memory[self._at] & _BASE ^ _BASE
+        into = self._memory[self._at] & BASE ^ BASE
         self._put(into, base)
         self._memory[self._at] = into
         return True
 
     def write_cells(self, cells: bytes) -> None:
         flags = self._memory[self._at]  # the pump writes it as well
-        valid = self._cells[(flags & _CELLS) >> 1]
-        if flags & _HAS_CELLS and self._memory[valid : valid + self._size] == cells:
+        valid = self._cells[(flags & CELLS) >> 1]
+        if flags & HAS_CELLS and self._memory[valid : valid + self._size] == cells:
             return
-        into = flags & _CELLS ^ _CELLS
+        into = flags & CELLS ^ CELLS
         at = self._cells[into >> 1]
         self._memory[at : at + self._size] = cells
-        self._memory[self._at] = flags & _BASE | into | _HAS_CELLS
+        self._memory[self._at] = flags & BASE | into | HAS_CELLS
 
     def _put(self, place: int, base: bytes) -> None:
         memory, at = self._memory, self._bases[place]
@@ -181,14 +182,14 @@ def read(memory: Memory) -> StoredState | None:
 
 def _read(view: memoryview, at: int, room: int, cells: int) -> tuple[bytes, bytes | None]:
     flags = _part(view, at, _FLAGS)[0]
-    place = flags & _BASE
+    place = flags & BASE
     (length,) = _LENGTH.unpack_from(view, at + 8 + _LENGTH.size * place)
     if length > room:
         raise ValueError("a state is longer than its place")
     base = bytes(_part(view, at + _FLAGS + place * room, length))
-    if not flags & _HAS_CELLS:
+    if not flags & HAS_CELLS:
         return base, None
-    second = _even(cells) if flags & _CELLS else 0
+    second = _even(cells) if flags & CELLS else 0
     return base, bytes(_part(view, at + _FLAGS + 2 * room + second, cells))
 
 

@@ -41,9 +41,7 @@ class TopicPipeline:
         self._point = point
         self._preparation = _UNPREPARED
         self._until = 0
-        self._lane: FastLane | None = None
-        self._prepared: BatchOptions | None = None
-        self._counts: FastPathCounts | None = None
+        self._prepared: tuple[FastLane, BatchOptions, FastPathCounts] | None = None
         self._defect: FastLane | None = None
         self._called: tuple[int, ModuleCall] | None = None
         self._source = interceptor.senders.number(point)
@@ -57,54 +55,41 @@ class TopicPipeline:
     def _judged(self, batch: Batch) -> Batch | None:
         interceptor = self._interceptor
         now = batch.judged = batch.judged or interceptor.now()
-        if self._preparation != interceptor.preparation.number or now >= self._until:
+        prepared = self._prepared
+        if prepared is None or self._preparation != interceptor.preparation.number or now >= self._until:
             return self._through(batch, BatchProgress(batch, now))
-        assert self._lane is not None  # noqa: S101  `_prepare` has found one
-        assert self._prepared is not None  # noqa: S101  and prepared it
-        assert self._counts is not None  # noqa: S101  and counts for it
+        lane, options, counts = prepared
         pieces: list[memoryview | bytes | bytearray] = []
         try:
-            walked = self._lane.process_batch(batch.view, 0, 0, pieces, now, self._prepared, batch.answer)
+            walked = lane.process_batch(batch.view, 0, 0, pieces, now, options, batch.answer)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
-            self._failed(error, self._lane, now)
+            self._failed(error, lane, now)
             return self._through(batch, BatchProgress(batch, now))
-        if not self._counts.begun:
-            interceptor.observer.collect_later(self._counts)
+        if not counts.begun:
+            interceptor.observer.collect_later(counts)
         if walked is None:
             return batch
         progress = BatchProgress(batch, now)
         progress.pieces = pieces
-        self._account(walked, progress, self._counts)
+        self._account(walked, progress, counts)
         return self._through(batch, progress)
 
     def module_call(self) -> ModuleCall | None:
         """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         lane = None if monitors is None or interceptor.blocked else monitors.lane(self._point[1])
-        if monitors is None or lane is None or lane is self._defect:
+        if monitors is None or lane is None or not self._usable(monitors, lane, interceptor.now()):
             return None
-        if self._preparation != interceptor.preparation.number and not monitors.lane_ready(
-            lane, interceptor.now()
-        ):
-            return None
-        prepared, counts = self._prepare(monitors, lane)
+        options, counts = self._prepare(monitors, lane)
         if not counts.begun:
             interceptor.observer.collect_later(counts)
         if self._called is None or self._called[0] != self._preparation:
-            native = lane.native()
-            if native is None:
+            native, way = lane.native(), self._point[1]
+            place = interceptor.cells_place(way) if native is not None and native.cells else NOT_KEPT
+            if native is None or place is None:
                 return None
-            place = interceptor.cells_place(self._point[1]) if native.cells else NOT_KEPT
-            if place is None:
-                return None
-            call = ModuleCall(
-                interceptor.preparation,
-                native,
-                prepared,
-                place,
-                offset=interceptor.offset,
-                until=self._until,
-            )
+            given = interceptor.preparation, native, options, place
+            call = ModuleCall(*given, offset=interceptor.offset, until=self._until)
             counts.count_in(call)
             self._called = self._preparation, call
         return self._called[1]
@@ -138,10 +123,13 @@ class TopicPipeline:
         interceptor.schedule()
         return progress.result()
 
+    def _usable(self, monitors: MonitorSet, lane: FastLane, now: int) -> bool:
+        return lane is not self._defect and monitors.lane_ready(lane, now)
+
     def _walk(self, monitors: MonitorSet, lane: FastLane, progress: BatchProgress) -> bool:
         """Pass messages through the fast path for a quantum; return False if the engine must take the next message."""
         interceptor = self._interceptor
-        if lane is self._defect or not monitors.lane_ready(lane, progress.time):
+        if not self._usable(monitors, lane, progress.time):
             return False
         prepared, counts = self._prepare(monitors, lane)
         try:
@@ -184,27 +172,28 @@ class TopicPipeline:
 
     def _prepare(self, monitors: MonitorSet, lane: FastLane) -> tuple[BatchOptions, FastPathCounts]:
         """Prepare the options and counts of all batches until something changes."""
-        observer, point = self._interceptor.observer, self._point
-        prepared, counts = self._prepared, self._counts
-        if counts is None or counts.lane is not lane:
-            counts = self._counts = FastPathCounts(lane, point)
-        if (
-            prepared is None
-            or self._preparation != self._interceptor.preparation.number
-            or self._lane is not lane
-        ):
-            prepared = self._prepared = lane.prepare(
-                loud=lane.changes and observer.shows(point),
-                told=[not observer.hides_drop(monitor, point) for monitor in lane.monitors]
-                if lane.drops
-                else (),
-                counted=[observer.hides_verdict(verdict, point) for verdict in lane.verdicts],
-                source=self._source,
-                changed=counts.changed,
-            )
-        self._lane, self._preparation = lane, self._interceptor.preparation.number
+        observer, point, number = (
+            self._interceptor.observer,
+            self._point,
+            self._interceptor.preparation.number,
+        )
         self._until = _NEVER if monitors.next_due is None else monitors.next_due
-        return prepared, counts
+        if self._prepared is None or self._prepared[0] is not lane:
+            counts = FastPathCounts(lane, point)
+        elif self._preparation != number:
+            counts = self._prepared[2]
+        else:
+            return self._prepared[1:]
+        told = [not observer.hides_drop(monitor, point) for monitor in lane.monitors] if lane.drops else ()
+        options = lane.prepare(
+            loud=lane.changes and observer.shows(point),
+            told=told,
+            counted=[observer.hides_verdict(verdict, point) for verdict in lane.verdicts],
+            source=self._source,
+            changed=counts.changed,
+        )
+        self._prepared, self._preparation = (lane, options, counts), number
+        return options, counts
 
     def _one_by_one(self, monitors: MonitorSet, progress: BatchProgress, count: int) -> None:
         """Pass up to `count` messages to the engine, or fewer if the quantum is used up."""

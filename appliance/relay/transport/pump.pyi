@@ -6,6 +6,9 @@ from rosmop.run.fast_path import BatchOptions, NativeCall
 SUBSCRIBERS: Final[int]
 SMALL: Final[int]
 LARGE: Final[int]
+BASE: Final[int]
+CELLS: Final[int]
+HAS_CELLS: Final[int]
 MOST: Final[int]
 UNARMED: Final = 0
 RECEIVED: Final = 1

@@ -77,7 +77,7 @@ cdef enum:
     _BOUNDS = 10
     _OPTIONS = 32
     _PARTS = 16
-    _BASE = 1  # these are bits of state_memory.py
+    _BASE = 1
     _CELLS = 2
     _HAS_CELLS = 4
     _UNARMED = 0
@@ -87,6 +87,7 @@ cdef enum:
 
 SUBSCRIBERS = _SUBSCRIBERS
 SMALL, LARGE, MOST = _SMALL, _LARGE, _FRAMES
+BASE, CELLS, HAS_CELLS = _BASE, _CELLS, _HAS_CELLS  # bits of a section's byte, explained in state_memory.py
 UNARMED, RECEIVED, JUDGED, SENT = _UNARMED, _RECEIVED, _JUDGED, _SENT
 LITTLE = 1e-4
 """Seconds of a step that are not charged, because no other descriptor was ready when it began."""
@@ -223,9 +224,6 @@ cdef class ModuleCall:
     @property
     def valid(self) -> bool:
         """Whether steps may make this call."""
-        return self._is_valid()
-
-    cdef bint _is_valid(self) noexcept:
         return self._preparation.number == self._version
 
     def settle(self) -> None:
@@ -393,7 +391,7 @@ cdef class PumpedConnection:
         """Whether a step is possible now."""
         if self._plain is None or self._plain.number != self._version:
             return False
-        return self._module is None or self._module._is_valid()
+        return self._module is None or self._module._preparation.number == self._module._version
 
     def step(self) -> Left | None:
         """Perform a step, unless `Pump.wait` has just done so; return what is left to do (None: nothing)."""
