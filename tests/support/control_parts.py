@@ -33,6 +33,7 @@ from appliance.master.rosmaster import RosMaster
 from appliance.policy.model import Address, Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
+from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import CallFailedError, RefusedError
 from appliance.store.state_file import StateStore
@@ -403,8 +404,13 @@ class ControlParts:
     def fill_queue(self) -> None:
         """Shut the door, and fill the queue of changes: registering calls then wait for the next round."""
         self.rosmaster.shut()
-        node = self.node("/filler", 999)
-        for number in range(1024):
+        for host in ("10.0.0.8", "10.0.0.9"):
+            self.fill_part_of_queue(host)
+
+    def fill_part_of_queue(self, host: str) -> None:
+        """Let as many changes of a host wait as it may have."""
+        node = self.node("/filler", 999, ipaddress.ip_address(host))
+        for number in range(MASTER_CHANGES.bounds.host):
             self.entries.make(node, NodeRegistration(Kind.PUBLICATION, f"/filler_{number}", "t", number))
 
     def reload(self, text: str) -> int:

@@ -85,7 +85,7 @@ class RegistrationCalls:
 
     async def unregister_service(self, caller: Caller, service: str, service_api: ApiUri) -> Answer:
         """`unregisterService(caller_id, service, service_api)`: the caller's node is found by what it offers."""
-        await self.enactor.entries.room()
+        await self.enactor.entries.room(caller.peer.host)
         port = service_api.uri.port
         provider = next(
             (
@@ -105,12 +105,12 @@ class RegistrationCalls:
 
     async def unsubscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`unsubscribeParam(caller_id, caller_api, key)`: the ROS master's answer is always the same."""
-        await self.enactor.entries.room()
+        await self.enactor.entries.room(caller.peer.host)
         self._unregistered(caller, self.arrivals.known(caller, caller_api), Kind.PARAMETER, key, "")
         return [1, f"Unsubscribe to parameter [{key}]", 1]
 
     async def _unregister_topic(self, caller: Caller, kind: Kind, topic: str, caller_api: ApiUri) -> Answer:
-        await self.enactor.entries.room()
+        await self.enactor.entries.room(caller.peer.host)
         node = self.arrivals.known(caller, caller_api) or self._by_lookup_uri(caller, caller_api)
         other = f"[{caller.caller_id}] is not a known provider of [{topic}]"
         return self._unregistered(caller, node, kind, topic, other)
@@ -141,7 +141,7 @@ class RegistrationCalls:
 
         If the host is at its limit, a new incarnation replaces an unused or lost incarnation of the host.
         """
-        await self.enactor.entries.room()
+        await self.enactor.entries.room(caller.peer.host)
         evicted = self.gate.to_make_room(caller, api)
         if evicted is not None:
             self.enactor.carry_out(self.graph.forgotten(evicted))

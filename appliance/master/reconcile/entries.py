@@ -9,12 +9,12 @@ with the node's inner URI; services get a stand-in URI. Clients never get these 
    registry, so they are dropped (`start_round`). Later changes follow after the round.
 4. A change that fails is not repeated. It shuts the door, and the next round removes the difference. The same holds
    after the death of control: its registry is stored.
-5. At most `_MOST_WAITING` changes wait. Beyond that, registering calls wait (`room`). Changes that no node called for,
-   such as a revocation, do not wait.
+5. At most `MASTER_CHANGES` wait (`quotas.table`). Beyond that, registering calls of the host wait (`room`). Changes
+   that no node called for, such as a revocation, do not wait.
 """
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 
 import structlog
@@ -22,12 +22,13 @@ import structlog
 from appliance.master.graph.registry import Incarnation, Kind, NodeRegistration, Registry
 from appliance.master.graph.revocation import CALLS
 from appliance.master.rosmaster import LARGEST_MULTICALL, RosMaster, Wanted
+from appliance.policy.model import Address
+from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.uris import service_uri
 
 NAME = "/master"
 _GATHER_SECONDS = 0.02  # the ROS master serves gathered changes in half the processor time
-_MOST_WAITING = 1024  # a tenth of a second of the ROS master's time
 
 _log = structlog.get_logger()
 
@@ -44,14 +45,15 @@ class MasterRegistrations:
         self._rosmaster = rosmaster
         self._registry = registry
         self._inner_uri = inner_uri
-        self._waiting: deque[Wanted] = deque()
+        self._waiting: deque[tuple[Address, Wanted]] = deque()  # each with the host of its node
+        self._waiting_of: Counter[Address] = Counter()
         self._sending: asyncio.Task[None] | None = None
         self._has_room = asyncio.Event()
         self.pid: int | None = None
 
     def make(self, node: Incarnation, registration: NodeRegistration) -> None:
         """Make a registration of a node, after all changes that wait."""
-        self._forward(self.call_to_make(node, registration))
+        self._forward(node.host, self.call_to_make(node, registration))
 
     def end(self, node: Incarnation, registration: NodeRegistration) -> None:
         """End a registration of a node, after all changes that wait."""
@@ -59,20 +61,21 @@ class MasterRegistrations:
         told = [resource, stand_in(node) if kind is Kind.SERVICE else self._inner_uri(node)]
         if kind is Kind.PARAMETER:  # only this call has the reverse order
             told.reverse()
-        self._forward((CALLS[kind][1], (node.name, *told)))
+        self._forward(node.host, (CALLS[kind][1], (node.name, *told)))
 
-    async def room(self) -> None:
-        """Wait until the queue has room for another change. Raises `CallFailedError` after a long wait."""
-        if len(self._waiting) < _MOST_WAITING:
+    async def room(self, host: Address) -> None:
+        """Wait until the queue has room for a change of a host. Raises `CallFailedError` after a long wait."""
+        if not self._is_full(host):
             return
         async with self._rosmaster.patience():
-            while len(self._waiting) >= _MOST_WAITING:
+            while self._is_full(host):
                 self._has_room.clear()
                 await self._has_room.wait()
 
     def start_round(self) -> list[tuple[Incarnation, NodeRegistration]]:
         """Return the registrations that the ROS master must have, in order. Drop the changes that led to them."""
         self._waiting.clear()
+        self._waiting_of.clear()
         self._has_room.set()
         return list(self._registry.in_order())
 
@@ -87,8 +90,13 @@ class MasterRegistrations:
         }[registration.kind]
         return CALLS[registration.kind][0], (node.name, *told)
 
-    def _forward(self, call: Wanted) -> None:
-        self._waiting.append(call)
+    def _is_full(self, host: Address) -> bool:
+        bounds = MASTER_CHANGES.bounds
+        return len(self._waiting) >= bounds.whole or self._waiting_of[host] >= bounds.host
+
+    def _forward(self, host: Address, call: Wanted) -> None:
+        self._waiting.append((host, call))
+        self._waiting_of[host] += 1
         if self._sending is None or self._sending.done():
             self._sending = asyncio.get_running_loop().create_task(self._send())
 
@@ -97,8 +105,10 @@ class MasterRegistrations:
             if len(self._waiting) < LARGEST_MULTICALL:
                 await asyncio.sleep(_GATHER_SECONDS)
             await self._rosmaster.opened()
-            part = [self._waiting.popleft() for _ in range(min(len(self._waiting), LARGEST_MULTICALL))]
+            taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), LARGEST_MULTICALL))]
+            self._waiting_of -= Counter(host for host, _call in taken)  # removes hosts without changes
             self._has_room.set()
+            part = [call for _host, call in taken]
             try:
                 answers = await self._rosmaster.call_once(part)
             except CallFailedError as error:

@@ -162,6 +162,21 @@ async def test_calls_wait_while_too_many_changes_wait() -> None:
     assert world.hidden.has(Kind.PUBLICATION, "/t") == ["/n"]
 
 
+async def test_a_host_leaves_room_in_the_queue() -> None:
+    """A host with its share of waiting changes waits; a call of another host is answered at once."""
+    world, _requests = await started()
+    world.rosmaster.shut()
+    world.fill_part_of_queue("10.0.0.5")
+    flood = asyncio.ensure_future(world.ask("registerPublisher", "/flood", "/t", TYPE, uri(3)))
+    other = await world.ask("registerPublisher", "/n", "/t", TYPE, "http://10.0.0.6:4001/", host="10.0.0.6")
+    assert other == [1, "Registered [/n] as publisher of [/t]", []]
+    assert not flood.done()
+    await world.round()
+    answer: Any = await flood
+    assert answer[0] == 1
+    await world.settle()
+
+
 async def test_a_call_does_not_wait_forever() -> None:
     """If the ROS master does not come back, the call fails, and nothing was registered."""
     world, _requests = await started()
