@@ -15,9 +15,10 @@ LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
 CONTAINERS := tests/system/containers
 FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
-# What takes longest runs with `make test-system` only: attacks, crashes and stock tools; searches through the language.
+# What takes longest runs with `make test-system` only: attacks, crashes and stock tools; searches.
 LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integration/*/test_floods.py tests/integration/*/test_crashes.py tests/integration/*/test_robustness.py tests/integration/test_stock_tools.py tests/integration/*/test_stock_tools.py)
-LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py)
+LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py) \
+	tests/unit/recorder/test_killed.py tests/unit/relay/transport/test_pump_fuzzer.py
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
 .PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site release bench clean
