@@ -19,9 +19,9 @@ import asyncio
 import heapq
 import time
 from collections import deque
-from collections.abc import Callable, Coroutine, Generator, Hashable
+from collections.abc import Callable, Hashable
 from operator import itemgetter
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from appliance.policy.model import Address
 from appliance.quotas.table import RVMASTER_TIME
@@ -31,9 +31,7 @@ _MOST_KEPT = 1024  # keys with a stored use; beyond this, only the largest debts
 
 Key = TypeVar("Key", bound=Hashable)
 Item = TypeVar("Item")
-T = TypeVar("T")
 Work = Callable[[], None]
-Steps = Generator[Any, Any, T]
 
 
 class Line(Generic[Key, Item]):
@@ -115,7 +113,6 @@ class ProcessorTime:
         self._spent = 0.0  # seconds in this turn of the loop
         self._since: float | None = None  # the start of the running piece
         self._turn_ends = False  # whether the end of this turn is scheduled
-        self._granted = False  # whether a step may run but has not begun
 
     @property
     def waiting(self) -> int:
@@ -125,12 +122,17 @@ class ProcessorTime:
     @property
     def free(self) -> bool:
         """Whether work may run at once: no work waits, and this turn has time left."""
-        return not self._classes and not self._granted and self._left > 0
+        return not self._classes and self._left > 0
 
     @property
     def _left(self) -> float:
         running = 0.0 if self._since is None else self._clock() - self._since
         return TURN_SECONDS - self._spent - running
+
+    @property
+    def running(self) -> bool:
+        """Whether a piece of work is running."""
+        return self._since is not None
 
     def run(self, host: Address, work: Work) -> bool:
         """Run short work for a host now and return True, or queue it for the host's turn and return False.
@@ -142,14 +144,6 @@ class ProcessorTime:
             return True
         self._queue(host, work)
         return False
-
-    def steps(self, host: Address, work: Coroutine[Any, Any, T]) -> "_InSteps[T]":
-        """Run a coroutine. Each step, from one `await` to the next, waits for the host's turn."""
-        return _InSteps(self, host, work)
-
-    async def spend(self, host: Address, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine as `steps` does, and return its result."""
-        return await _InSteps(self, host, work)
 
     def charge(self, host: Address, seconds: float) -> None:
         """Charge a host for time that was used in this turn of the loop."""
@@ -177,24 +171,6 @@ class ProcessorTime:
         seconds, self._since = self._clock() - self._since, None
         self.charge(host, seconds)
 
-    def turn_of(self, host: Address) -> "asyncio.Future[None]":
-        """Return a future that is done at the host's turn. The caller must call `taken`, even after a cancellation."""
-        turn = asyncio.get_running_loop().create_future()
-
-        def grant() -> None:
-            if not turn.done():
-                self._granted = True
-                turn.set_result(None)
-
-        self._queue(host, grant)
-        return turn
-
-    def taken(self, turn: "asyncio.Future[None]") -> None:
-        """End a turn of `turn_of` if it was granted, whether or not its step has run."""
-        if turn.done() and not turn.cancelled():
-            self._granted = False
-            self._go_on()
-
     def _do(self, host: Address, work: Work) -> None:
         outermost = self.begin()
         try:
@@ -221,62 +197,13 @@ class ProcessorTime:
     def _new_turn(self) -> None:
         self._turn_ends = False
         self._spent = 0.0
-        self._go_on()
-        if self._classes:
-            self._end_turn_later()
-        elif not self._granted:
-            self._classes.forget()
-
-    def _go_on(self) -> None:
-        """Run waiting work while this turn has time left; grant coroutine steps one at a time."""
-        while self._classes and not self._granted and self._left > 0:
+        while self._classes and self._left > 0:
             kind, _ = self._classes.pop()
             hosts = self._hosts[kind]
             self._do(*hosts.pop())
             if not hosts:
                 del self._hosts[kind]
-
-
-class _InSteps(Generic[T]):
-    """Await a coroutine step by step (`ProcessorTime.steps`)."""
-
-    __slots__ = ("_host", "_time", "_work")
-
-    def __init__(self, time: ProcessorTime, host: Address, work: Coroutine[Any, Any, T]) -> None:
-        self._time = time
-        self._host = host
-        self._work = work
-
-    def __await__(self) -> Steps[T]:
-        value, error = None, None
-        try:
-            while True:
-                turn = None
-                if error is None and not self._time.free:
-                    turn = self._time.turn_of(self._host)
-                    try:
-                        yield from turn
-                    except BaseException as raised:  # noqa: BLE001 - passed on to the coroutine
-                        error = raised
-                try:
-                    awaited = self._step(value, error)
-                except StopIteration as done:
-                    return done.value  # type: ignore[no-any-return]  # the work's result
-                finally:
-                    if turn is not None:
-                        self._time.taken(turn)
-                value, error = None, None
-                try:
-                    value = yield awaited
-                except BaseException as raised:  # noqa: BLE001 - same
-                    error = raised
-        finally:
-            self._work.close()
-
-    def _step(self, value: Any, error: BaseException | None) -> Any:
-        outermost = self._time.begin()
-        try:
-            return self._work.send(value) if error is None else self._work.throw(error)
-        finally:
-            if outermost:
-                self._time.end(self._host)
+        if self._classes:
+            self._end_turn_later()
+        else:
+            self._classes.forget()

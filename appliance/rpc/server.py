@@ -30,6 +30,7 @@ from appliance.rpc.acceptor import BACKLOG, Acceptor
 from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import Front, HttpLimits, plain_address
+from appliance.rpc.host_task import HostTask
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.source_queues import Program, SourceQueues
 from roswire.xmlrpc import build_fault
@@ -199,8 +200,9 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._counted = False
         self._too_many = ""  # the reason if the connection is refused
         self._unparsed = b""  # input that waits for the host's turn
-        self._busy: asyncio.Task[None] | None = None
-        self._waiting = False  # whether the request waits for its turn
+        self._busy: HostTask[None] | None = None  # serves a request that could not be answered at once
+        self._waiting = False  # whether the request waits for a slot
+        self._has_slot = False
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
         self._body = bytearray()
         self._held = 0  # bytes of the body that are counted
@@ -405,7 +407,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
         finished = not (self._pending or self.in_request or closing)
         self.connection_table.file(self, Stage.IDLE if finished else Stage.UNFINISHED)
         if self._pending:
-            self._serve_next()
+            asyncio.get_running_loop().call_soon(self.server.time.run, self.peer.host, self._serve_next)
         elif not (closing or self._unparsed):
             self.transport.resume_reading()
 
@@ -419,10 +421,16 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return True
 
     def _serve_next(self) -> None:
+        """Serve the next request, if there is one and no other is being served."""
+        if not (self._pending and self.is_quiet):
+            return
         request, keep = self._pending.popleft()
         self.deadline = float("inf")  # the handler has limits of its own
-        serving = self.server.time.spend(self.peer.host, self._serve(request, keep))
-        self._busy = asyncio.get_running_loop().create_task(serving)
+        serving = HostTask(self.server.time, self.peer.host, self._serve(request, keep))
+        if not serving.done():
+            self._busy = serving
+            if self._has_slot:
+                self.connection_table.file(self, Stage.SERVED)
 
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         try:
@@ -455,7 +463,9 @@ class _Connection(Front, asyncio.BufferedProtocol):
             await turns.enter(host)
         finally:
             self._waiting = False
-        self.connection_table.file(self, Stage.SERVED)
+        self._has_slot = True
+        if self._busy is not None:
+            self.connection_table.file(self, Stage.SERVED)
         try:
             return b"200 OK", await self.server.handler(request)
         except NoAnswerError:
@@ -464,6 +474,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             _log.exception("a request could not be served", host=request.peer.text, path=request.path[:200])
             return b"500 Internal Server Error", b""
         finally:
+            self._has_slot = False
             turns.leave(host)
 
     def _hold_unsent(self) -> None:
