@@ -90,7 +90,7 @@ def open_for_writing(path: Path) -> sqlite3.Connection:
         isolation_level=None,
         timeout=_BUSY_SECONDS,
         check_same_thread=False,
-        cached_statements=64,
+        cached_statements=128,  # an INSERT for each number of rows up to 64, and others
     )
     return _checked(connection, path, _prepare_writing)
 

@@ -7,6 +7,7 @@
 
 import contextlib
 import fcntl
+import functools
 import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,12 +38,12 @@ _REPLACED = (
 _TEXT_ROWS = 256
 
 
+@functools.cache
 def _insert(rows: int) -> str:
     return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
 
 
 _AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
-_INSERTS = {rows: _insert(rows) for rows in (_ROWS_PER_INSERT, 8, 1)}
 
 
 class RemovedRange(NamedTuple):
@@ -131,20 +132,16 @@ class ChainWriter:
 
     def _insert(self, records: Sequence[AuditRecord]) -> tuple[int, bytes, str]:
         sequence, digest, last_id = self.sequence, self.hash, self.last_id
-        position, remaining = 0, len(records)
-        while remaining:
-            rows = next(size for size in _INSERTS if size <= remaining)
-            values: list[object] = []
-            for record in records[position : position + rows]:
+        for start in range(0, len(records), _ROWS_PER_INSERT):
+            part, values = records[start : start + _ROWS_PER_INSERT], list[object]()
+            for record in part:
                 sequence += 1
                 columns = to_columns(record, sequence)
                 digest = record_hash(digest, columns)
                 values += columns
                 values.append(digest)
                 last_id = max(last_id, columns.id)
-            self._connection.execute(_INSERTS[rows], values)
-            position += rows
-            remaining -= rows
+            self._connection.execute(_insert(len(part)), values)
         return sequence, digest, last_id
 
     def seal(self, time: int) -> tuple[Checkpoint, bytes]:
