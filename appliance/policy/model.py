@@ -13,11 +13,14 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 class _Stored:
-    """Store the hash and the text of an address. The standard library computes both at each use."""
+    """Store properties of an address that the standard library computes at each use."""
+
+    is_loopback = False
 
     def __init__(self, text: str) -> None:
         super().__init__(text)  # type: ignore[call-arg]  # the next base is an address
         self._hash, self._text = super().__hash__(), super().__str__()
+        self.is_loopback = super().is_loopback
 
     def __hash__(self) -> int:
         return self._hash
