@@ -236,9 +236,13 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return self._buffer
 
     def buffer_updated(self, size: int) -> None:
-        self._unparsed = bytes(memoryview(self._buffer)[:size])
-        if not self.server.time.run(self.peer.host, self._parse_read):
+        data = bytes(memoryview(self._buffer)[:size])
+        if self._unparsed:
+            self._unparsed += data
             self.transport.pause_reading()
+        else:
+            self._unparsed = data
+            self.server.time.run(self.peer.host, self._parse_read)
 
     def _parse_read(self) -> None:
         data, self._unparsed = self._unparsed, b""

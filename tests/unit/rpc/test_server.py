@@ -7,6 +7,7 @@ import socket
 import pytest
 
 from appliance.quotas.pool import Bounds
+from appliance.rpc.processor_time import TURN_SECONDS
 from appliance.rpc.server import HttpRequest, NoAnswerError
 from appliance.rpc.source_queues import first_for
 from tests.support.http_server import WAIT, Client, Server, Shares, post, serving, until
@@ -274,3 +275,29 @@ async def test_a_handler_without_an_answer() -> None:
         await client.send(post(b"x"))
         with pytest.raises(ConnectionResetError):
             await client.reader.readexactly(1)
+
+
+async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_order() -> None:
+    """The pieces of a request arrive while other hosts use the processor; the request is whole."""
+    now = 0.0
+
+    def work() -> None:
+        nonlocal now
+        now += TURN_SECONDS
+
+    async with serving(shares=Shares(clock=lambda: now)) as server:
+        client, other = await server.connect(), ipaddress.ip_address("10.0.0.66")
+        request = post(bytes(range(256)))
+        await client.send(request[:20])
+        await until(lambda: not server.time.waiting)
+        server.time.charge_beside(ipaddress.ip_address("127.0.0.1"), 1000 * TURN_SECONDS)
+        for _ in range(100):
+            server.time.run(other, work)
+        for start in range(20, len(request), 50):
+            await client.send(request[start : start + 50])
+            for _ in range(3):
+                await asyncio.sleep(0)
+        assert server.time.waiting > 1
+        assert not server.requests
+        await client.response()
+        assert [one.body for one in server.requests] == [bytes(range(256))]
