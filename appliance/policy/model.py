@@ -20,7 +20,7 @@ class _Stored:
     def __init__(self, text: str) -> None:
         super().__init__(text)  # type: ignore[call-arg]  # the next base is an address
         self._hash, self._text = super().__hash__(), super().__str__()
-        self.is_loopback = super().is_loopback
+        self.is_loopback = super().is_loopback  # type: ignore[misc]  # as above
 
     def __hash__(self) -> int:
         return self._hash

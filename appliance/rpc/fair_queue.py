@@ -8,7 +8,7 @@ additional addresses in its network are useless.
 """
 
 import asyncio
-from collections import Counter, OrderedDict, deque
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
 
 from appliance.policy.model import Address
@@ -41,7 +41,7 @@ class Turns:
         self._alike = alike
         self.pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
-        self._taken: Counter[Hashable] = Counter()  # slots by group
+        self._taken: dict[Hashable, int] = {}  # slots by group
         self._taken_as: dict[Address, Hashable] = {}
         self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
@@ -66,7 +66,7 @@ class Turns:
     def leave(self, host: Address) -> None:
         """Release a slot, and give free slots to the longest waiting hosts that may have them."""
         self._give_back(host)
-        while (following := self._next()) is not None:
+        while self.waiting and (following := self._next()) is not None:
             kind, host = following
             hosts = self.waiting.pop(kind)
             queue = hosts.pop(host)
@@ -83,7 +83,7 @@ class Turns:
     def _next(self) -> tuple[Hashable, Address] | None:
         """Take a slot for the next host, and return the host with its group. Return None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
-            if self._taken[kind] < self._together:
+            if self._taken.get(kind, 0) < self._together:
                 for host in hosts:
                     if self._take(host, kind):
                         return kind, host
@@ -91,9 +91,10 @@ class Turns:
 
     def _take(self, host: Address, kind: Hashable) -> bool:
         kind = self._taken_as.get(host, kind)  # the group that the host's other slots are counted for
-        if self._taken[kind] >= self._together or self.slots.take(host):
+        taken = self._taken.get(kind, 0)
+        if taken >= self._together or self.slots.take(host):
             return False
-        self._taken[kind] += 1
+        self._taken[kind] = taken + 1
         self._taken_as[host] = kind
         return True
 
