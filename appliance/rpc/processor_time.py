@@ -186,7 +186,10 @@ class ProcessorTime:
     def _queue(self, host: Address, work: Work) -> None:
         kind = self._kind(host)
         self._classes.put(kind, None)
-        self._hosts.setdefault(kind, Line()).put(host, work)
+        hosts = self._hosts.get(kind)
+        if hosts is None:
+            hosts = self._hosts[kind] = Line()
+        hosts.put(host, work)
         self._end_turn_later()
 
     def _end_turn_later(self) -> None:
