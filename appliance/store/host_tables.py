@@ -160,14 +160,12 @@ class HostTables:
 
     def save_revoked(self, row: RevokedCertificateRow) -> None:
         """Store that a certificate is revoked."""
-        self._database.submit("INSERT OR IGNORE INTO revocation VALUES (?, ?, ?, ?)", row)
+        self._database.put("revocation", *row)
 
     def forget_revoked(self, before: float) -> None:
         """Remove certificates that expired before this time: they are invalid even without a revocation."""
-        self._database.submit("DELETE FROM revocation WHERE expires < ?", (before,))
-        self._database.submit(
-            "DELETE FROM revoked_certificate WHERE moment < ?", (before - _LONGEST_SECONDS,)
-        )
+        self._database.delete("revocation", ("expires", "<", before))
+        self._database.delete("revoked_certificate", ("moment", "<", before - _LONGEST_SECONDS))
 
     def revoked(self) -> list[RevokedCertificateRow]:
         """Return all revoked certificates, the earliest revocation first."""

@@ -131,7 +131,7 @@ class StateStore:
         await self.database.settled()
 
     def close(self, seconds: float | None = None) -> None:
-        """Write the queued statements within `seconds` (None: no limit), and close the file."""
+        """Write the queued changes within `seconds` (None: no limit), and close the file."""
         self.database.close(seconds)
 
     # --- registry ---
@@ -192,9 +192,7 @@ class StateStore:
         """Store the whole parameter tree, and remove the single changes that it contains."""
         self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
         # After a crash, changes that the tree contains may remain: repeated in order, they give the same tree.
-        self.database.submit(
-            "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
-        )
+        self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
 
     def note_parameter(self, key: str, value: Any) -> None:
         """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
@@ -221,10 +219,9 @@ class StateStore:
     def parameters_disowned(self, key: str) -> None:
         """Remove the owners of this key and of all keys below it."""
         above = key.rstrip("/")  # '0' follows '/'
-        self.database.submit(
-            "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
-            (key, f"{above}/", f"{above}0"),
-        )
+        with self.database.together():
+            self.database.delete("parameter_owner", key=key)
+            self.database.delete("parameter_owner", ("key", ">", f"{above}/"), ("key", "<", f"{above}0"))
 
     def parameter_owners(self) -> list[tuple[str, str]]:
         """Return each key with a stored owner, and the host that owns this key and the keys below it."""
@@ -269,7 +266,7 @@ class StateStore:
             for row in rows:
                 if row.keys is not None:
                     self.database.put("token_keys", row.id, *row.keys)
-            for row in rows:  # consecutive rows of a table are one statement
+            for row in rows:  # consecutive rows of a table are one change
                 self.database.put("token", *row[:-1])
 
     def tokens(self) -> list[TokenRow]:

@@ -1,30 +1,31 @@
-"""Write one SQLite file in one thread: statements are queued, written in groups, and can be awaited.
+"""Write one SQLite file in one thread: changes are queued, written in groups, and can be awaited.
 
-Waiting statements are committed together (group commit). A killed process loses no statement: a separate file holds
-queued statements until the database has them (`ahead`). A power failure loses no statement that was awaited
+Waiting changes are committed together (group commit). A killed process loses no change: a separate file holds
+queued changes until the database has them (`ahead`). A power failure loses no change that was awaited
 (`settled`). So a change that was reported to an operator as done stays done.
+
+Each change has a number, in the order of the queue. The table `journal` has the number of the last change in the
+database; the same transaction writes both. So after a crash the database neither repeats nor skips a change.
 """
 
 import asyncio
 import contextlib
-import itertools
 import os
 import queue
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import structlog
 
-from appliance.store.ahead import Parameter, Parameters, WriteAhead
+from appliance.store.ahead import Encoded, WriteAhead
+from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
 
 _GROUP = 2_000
-_GATHER_SECONDS = 0.02  # time to gather statements that are not awaited: they are safe in `ahead`
-
-_ROWS = 64  # rows in one statement
+_GATHER_SECONDS = 0.02  # time to gather changes that are not awaited: they are safe in `ahead`
 
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
@@ -35,15 +36,19 @@ _LEFT = "changes in the file state.ahead are applied at the next start; other ch
 _log = structlog.get_logger()
 
 
+_JOURNAL = """
+CREATE TABLE IF NOT EXISTS journal (id INTEGER PRIMARY KEY CHECK (id = 1), number INTEGER NOT NULL);
+"""
+
+
 class _Queued(NamedTuple):
-    sql: str
-    parameters: Parameters
-    ahead: bool
+    number: int
+    change: Change
 
 
 class _Gathered(NamedTuple):
     thread: int
-    statements: list[_Queued]
+    changes: list[tuple[Change, bool]]
 
 
 class StoreError(Exception):
@@ -62,6 +67,8 @@ class Database:
         self._failed = failed
         self._failing = ""
         self._told: set[str] = set()
+        self._tables = Tables(schema)
+        self._encoder = msgspec.msgpack.Encoder()
         # `.ahead` exists once the database has tables. SQLite would take an empty file for new, and lose revocations.
         if path.exists() and not path.stat().st_size and path.with_suffix(".ahead").exists():
             raise StoreError(
@@ -72,12 +79,12 @@ class Database:
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=NORMAL")
-            self._connection.executescript(schema)
+            self._connection.executescript(schema + _JOURNAL)
             self._ahead = WriteAhead(path.with_suffix(".ahead"))
-            self._catch_up()
+            self._number = self._catch_up()  # of the last change
         except sqlite3.Error as error:
             raise StoreError(f"{path}: {error}; {_advice(error)}") from error
-        except (OSError, msgspec.MsgspecError) as error:
+        except (OSError, msgspec.MsgspecError, ChangeError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._gathered: _Gathered | None = None
         self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
@@ -88,10 +95,10 @@ class Database:
         self._thread = threading.Thread(target=self._write, name="store", daemon=True)
         self._thread.start()
 
-    def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
+    def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
         """Read rows, including those queued before; after start-up, call this in a thread, because it may wait.
 
-        The result lacks statements that are not written within `_CATCH_UP_SECONDS`. If writing fails (a full disk), the
+        The result lacks changes that are not written within `_CATCH_UP_SECONDS`. If writing fails (a full disk), the
         call does not wait.
         """
         if self._thread.is_alive() and not self._failing:
@@ -105,21 +112,30 @@ class Database:
         except sqlite3.Error as error:
             raise StoreError(f"{self._path}: {error}") from error
 
-    def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
-        """Queue one statement; with `ahead`, it survives the process from then on (large values do without).
+    def put(self, table: str, *row: Value, ahead: bool = True) -> None:
+        """Queue a row of a table; it replaces the row with the same key.
 
-        An INSERT must end with its row. Raises `StoreError` after `close`, like all methods that submit.
+        With `ahead`, it survives the process from then on (large values do without). Raises `ChangeError` for a row
+        that does not fit the table, and `StoreError` after `close`, as `delete` does.
         """
-        statement = _Queued(sql, parameters, ahead)
+        self._submit(Put(table, [row]), ahead=ahead)
+
+    def delete(self, table: str, *conditions: Condition, ahead: bool = True, **equal: Value) -> None:
+        """Queue the removal of the rows that meet all conditions and have these values in these columns; see `put`."""
+        equals: list[Condition] = [(column, "=", value) for column, value in equal.items()]
+        self._submit(Delete(table, [*conditions, *equals]), ahead=ahead)
+
+    def _submit(self, change: Change, *, ahead: bool) -> None:
+        self._tables.check(change)
         gathered = self._gathered
         if gathered is not None and gathered.thread == threading.get_ident():
-            gathered.statements.append(statement)
+            gathered.changes.append((change, ahead))
         else:
-            self._keep([statement])
+            self._keep([(change, ahead)])
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """Gather this thread's statements in the block into one write at its end; none survives the process before."""
+        """Gather this thread's changes in the block into one write at its end; none survives the process before."""
         if self._gathered is not None:
             yield
             return
@@ -128,37 +144,35 @@ class Database:
             yield
         finally:
             self._gathered = None
-            if gathered.statements:
-                self._keep(gathered.statements)
+            if gathered.changes:
+                self._keep(gathered.changes)
 
-    def _keep(self, statements: list[_Queued]) -> None:
-        statements = list(_joined(statements))
-        ahead = [(statement.sql, statement.parameters) for statement in statements if statement.ahead]
+    def _keep(self, changes: list[tuple[Change, bool]]) -> None:
+        encoded = [
+            (change, self._encoder.encode(change) if ahead else None) for change, ahead in joined(changes)
+        ]
         with self._order:
             self._require_open()
+            first = self._number + 1
+            self._number += len(encoded)
+            ahead = [
+                Encoded(number, body)
+                for number, (_change, body) in enumerate(encoded, first)
+                if body is not None
+            ]
             if ahead:
                 try:
                     self._ahead.append(ahead)
                 except OSError as error:
                     self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
-            for statement in statements:
-                self._queue.put(statement)
+            for number, (change, _body) in enumerate(encoded, first):
+                self._queue.put(_Queued(number, change))
 
     def _require_open(self) -> None:
         if self._closed:
             raise StoreError(
                 f"{self._path}: the appliance is stopping, and this change came too late to be saved"
             )
-
-    def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
-        """Queue a row of a table; it replaces the row with the same key. See `submit`."""
-        marks = ", ".join("?" * len(row))
-        self.submit(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row, ahead=ahead)  # noqa: S608  fixed names
-
-    def delete(self, table: str, **where: Parameter) -> None:
-        """Queue the removal of the rows with these values in these columns; see `submit`."""
-        wanted = " AND ".join(f"{column} = ?" for column in where)
-        self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
 
     def require_room(self) -> None:
         """Raise `StoreError` if the disk is too full for an order's changes; the order must then change nothing."""
@@ -169,7 +183,7 @@ class Database:
             raise StoreError(f"{why}; nothing was changed: free space and try again")
 
     async def settled(self) -> None:
-        """Wait until all statements queued so far are on the disk. Raises `StoreError` if they cannot be written."""
+        """Wait until all changes queued so far are on the disk. Raises `StoreError` if they cannot be written."""
         loop = asyncio.get_running_loop()
         done = loop.create_future()
 
@@ -193,7 +207,7 @@ class Database:
     def close(self, seconds: float | None = None) -> None:
         """Write the queue within `seconds` (None: no limit), and close the file.
 
-        Statements submitted after this call begins raise `StoreError`.
+        Changes made after this call begins raise `StoreError`.
         """
         with self._order:
             self._closed = True
@@ -222,13 +236,11 @@ class Database:
             if None in group:
                 return
 
-    def _commit(self, statements: list[_Queued]) -> None:
-        while statements:
+    def _commit(self, queued: list[_Queued]) -> None:
+        while queued:
+            last = queued[-1].number
             try:
-                self._connection.execute("BEGIN")
-                for statement in statements:
-                    self._connection.execute(statement.sql, statement.parameters)
-                self._connection.execute("COMMIT")
+                self._execute([self._tables.statement(item.change) for item in queued], last)
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
@@ -242,14 +254,14 @@ class Database:
                     _log.warning("state is written again", file=str(self._path))
                     self._told.clear()
                 self._failing = ""
-                self._ahead.taken(sum(statement.ahead for statement in statements))
+                self._ahead.stored(last)
                 return
 
     def _sync(self) -> None:
         try:
             with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
                 os.fsync(log.fileno())
-            self._ahead.sync()  # else a power failure could restore statements that the database has long had
+            self._ahead.sync()  # else a power failure could leave a part of it
         except OSError as error:
             self._fail(f"{self._path}: {error}")
 
@@ -258,28 +270,26 @@ class Database:
             self._told.add(reason)
             self._failed(reason)
 
-    def _catch_up(self) -> None:
-        """Execute the statements that a killed process left, before anything is read."""
-        left = self._ahead.left()
-        if left:
-            self._connection.execute("BEGIN")
-            for sql, parameters in left:
-                self._connection.execute(sql, parameters)
-            self._connection.execute("COMMIT")
+    def _execute(self, statements: list[tuple[str, list[Value]]], number: int) -> None:
+        """Execute statements and store the number of the last change, in one transaction."""
+        self._connection.execute("BEGIN")
+        for sql, values in statements:
+            self._connection.execute(sql, values)
+        self._connection.execute("INSERT OR REPLACE INTO journal VALUES (1, ?)", (number,))
+        self._connection.execute("COMMIT")
+
+    def _catch_up(self) -> int:
+        """Apply the changes that a killed process left, before anything is read; return the last number."""
+        number = max((row[0] for row in self._connection.execute("SELECT number FROM journal")), default=0)
+        left = self._ahead.left(number)
+        for _number, change in left.changes:
+            self._tables.check(change)
+        if left.changes or left.statements:
+            number = left.changes[-1][0] if left.changes else number
+            statements = [self._tables.statement(change) for _number, change in left.changes]
+            self._execute(left.statements + statements, number)
         self._ahead.clear()
-
-
-def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
-    """Yield the statements, joining consecutive rows of a table: each statement delays the loop's thread."""
-    for (sql, ahead), same in itertools.groupby(
-        statements, lambda statement: (statement.sql, statement.ahead)
-    ):
-        rows = [statement.parameters for statement in same]
-        most = _ROWS if sql.startswith("INSERT") else 1
-        for start in range(0, len(rows), most):
-            together = rows[start : start + most]
-            more = f", {sql[sql.rindex('(') :]}" * (len(together) - 1) if most > 1 else ""
-            yield _Queued(sql + more, [value for row in together for value in row], ahead)
+        return number
 
 
 def _advice(error: sqlite3.Error) -> str:

@@ -276,7 +276,7 @@ async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
     """A token without saved keys is sent itself and recognised by its hash; its holder cannot sign."""
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     token = row.token
-    world.store.database.submit("DELETE FROM token_keys WHERE id = ?", (row.id,))
+    world.store.database.delete("token_keys", id=row.id)
     await world.store.settled()
     world.begin(require_proof=False)
     api = Api(world)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.store.ahead import Statement, WriteAhead
+from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.state_file import (
     LARGEST_CHANGE,
     IncarnationRow,
@@ -29,6 +29,13 @@ def incarnation(key: str) -> IncarnationRow:
 def reopened(directory: Path) -> StateStore:
     """Return the store as the next control finds it."""
     return StateStore(directory, failed=pytest.fail)
+
+
+def leave_behind(directory: Path, changes: Sequence[Encoded]) -> None:
+    """Write the file that a killed process leaves."""
+    ahead = WriteAhead(directory / "state.ahead")
+    ahead.append(changes)
+    ahead.close()
 
 
 def killed_after(work: Callable[[StateStore], None], directory: Path) -> None:
@@ -58,15 +65,15 @@ def test_the_registry_comes_back_as_it_was(tmp_path: Path) -> None:
     again.close()
 
 
-def test_statements_of_a_killed_process_are_repeated_from_any_of_them_on(
+def test_changes_of_a_killed_process_are_applied_from_any_of_them_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever control was killed, the next one starts and finds the registry, even if the database already had it."""
-    statements: list[Statement] = []
+    """Wherever control was killed, the next one starts and finds the registry, however much the database had."""
+    changes: list[Encoded] = []
     append = WriteAhead.append
 
-    def observed(ahead: WriteAhead, together: Sequence[Statement]) -> None:
-        statements.extend(together)
+    def observed(ahead: WriteAhead, together: Sequence[Encoded]) -> None:
+        changes.extend(together)
         append(ahead, together)
 
     monkeypatch.setattr(WriteAhead, "append", observed)
@@ -86,14 +93,17 @@ def test_statements_of_a_killed_process_are_repeated_from_any_of_them_on(
     store.save_incarnation(node)
     store.close()
     monkeypatch.undo()
-    for begin in range(len(statements)):
-        ahead = WriteAhead(tmp_path / "state.ahead")
-        for statement in statements[begin:]:
-            ahead.append([statement])
-        ahead.close()
-        again = reopened(tmp_path)
+    for stored in range(len(changes) + 1):
+        directory = tmp_path / str(stored)
+        directory.mkdir()
+        leave_behind(directory, changes[:stored])
+        reopened(directory).close()
+        leave_behind(directory, changes)
+        again = reopened(directory)
         assert again.load_registry() == ([node], [registration])
         assert again.permissions() == [grant]
+        assert again.parameter_changes() == [("/a", 1)]
+        assert again.parameter_owners() == [("/a/b", "10.0.0.9")]
         again.close()
 
 

@@ -14,10 +14,12 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 
 from appliance.store import ahead as ahead_module
-from appliance.store.ahead import Statement, WriteAhead, WriteAheadClosedError
+from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
+from appliance.store.changes import ChangeError, Put
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
@@ -29,15 +31,20 @@ from pathlib import Path
 from appliance.store.writer_thread import Database
 database = Database(Path(sys.argv[1]) / "state.db", sys.argv[2], failed=print)
 for number in range(5000):
-    database.submit("INSERT OR REPLACE INTO thing VALUES ('last', ?)", (number,))
-    database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", ("row " + str(number),))
+    database.put("thing", "last", number)
+    database.put("thing", "row " + str(number), 1)
 with database.together():
     for number in range(100):
         with database.together():
-            database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", ("together " + str(number),))
+            database.put("thing", "together " + str(number), 1)
 os.kill(os.getpid(), signal.SIGKILL)
 """
-SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER)"
+SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER);"
+
+
+def encoded(number: int, name: str) -> Encoded:
+    """Return the change that puts this row."""
+    return Encoded(number, msgspec.msgpack.encode(Put("thing", [(name, number)])))
 
 
 @pytest.fixture
@@ -57,7 +64,7 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
 async def test_queued_statements_are_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
     """After `settled` another connection sees every statement, in order."""
     for size in range(500):
-        database.submit("INSERT OR REPLACE INTO thing VALUES ('a', ?)", (size,))
+        database.put("thing", "a", size)
     await database.settled()
     with sqlite3.connect(tmp_path / "state.db") as other:
         assert other.execute("SELECT size FROM thing").fetchall() == [(499,)]
@@ -67,7 +74,7 @@ def test_closing_writes_what_is_left(tmp_path: Path) -> None:
     """Nothing that was queued before `close` is lost."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     for number in range(3000):
-        database.submit("INSERT INTO thing VALUES (?, 1)", (str(number),))
+        database.put("thing", str(number), 1)
     database.close()
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     assert again.query("SELECT count(*) FROM thing") == [(3000,)]
@@ -81,7 +88,7 @@ async def test_a_write_that_fails_is_tried_again_until_it_succeeds(
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     database.query("SELECT 1")
     blocker.execute("BEGIN EXCLUSIVE")
-    database.submit("INSERT INTO thing VALUES ('late', 1)")
+    database.put("thing", "late", 1)
     async with asyncio.timeout(60):
         while not failures:
             await asyncio.sleep(0.05)
@@ -98,7 +105,7 @@ def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[s
     database.query("SELECT 1")
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
     blocker.execute("BEGIN EXCLUSIVE")
-    database.submit("INSERT INTO thing VALUES ('late', 1)")
+    database.put("thing", "late", 1)
     began = time.monotonic()
     database.close(0.1)
     assert time.monotonic() - began < 3  # that of SQLite's own patience is five
@@ -127,7 +134,7 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
                 pass
 
         async def scene() -> None:
-            database.submit("INSERT INTO thing VALUES ('late', 1)")
+            database.put("thing", "late", 1)
             with pytest.raises(StoreError, match=r"state\.db: .*full; free space"):
                 await database.settled()
             filler.unlink()
@@ -153,7 +160,7 @@ async def test_settled_statements_survive_a_power_failure(
         synced.append((str(Path(f"/proc/self/fd/{descriptor}").readlink()), os.fstat(descriptor).st_size))
 
     monkeypatch.setattr(os, "fsync", noted)
-    database.submit("INSERT INTO thing VALUES ('revoked', 1)")
+    database.put("thing", "revoked", 1)
     await database.settled()
     log, ahead = tmp_path / "state.db-wal", tmp_path / "state.ahead"
     assert synced == [(str(log), log.stat().st_size), (str(ahead), 0)]
@@ -190,7 +197,7 @@ def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> Non
 
 
 def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tmp_path: Path) -> None:
-    """Nothing that `submit` took is lost to SIGKILL or reordered, whatever the writer thread had done by then."""
+    """Nothing that `put` took is lost to SIGKILL or reordered, whatever the writer thread had done by then."""
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
@@ -206,9 +213,9 @@ def test_rows_of_one_table_are_one_statement(
     numbers: list[int] = []
     append = WriteAhead.append
 
-    def observed(ahead: WriteAhead, statements: Sequence[Statement]) -> None:
-        numbers.append(len(statements))
-        append(ahead, statements)
+    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
+        numbers.append(len(changes))
+        append(ahead, changes)
 
     monkeypatch.setattr(WriteAhead, "append", observed)
     with database.together():
@@ -232,12 +239,13 @@ def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
     kept: list[list[str]] = []
     append = WriteAhead.append
 
-    def observed(ahead: WriteAhead, statements: Sequence[Statement]) -> None:
-        kept.append([str(one) for _sql, parameters in statements for one in parameters])
-        append(ahead, statements)
+    def observed(ahead: WriteAhead, changes: Sequence[Encoded]) -> None:
+        put = [msgspec.msgpack.decode(change.body, type=Put) for change in changes]
+        kept.append([row[0] for change in put for row in change.rows])
+        append(ahead, changes)
 
     def submit(name: str) -> None:
-        database.submit("INSERT INTO thing VALUES (?, 1)", (name,))
+        database.put("thing", name, 1)
 
     monkeypatch.setattr(WriteAhead, "append", observed)
     with pytest.raises(ValueError, match="amid it"), database.together():
@@ -258,22 +266,111 @@ async def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
 ) -> None:
     """It does not grow with the number of statements that were ever made."""
     for number in range(100):
-        database.submit("INSERT INTO thing VALUES (?, 1)", (str(number),))
+        database.put("thing", str(number), 1)
     await database.settled()
     assert (tmp_path / "state.ahead").stat().st_size == 0
 
 
-def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
-    """Half a statement at the end was never confirmed; the complete ones before it are carried out."""
-    ahead = WriteAhead(tmp_path / "state.ahead")
-    ahead.append([("INSERT OR REPLACE INTO thing VALUES ('whole', 1)", ())])
+def leave_behind(path: Path, *changes: Encoded) -> None:
+    """Write the file that a killed process leaves."""
+    ahead = WriteAhead(path)
+    for change in changes:
+        ahead.append([change])
     ahead.close()
-    with (tmp_path / "state.ahead").open("ab") as file:
-        file.write(b"\x00\x00\x01\x00 torn")
+
+
+def names_after_start(tmp_path: Path) -> list[str]:
+    """Start and stop; return the rows then. The file of changes under way must be empty."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
-    assert database.query("SELECT name FROM thing") == [("whole",)]
+    names = [name for (name,) in database.query("SELECT name FROM thing ORDER BY name")]
     database.close()
     assert (tmp_path / "state.ahead").stat().st_size == 0
+    return names
+
+
+def test_a_change_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
+    """However much of the last change was written, it was never confirmed; the complete ones before it are applied."""
+    file = tmp_path / "state.ahead"
+    leave_behind(file, encoded(1, "whole"))
+    whole = file.stat().st_size
+    leave_behind(file, encoded(2, "torn"))
+    data = file.read_bytes()
+    for end in range(whole, len(data)):
+        (tmp_path / "state.db").unlink(missing_ok=True)
+        file.write_bytes(data[:end])
+        assert names_after_start(tmp_path) == ["whole"]
+
+
+@pytest.mark.parametrize("damage", [b"\x00", b"\xff"])
+def test_nothing_behind_a_damaged_change_is_applied(tmp_path: Path, damage: bytes) -> None:
+    """A power failure may leave any block of the file empty; a later change could depend on the missing one."""
+    file = tmp_path / "state.ahead"
+    leave_behind(file, encoded(1, "first"))
+    begin = file.stat().st_size
+    leave_behind(file, encoded(2, "second"))
+    end = file.stat().st_size
+    leave_behind(file, encoded(3, "third"))
+    data = file.read_bytes()
+    for size in (1, end - begin):
+        for at in range(begin, end - size + 1):
+            damaged = data[:at] + damage * size + data[at + size :]
+            (tmp_path / "state.db").unlink(missing_ok=True)
+            file.write_bytes(damaged)
+            expected = ["first", "second", "third"] if damaged == data else ["first"]
+            assert names_after_start(tmp_path) == expected
+
+
+def test_changes_behind_a_missing_one_are_left_out(tmp_path: Path) -> None:
+    """A power failure may undo changes that had left the file; later changes in the file are then left out."""
+    leave_behind(tmp_path / "state.ahead", encoded(1, "kept"))
+    assert names_after_start(tmp_path) == ["kept"]
+    ahead = WriteAhead(tmp_path / "state.ahead")
+    ahead.append([encoded(2, "lost")])
+    ahead.clear()
+    ahead.append([encoded(3, "later")])
+    ahead.close()
+    assert names_after_start(tmp_path) == ["kept"]
+
+
+def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path) -> None:
+    """Large values are not in the file, so their numbers are missing there."""
+    ahead = WriteAhead(tmp_path / "state.ahead")
+    ahead.append([encoded(2, "second"), encoded(5, "fifth")])
+    ahead.close()
+    assert names_after_start(tmp_path) == ["fifth", "second"]
+
+
+def test_statements_that_an_earlier_release_left_are_executed(tmp_path: Path) -> None:
+    """The first start after an upgrade executes the SQL in its file, without a torn last statement."""
+    Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail).close()
+    bodies = [
+        msgspec.msgpack.encode(("INSERT OR REPLACE INTO thing VALUES (?, ?), (?, ?)", ["a", 1, "b", 2])),
+        msgspec.msgpack.encode(("DELETE FROM thing WHERE name = ?", ["a"])),
+    ]
+    data = b"".join(len(body).to_bytes(4, "big") + body for body in bodies)
+    (tmp_path / "state.ahead").write_bytes(data + b"\x00\x00\x01\x00 torn")
+    assert names_after_start(tmp_path) == ["b"]
+
+
+def test_a_change_of_a_later_release_is_an_error_that_names_it(tmp_path: Path) -> None:
+    """It is not dropped: the file stays as it is."""
+    body = msgspec.msgpack.encode(Put("future", [("a", 1)]))
+    leave_behind(tmp_path / "state.ahead", Encoded(1, body))
+    before = (tmp_path / "state.ahead").read_bytes()
+    with pytest.raises(StoreError, match=r"state\.ahead: the state has no table 'future'"):
+        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    assert (tmp_path / "state.ahead").read_bytes() == before
+
+
+def test_a_change_that_fits_no_table_is_refused_at_once(database: Database) -> None:
+    """The caller gets the error; the changes around it are saved."""
+    database.put("thing", "before", 1)
+    with pytest.raises(ChangeError, match="a row of thing has 2 values, not 3"):
+        database.put("thing", "bad", 1, 2)
+    with pytest.raises(ChangeError, match="thing has no column 'colour'"):
+        database.delete("thing", colour="red")
+    database.put("thing", "after", 1)
+    assert database.query("SELECT name FROM thing ORDER BY rowid") == [("before",), ("after",)]
 
 
 class _Gate:
@@ -313,7 +410,7 @@ def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch
     monkeypatch.setattr(ahead_module, "os", calls)
     monkeypatch.setattr(ahead_module, "threading", SimpleNamespace(Lock=lambda: gate))
     ahead = WriteAhead(tmp_path / "state.ahead")
-    writing = threading.Thread(target=ahead.append, args=([("INSERT", ())],))
+    writing = threading.Thread(target=ahead.append, args=([encoded(1, "a")],))
     writing.start()
     assert gate.writing.wait(30)
     ahead.close()
@@ -330,9 +427,8 @@ def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
     with (tmp_path / "another").open("wb") as another:
         another.write(b"untouched")
         another.flush()
-        insert: list[Statement] = [("INSERT", ())]
-        uses: list[Callable[[], None]] = [ahead.clear, ahead.sync, partial(ahead.taken, 0)]
-        uses.append(partial(ahead.append, insert))
+        uses: list[Callable[[], None]] = [ahead.clear, ahead.sync, partial(ahead.stored, 0)]
+        uses.append(partial(ahead.append, [encoded(1, "a")]))
         for use in uses:
             with pytest.raises(WriteAheadClosedError, match=r"already closed.*state\.ahead"):
                 use()
@@ -351,7 +447,7 @@ def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) ->
         with contextlib.suppress(StoreError):
             for number in range(3_000):
                 row = f"{name} {number}"
-                database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", (row,), ahead=bool(number % 2))
+                database.put("thing", row, 1, ahead=bool(number % 2))
                 kept.append(row)
 
     threads = [threading.Thread(target=submit, args=(name,)) for name in range(8)]
