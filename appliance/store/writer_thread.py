@@ -6,12 +6,16 @@ queued changes until the database has them (`ahead`). A power failure loses no c
 
 Each change has a number, in the order of the queue. The table `journal` has the number of the last change in the
 database; the same transaction writes both. So after a crash the database neither repeats nor skips a change.
+
+Numbers identify changes within a *history* only. Each process that changes the file begins a new history, because an
+earlier process may have passed on changes that it then lost in a crash.
 """
 
 import asyncio
 import contextlib
 import os
 import queue
+import secrets
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -22,6 +26,7 @@ import msgspec
 import structlog
 
 from appliance.store.ahead import Encoded, WriteAhead
+from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
 
 _GROUP = 2_000
@@ -37,13 +42,24 @@ _log = structlog.get_logger()
 
 
 _JOURNAL = """
-CREATE TABLE IF NOT EXISTS journal (id INTEGER PRIMARY KEY CHECK (id = 1), number INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS journal (
+    id INTEGER PRIMARY KEY CHECK (id = 1), epoch INTEGER NOT NULL, history TEXT NOT NULL, number INTEGER NOT NULL
+);
 """
+_NOTE_NUMBER = (
+    "INSERT INTO journal VALUES (1, 0, ?, ?)"
+    " ON CONFLICT (id) DO UPDATE SET history = excluded.history, number = excluded.number"
+)
 
 
 class _Queued(NamedTuple):
     number: int
     change: Change
+
+
+class _Waiter(NamedTuple):
+    tell: Callable[[], None]
+    synced: bool
 
 
 class _Gathered(NamedTuple):
@@ -67,7 +83,8 @@ class Database:
         self._failed = failed
         self._failing = ""
         self._told: set[str] = set()
-        self._tables = Tables(schema)
+        self.tables = Tables(schema)
+        self.history = secrets.token_hex(8)
         self._encoder = msgspec.msgpack.Encoder()
         # `.ahead` exists once the database has tables. SQLite would take an empty file for new, and lose revocations.
         if path.exists() and not path.stat().st_size and path.with_suffix(".ahead").exists():
@@ -86,8 +103,9 @@ class Database:
             raise StoreError(f"{path}: {error}; {_advice(error)}") from error
         except (OSError, msgspec.MsgspecError, ChangeError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
+        self._feeds: tuple[ChangeFeed, ...] = ()
         self._gathered: _Gathered | None = None
-        self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Queued | _Waiter | None] = queue.SimpleQueue()
         self._order = threading.Lock()  # for equal order in the write-ahead file and the queue
         self._closed = False
         self._closing = threading.Event()
@@ -103,7 +121,7 @@ class Database:
         """
         if self._thread.is_alive() and not self._failing:
             written = threading.Event()
-            self._queue.put(written.set)
+            self._queue.put(_Waiter(written.set, synced=False))
             self._hurry.set()
             written.wait(_CATCH_UP_SECONDS)
         try:
@@ -126,7 +144,7 @@ class Database:
         self._submit(Delete(table, [*conditions, *equals]), ahead=ahead)
 
     def _submit(self, change: Change, *, ahead: bool) -> None:
-        self._tables.check(change)
+        self.tables.check(change)
         gathered = self._gathered
         if gathered is not None and gathered.thread == threading.get_ident():
             gathered.changes.append((change, ahead))
@@ -149,24 +167,62 @@ class Database:
 
     def _keep(self, changes: list[tuple[Change, bool]]) -> None:
         encoded = [
-            (change, self._encoder.encode(change) if ahead else None) for change, ahead in joined(changes)
+            (change, ahead, self._encoder.encode(change) if ahead or self._feeds else b"")
+            for change, ahead in joined(changes)
         ]
         with self._order:
             self._require_open()
             first = self._number + 1
             self._number += len(encoded)
-            ahead = [
-                Encoded(number, body)
-                for number, (_change, body) in enumerate(encoded, first)
-                if body is not None
-            ]
-            if ahead:
+            kept = [Encoded(number, body) for number, (_, ahead, body) in enumerate(encoded, first) if ahead]
+            if kept:
                 try:
-                    self._ahead.append(ahead)
+                    self._ahead.append(kept)
                 except OSError as error:
                     self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
-            for number, (change, _body) in enumerate(encoded, first):
+            for number, (change, _, _) in enumerate(encoded, first):
                 self._queue.put(_Queued(number, change))
+            for feed in self._feeds:
+                bodies = [body or self._encoder.encode(change) for change, _, body in encoded]
+                feed.add([Encoded(number, body) for number, body in enumerate(bodies, first)])
+
+    def follow(self, changed: Callable[[], None], room: int) -> ChangeFeed:
+        """Return a feed of all changes from now on; `changed` is called after each, in its thread."""
+        with self._order:
+            feed = ChangeFeed(self._number, changed, room)
+            self._feeds = (*self._feeds, feed)
+        return feed
+
+    def unfollow(self, feed: ChangeFeed) -> None:
+        """Add no further changes to this feed."""
+        with self._order:
+            self._feeds = tuple(other for other in self._feeds if other is not feed)
+
+    @property
+    def number(self) -> int:
+        """Return the number of the last change that was made."""
+        return self._number
+
+    def copy(self) -> sqlite3.Connection:
+        """Return a copy of the database, in a file that no longer has a name; call this in a thread.
+
+        The copy is one step: with fewer pages at a time, each commit would start it again. Changes are still written.
+        """
+        path = self._path.with_suffix(".copy")
+        path.unlink(missing_ok=True)  # a killed process may have left a part
+        copy = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
+        try:
+            copy.execute("PRAGMA journal_mode=OFF")
+            copy.execute("PRAGMA synchronous=OFF")
+            with contextlib.closing(sqlite3.connect(self._path)) as source:
+                source.backup(copy)
+            copy.execute("PRAGMA journal_mode=OFF")  # the source's mode was copied with it
+        except sqlite3.Error as error:
+            copy.close()
+            raise StoreError(f"{path}: {error}; {_advice(error)}") from error
+        finally:
+            path.unlink(missing_ok=True)
+        return copy
 
     def _require_open(self) -> None:
         if self._closed:
@@ -192,13 +248,12 @@ class Database:
                 done.set_result(None)
 
         def call_back() -> None:
-            self._sync()
             with contextlib.suppress(RuntimeError):  # the loop has ended, so no caller waits
                 loop.call_soon_threadsafe(tell)
 
         with self._order:
             self._require_open()
-            self._queue.put(call_back)
+            self._queue.put(_Waiter(call_back, synced=True))
         self._hurry.set()
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
@@ -230,9 +285,11 @@ class Database:
             while len(group) < _GROUP and not self._queue.empty():
                 group.append(self._queue.get())
             self._commit([item for item in group if isinstance(item, _Queued)])
-            for item in group:
-                if callable(item):
-                    item()
+            waiters = [item for item in group if isinstance(item, _Waiter)]
+            if any(waiter.synced for waiter in waiters):
+                self._sync()
+            for waiter in waiters:
+                waiter.tell()
             if None in group:
                 return
 
@@ -240,7 +297,7 @@ class Database:
         while queued:
             last = queued[-1].number
             try:
-                self._execute([self._tables.statement(item.change) for item in queued], last)
+                self._execute([self.tables.statement(item.change) for item in queued], last)
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
@@ -275,7 +332,7 @@ class Database:
         self._connection.execute("BEGIN")
         for sql, values in statements:
             self._connection.execute(sql, values)
-        self._connection.execute("INSERT OR REPLACE INTO journal VALUES (1, ?)", (number,))
+        self._connection.execute(_NOTE_NUMBER, (self.history, number))
         self._connection.execute("COMMIT")
 
     def _catch_up(self) -> int:
@@ -283,10 +340,10 @@ class Database:
         number = max((row[0] for row in self._connection.execute("SELECT number FROM journal")), default=0)
         left = self._ahead.left(number)
         for _number, change in left.changes:
-            self._tables.check(change)
+            self.tables.check(change)
         if left.changes or left.statements:
             number = left.changes[-1][0] if left.changes else number
-            statements = [self._tables.statement(change) for _number, change in left.changes]
+            statements = [self.tables.statement(change) for _number, change in left.changes]
             self._execute(left.statements + statements, number)
         self._ahead.clear()
         return number

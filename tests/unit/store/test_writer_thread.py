@@ -19,7 +19,7 @@ import pytest
 
 from appliance.store import ahead as ahead_module
 from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
-from appliance.store.changes import ChangeError, Put
+from appliance.store.changes import Change, ChangeError, Put, Tables
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
@@ -371,6 +371,94 @@ def test_a_change_that_fits_no_table_is_refused_at_once(database: Database) -> N
         database.delete("thing", colour="red")
     database.put("thing", "after", 1)
     assert database.query("SELECT name FROM thing ORDER BY rowid") == [("before",), ("after",)]
+
+
+def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> None:
+    """Threads that make changes at once get different numbers; large values are in the feed as well."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database.put("thing", "earlier", 1)
+    calls: list[int] = []
+    feed = database.follow(lambda: calls.append(1), 1 << 30)
+    begin = database.number
+
+    def put(name: int) -> None:
+        for number in range(500):
+            database.put("thing", f"row {number % 50}", name * number, ahead=bool(number % 3))
+
+    threads = [threading.Thread(target=put, args=(name,)) for name in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    database.delete("thing", name="row 1")
+    assert (begin, database.number, len(calls)) == (1, 2002, 2001)
+    changes = feed.after(begin, 1 << 30)
+    assert changes is not None
+    assert [change.number for change in changes] == list(range(begin + 1, database.number + 1))
+    database.unfollow(feed)
+    database.put("thing", "later", 1)
+    assert feed.after(database.number, 1) is None
+    with contextlib.closing(sqlite3.connect(":memory:")) as other:
+        other.executescript(SCHEMA)
+        other.execute("INSERT INTO thing VALUES ('earlier', 1), ('later', 1)")
+        for change in changes:
+            other.execute(*Tables.statement(msgspec.msgpack.decode(change.body, type=Change)))
+        query = "SELECT * FROM thing ORDER BY name"
+        assert other.execute(query).fetchall() == database.query(query)
+    database.close()
+
+
+def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tmp_path: Path) -> None:
+    """A start that changes nothing leaves the stored history as it was: another appliance may have the same state."""
+    found: list[tuple[str, int]] = []
+    for start in range(3):
+        database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+        assert database.number == 2 * start
+        database.put("thing", "a", start)
+        database.put("thing", "b", start)
+        found.append((database.history, database.number))
+        database.close()
+        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail).close()
+        with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
+            assert reader.execute("SELECT history, number FROM journal").fetchall() == found[-1:]
+    assert len(set(found)) == 3
+    leave_behind(tmp_path / "state.ahead", encoded(7, "left"))
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    query = "SELECT history, number FROM journal"
+    assert database.query(query) == [(database.history, 7)]
+    assert database.number == 7
+    database.close()
+
+
+def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
+    """Its rows are those up to its number, while another thread writes; a killed process may have left a part."""
+    (tmp_path / "state.copy").write_bytes(b"a part")
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database.put("thing", "0", 0)
+    database.query("SELECT 1")
+    ended = threading.Event()
+
+    def put() -> None:
+        for number in range(1, 20_000):
+            if ended.is_set():
+                return
+            database.put("thing", str(number), number)
+
+    thread = threading.Thread(target=put)
+    thread.start()
+    try:
+        for _ in range(10):
+            copy = database.copy()
+            (count,) = copy.execute("SELECT count(*) FROM thing").fetchone()
+            assert copy.execute("SELECT number FROM journal").fetchone() == (count,)
+            copy.close()
+    finally:
+        ended.set()
+        thread.join(30)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "state.db", "state.db-wal", "state.db-shm", "state.ahead"
+    }  # fmt: skip
+    database.close()
 
 
 class _Gate:

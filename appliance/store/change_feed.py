@@ -1,0 +1,65 @@
+"""The latest changes of the state, kept in memory for one consumer that sends them to another appliance."""
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from itertools import islice
+
+from appliance.store.ahead import Encoded
+
+
+class ChangeFeed:
+    """The changes after the number `before`, in order: at most `room` bytes, but always the last one.
+
+    When more arrive, the oldest are dropped, and a consumer that lacks them needs a copy of the whole state. `changed`
+    is called in the thread that made a change. Any thread may use this class.
+    """
+
+    def __init__(self, before: int, changed: Callable[[], None], room: int) -> None:
+        self._before = before
+        self._changed = changed
+        self._room = room
+        self._size = 0
+        self._changes: deque[Encoded] = deque()
+        self._lock = threading.Lock()
+
+    def add(self, changes: Sequence[Encoded]) -> None:
+        """Append the next changes; the numbers have no gap."""
+        with self._lock:
+            self._changes += changes
+            self._size += sum(len(change.body) for change in changes)
+            while self._size > self._room and len(self._changes) > 1:
+                self._drop_oldest()
+        self._changed()
+
+    def after(self, number: int, most: int) -> list[Encoded] | None:
+        """Return the changes after this number: at most `most` bytes, but at least one change if there is any.
+
+        Return None if the feed does not have all of them, or if there was never such a number.
+        """
+        with self._lock:
+            skipped = number - self._before
+            if not 0 <= skipped <= len(self._changes):
+                return None
+            found: list[Encoded] = []
+            for change in islice(self._changes, skipped, None):
+                most -= len(change.body)
+                if found and most < 0:
+                    break
+                found.append(change)
+            return found
+
+    def release(self, number: int) -> None:
+        """Drop the changes up to this number: the consumer has them."""
+        with self._lock:
+            while self._changes and self._before < number:
+                self._drop_oldest()
+
+    def size_after(self, number: int) -> int:
+        """Return the bytes of the changes after this number, as far as they are kept."""
+        with self._lock:
+            return sum(len(change.body) for change in self._changes if change.number > number)
+
+    def _drop_oldest(self) -> None:
+        self._before, body = self._changes.popleft()
+        self._size -= len(body)

@@ -1,0 +1,58 @@
+"""The latest changes, for a consumer."""
+
+from appliance.store.ahead import Encoded
+from appliance.store.change_feed import ChangeFeed
+
+
+def change(number: int, size: int = 10) -> Encoded:
+    """Return a change of this size."""
+    return Encoded(number, bytes(size))
+
+
+def numbers(changes: list[Encoded] | None) -> list[int] | None:
+    """Return the numbers of changes."""
+    return None if changes is None else [one.number for one in changes]
+
+
+def test_a_consumer_gets_all_changes_after_a_number_in_order() -> None:
+    """At most as many bytes as it asks for, but at least one change; only known numbers have an answer."""
+    calls: list[int] = []
+    feed = ChangeFeed(7, lambda: calls.append(1), 1000)
+    assert numbers(feed.after(7, 100)) == []
+    feed.add([change(8), change(9)])
+    feed.add([change(10, 50)])
+    assert len(calls) == 2
+    assert numbers(feed.after(7, 100)) == [8, 9, 10]
+    assert numbers(feed.after(7, 20)) == [8, 9]
+    assert numbers(feed.after(7, 19)) == [8]
+    assert numbers(feed.after(9, 1)) == [10]
+    assert numbers(feed.after(10, 100)) == []
+    assert feed.after(6, 100) is feed.after(11, 100) is None
+    assert (feed.size_after(7), feed.size_after(9), feed.size_after(10)) == (70, 50, 0)
+
+
+def test_a_consumer_that_is_away_for_long_learns_that_changes_are_missing() -> None:
+    """The oldest changes are dropped; the last stays however large it is."""
+    feed = ChangeFeed(0, lambda: None, 100)
+    for number in range(1, 1001):
+        feed.add([change(number)])
+    assert feed.after(989, 1000) is None
+    assert numbers(feed.after(990, 1000)) == list(range(991, 1001))
+    feed.add([change(1001, 5000)])
+    assert feed.after(999, 1000) is None
+    assert numbers(feed.after(1000, 1000)) == [1001]
+    feed.add([change(1002)])
+    assert feed.after(1000, 1000) is None
+    assert numbers(feed.after(1001, 1000)) == [1002]
+    assert feed.size_after(0) == 10
+
+
+def test_changes_that_the_consumer_has_are_dropped() -> None:
+    """A number that was never given drops nothing else."""
+    feed = ChangeFeed(0, lambda: None, 1000)
+    feed.add([change(1), change(2), change(3)])
+    feed.release(2)
+    assert feed.after(1, 100) is None
+    assert numbers(feed.after(2, 100)) == [3]
+    feed.release(1)
+    assert numbers(feed.after(2, 100)) == [3]
