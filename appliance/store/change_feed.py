@@ -55,10 +55,10 @@ class ChangeFeed:
             while self._changes and self._before < number:
                 self._drop_oldest()
 
-    def size_after(self, number: int) -> int:
-        """Return the bytes of the changes after this number, as far as they are kept."""
-        with self._lock:
-            return sum(len(change.body) for change in self._changes if change.number > number)
+    @property
+    def size(self) -> int:
+        """Return the bytes of the changes that are kept."""
+        return self._size
 
     def _drop_oldest(self) -> None:
         self._before, body = self._changes.popleft()

@@ -11,7 +11,7 @@ from appliance.store import host_tables
 from appliance.store.access_tokens import TokenRow
 from appliance.store.writer_thread import Database
 
-_SCHEMA = """
+SCHEMA = f"""
 CREATE TABLE IF NOT EXISTS incarnation (
     key TEXT PRIMARY KEY, name TEXT NOT NULL, host TEXT NOT NULL, api TEXT NOT NULL, told TEXT NOT NULL,
     outer_port INTEGER NOT NULL, relay_port INTEGER NOT NULL, own INTEGER NOT NULL,
@@ -48,7 +48,7 @@ CREATE TABLE IF NOT EXISTS token_keys (
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-"""
+{host_tables.SCHEMA}"""
 
 
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
@@ -122,7 +122,7 @@ class StateStore:
     """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
 
     def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
-        self.database = Database(directory / "state.db", _SCHEMA + host_tables.SCHEMA, failed=failed)
+        self.database = Database(directory / "state.db", SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
         self._parameter_changes = 0  # the number of the last change
 

@@ -1,0 +1,145 @@
+"""The messages between an active appliance and its standby, and the frames that carry them.
+
+A frame is a length (4 bytes) and one message as MessagePack. The standby sends `Stored`: first its position, then one
+for each message that it received. The active appliance sends `Changes` after that position, at least one a second, or a
+snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
+"""
+
+import asyncio
+import contextlib
+import struct
+from typing import Annotated, Any, Generic, TypeVar
+
+import msgspec
+
+from appliance.store.changes import Change, Put
+
+LARGEST_FRAME = 128 << 20  # more than a parameter tree, the largest value of the state
+_PIECE = 256 << 10
+_LENGTH = struct.Struct(">I")
+_LONGEST_REASON = 500
+
+M = TypeVar("M")
+_Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+_History = Annotated[str, msgspec.Meta(max_length=64)]
+
+
+class ReplicationError(Exception):
+    """The link between the appliances ended; the text has the reason."""
+
+
+class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
+    """The standby has all changes up to `number` of this history on its disk; `epoch` is the last it has seen."""
+
+    epoch: _Number
+    history: _History
+    number: _Number
+
+
+class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
+    """The sender of this message ends the link, for this reason."""
+
+    reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
+
+
+class Changes(msgspec.Struct, frozen=True, array_like=True, tag="changes"):
+    """The changes from number `first` on; none if nothing has changed."""
+
+    epoch: _Number
+    history: _History
+    first: _Number
+    changes: list[Change]
+
+
+class EncodedChanges(msgspec.Struct, frozen=True, array_like=True, tag="changes"):
+    """Like `Changes`, with changes that are already encoded."""
+
+    epoch: int
+    history: str
+    first: int
+    changes: list[msgspec.Raw]
+
+
+class SnapshotBegin(msgspec.Struct, frozen=True, array_like=True, tag="snapshot"):
+    """All rows follow, as they were after the change `number`."""
+
+    epoch: _Number
+    history: _History
+    number: _Number
+
+
+class SnapshotRows(msgspec.Struct, frozen=True, array_like=True, tag="rows"):
+    """Some rows of a snapshot."""
+
+    rows: list[Put]
+
+
+class SnapshotEnd(msgspec.Struct, frozen=True, array_like=True, tag="end"):
+    """The snapshot is complete, with this number of rows."""
+
+    rows: _Number
+
+
+FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused
+FromStandby = Stored | Refused
+
+
+def reason_of(error: Exception) -> Refused:
+    """Return the message that tells the other side why the link ends."""
+    return Refused(str(error)[:_LONGEST_REASON])
+
+
+class ReplicationLink(Generic[M]):
+    """One end of the link, which receives messages of one type."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, received: Any) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._encoder = msgspec.msgpack.Encoder()
+        self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
+
+    async def send(self, message: Any) -> None:
+        """Send a message, and wait until the connection can take more. Raises `ReplicationError`.
+
+        Only one task may send at a time.
+        """
+        body = self._encoder.encode(message)
+        if len(body) > LARGEST_FRAME:
+            raise ReplicationError(
+                f"a change has {len(body)} bytes, and the standby gets at most {LARGEST_FRAME}: make"
+                " limits.parameter_bytes smaller"
+            )
+        try:
+            self._writer.writelines((_LENGTH.pack(len(body)), body[:_PIECE]))
+            await self._writer.drain()
+            for begin in range(_PIECE, len(body), _PIECE):
+                await asyncio.sleep(0)  # encryption of all pieces at once would hold the loop
+                self._writer.write(body[begin : begin + _PIECE])
+                await self._writer.drain()
+        except OSError as error:
+            raise ReplicationError(f"the link was lost: {error}") from error
+
+    async def receive(self, seconds: float) -> M:
+        """Return the next message. Raises `ReplicationError` for a bad frame, a lost link, or silence for `seconds`."""
+        try:
+            async with asyncio.timeout(seconds):
+                (length,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
+                if length > LARGEST_FRAME:
+                    raise ReplicationError(f"a frame of {length} bytes; at most {LARGEST_FRAME} are allowed")
+                body = await self._reader.readexactly(length)
+        except TimeoutError as error:
+            raise ReplicationError(f"the other appliance sent nothing for {seconds:g} s") from error
+        except asyncio.IncompleteReadError as error:
+            raise ReplicationError("the other appliance closed the link") from error
+        except OSError as error:
+            raise ReplicationError(f"the link was lost: {error}") from error
+        try:
+            return self._decoder.decode(body)
+        except (msgspec.MsgspecError, RecursionError) as error:
+            raise ReplicationError(f"a message is malformed: {error}") from error
+
+    async def close(self) -> None:
+        """Close the link at once."""
+        self._writer.transport.abort()
+        with contextlib.suppress(OSError):
+            await self._writer.wait_closed()

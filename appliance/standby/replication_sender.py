@@ -1,0 +1,290 @@
+"""Send the changes of the active appliance's state to its standby, and wait until the standby has them.
+
+The standby connects, and says which change it has. It gets the changes after that one, if they are of this process and
+still in memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy. Rows
+are sent rather than the database file, because the standby must not have to trust a file.
+
+1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
+2. While the standby is away, at most `room` bytes of changes are kept. Making changes never waits for the standby:
+   whether an answer does is the caller's decision (`acknowledged`).
+3. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
+"""
+
+import asyncio
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import structlog
+
+from appliance.standby.replication_frames import (
+    LARGEST_FRAME,
+    EncodedChanges,
+    FromStandby,
+    Refused,
+    ReplicationError,
+    ReplicationLink,
+    SnapshotBegin,
+    SnapshotEnd,
+    SnapshotRows,
+    Stored,
+    reason_of,
+)
+from appliance.store.changes import ROWS, Put
+from appliance.store.writer_thread import Database, StoreError
+
+_ROOM = 32 << 20
+_BATCH = 1 << 20  # bytes in one frame, but at least one change
+_OVERHEAD = 64 << 10  # bytes of a frame besides the changes
+_CHANGES_UNANSWERED = (
+    2  # while two are under way, changes gather: the standby writes them to its disk together
+)
+_ROWS_UNANSWERED = 64
+_HEARTBEAT_SECONDS = 1.0
+_SILENCE_SECONDS = 30.0  # the standby writes a large snapshot to its disk in this time
+
+T = TypeVar("T")
+
+_log = structlog.get_logger()
+
+
+class ReplicationLag(NamedTuple):
+    """How far the standby is behind, and why its last link ended.
+
+    `waiting_since` (time of the loop) is set while `acknowledged` has waiters.
+    """
+
+    connected: bool
+    changes: int
+    bytes: int
+    waiting_since: float | None
+    reason: str
+
+    @property
+    def caught_up(self) -> bool:
+        """Whether the standby is connected and has all changes."""
+        return self.connected and not self.changes
+
+
+class ReplicationSender:
+    """The changes of `database` for the standby; `epoch` returns the epoch in which this appliance is active.
+
+    Create it in the event loop, before the first change that the standby needs.
+    """
+
+    def __init__(self, database: Database, epoch: Callable[[], int], *, room: int = _ROOM) -> None:
+        self._database = database
+        self._epoch = epoch
+        self._loop = asyncio.get_running_loop()
+        self._changed = asyncio.Event()
+        self._feed = database.follow(self._notice, room)
+        self._acknowledged = 0
+        self._sent = self._most_sent = 0  # on this link, on all links
+        self._unanswered = 0
+        self._answered = asyncio.Event()
+        self._reason = ""
+        self._link: asyncio.Task[None] | None = None
+        self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
+
+    async def acknowledged(self, number: int) -> None:
+        """Wait until this appliance and the standby have all changes up to this number on their disks.
+
+        Raises `StoreError` if this appliance cannot write. While the standby is away, this waits until it is back.
+        """
+        await self._database.settled()
+        if number > self._acknowledged:
+            waiter = self._loop.create_future()
+            self._waiting[waiter] = (number, self._loop.time())
+            try:
+                await waiter
+            finally:
+                del self._waiting[waiter]
+
+    def lag(self) -> ReplicationLag:
+        """Return how far the standby is behind."""
+        return ReplicationLag(
+            self._link is not None,
+            self._database.number - self._acknowledged,
+            self._feed.size,
+            min((since for _number, since in self._waiting.values()), default=None),
+            self._reason,
+        )
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Send to the standby until the link ends; a new link ends the earlier one. Raises `ReplicationError`."""
+        link: ReplicationLink[FromStandby] = ReplicationLink(reader, writer, FromStandby)
+        try:
+            while (earlier := self._link) is not None:
+                earlier.cancel()
+                await asyncio.wait([earlier])
+                if self._link is earlier:
+                    self._link = None
+            own = self._link = self._loop.create_task(self._serve(link))
+            try:
+                await asyncio.wait([own])
+            finally:
+                own.cancel()
+            if self._link is own:
+                self._link = None
+            if own.cancelled():
+                raise ReplicationError(
+                    "the standby opened another link, or this appliance is no longer active"
+                )
+            try:
+                own.result()
+            except (ReplicationError, StoreError) as error:
+                self._reason = str(error)
+                raise ReplicationError(self._reason) from error
+        finally:
+            await link.close()
+
+    def close(self) -> None:
+        """End the link, and keep no further changes."""
+        self._database.unfollow(self._feed)
+        if self._link is not None:
+            self._link.cancel()
+
+    def _notice(self) -> None:
+        if not self._changed.is_set():  # `_send` clears it before it looks for the last changes
+            with contextlib.suppress(RuntimeError):  # the loop has ended, so no link is open
+                self._loop.call_soon_threadsafe(self._changed.set)
+
+    async def _serve(self, link: ReplicationLink[FromStandby]) -> None:
+        begin = await link.receive(_SILENCE_SECONDS)
+        if isinstance(begin, Refused):
+            raise ReplicationError(f"the standby refuses: {begin.reason}")
+        if begin.epoch > self._epoch():
+            error = ReplicationError(
+                f"the standby has seen epoch {begin.epoch}, and this appliance is active in {self._epoch()}"
+            )
+            await link.send(reason_of(error))
+            raise error
+        known = begin.history == self._database.history and begin.number <= self._most_sent
+        position = begin.number if known and self._feed.after(begin.number, 0) is not None else None
+        if known and begin.number < self._acknowledged:
+            _log.error(
+                "the standby has lost changes that it acknowledged",
+                acknowledged=self._acknowledged,
+                stored=begin.number,
+            )
+        self._acknowledged = self._sent = self._unanswered = 0
+        if position is not None:
+            self._sent = position
+            self._take(begin)
+        ends = [
+            self._loop.create_task(self._receive(link)),
+            self._loop.create_task(self._send(link, position)),
+        ]
+        try:
+            ended, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
+        finally:
+            for task in ends:
+                task.cancel()
+            await asyncio.gather(*ends, return_exceptions=True)
+
+    async def _receive(self, link: ReplicationLink[FromStandby]) -> None:
+        while True:
+            message = await link.receive(_SILENCE_SECONDS)
+            if isinstance(message, Refused):
+                raise ReplicationError(f"the standby refuses: {message.reason}")
+            self._unanswered -= 1
+            self._answered.set()
+            if message.history == self._database.history:
+                self._take(message)
+
+    def _take(self, stored: Stored) -> None:
+        if stored.number > self._sent:
+            raise ReplicationError(
+                f"the standby acknowledged change {stored.number}, and was sent only {self._sent} changes"
+            )
+        if stored.number < self._acknowledged:
+            raise ReplicationError(
+                f"the standby acknowledged change {stored.number} after {self._acknowledged}"
+            )
+        self._acknowledged = stored.number
+        self._feed.release(stored.number)
+        for waiter, (number, _since) in self._waiting.items():
+            if number <= stored.number and not waiter.done():
+                waiter.set_result(None)
+
+    async def _send(self, link: ReplicationLink[FromStandby], position: int | None) -> None:
+        while True:
+            changes = None if position is None else self._feed.after(position, _BATCH)
+            if (
+                position is None
+                or changes is None
+                or sum(len(change.body) for change in changes) > LARGEST_FRAME - _OVERHEAD
+            ):  # in the snapshot, a smaller value may have replaced one that is too large
+                position = await self._send_snapshot(link)
+                continue
+            bodies = [msgspec.Raw(change.body) for change in changes]
+            await self._free_to_send(_CHANGES_UNANSWERED)
+            self._note_sent(position + len(changes))
+            await link.send(EncodedChanges(self._epoch(), self._database.history, position + 1, bodies))
+            position = self._sent
+            if self._feed.after(position, 0) == []:
+                self._changed.clear()
+                if self._feed.after(position, 0) == []:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(self._changed.wait(), _HEARTBEAT_SECONDS)
+
+    async def _send_snapshot(self, link: ReplicationLink[FromStandby]) -> int:
+        """Send a copy of the database; return the number of its last change."""
+        await self._database.settled()
+        copy = await _in_thread(self._database.copy)
+        with contextlib.closing(copy):
+            found = copy.execute("SELECT number FROM journal").fetchone()
+            number = found[0] if found else 0
+            self._note_sent(number)
+            self._unanswered += 1
+            await link.send(SnapshotBegin(self._epoch(), self._database.history, number))
+            rows = 0
+            puts = _rows_of(copy, self._database.tables)
+            while (put := await _in_thread(next, puts, None)) is not None:
+                await self._free_to_send(_ROWS_UNANSWERED)
+                await link.send(SnapshotRows([put]))
+                rows += len(put.rows)
+            self._unanswered += 1
+            await link.send(SnapshotEnd(rows))
+        return number
+
+    async def _free_to_send(self, most: int) -> None:
+        """Wait until at most `most` messages are unanswered, with the next one."""
+        while self._unanswered >= most:
+            self._answered.clear()
+            await self._answered.wait()
+        self._unanswered += 1
+
+    def _note_sent(self, number: int) -> None:
+        self._sent = number
+        self._most_sent = max(self._most_sent, number)
+
+
+async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
+    """Call a function in a thread, and wait for its end even if cancelled: it uses a connection that is closed then."""
+    task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait([task])
+        raise
+
+
+def _rows_of(copy: sqlite3.Connection, tables: Iterable[str]) -> Iterator[Put]:
+    """Yield all rows: at most `ROWS` at a time, and fewer if they have more than `_BATCH` bytes."""
+    for table in tables:
+        rows: list[tuple[str | int | float | bytes | None, ...]] = []
+        size = 0
+        for row in copy.execute(f"SELECT * FROM {table}"):  # noqa: S608  a table of the schema
+            size_of_row = sum(len(value) for value in row if isinstance(value, str | bytes))
+            if rows and (len(rows) == ROWS or size + size_of_row > _BATCH):
+                yield Put(table, rows)
+                rows, size = [], 0
+            rows.append(row)
+            size += size_of_row
+        if rows:
+            yield Put(table, rows)

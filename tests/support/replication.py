@@ -1,0 +1,189 @@
+"""Two appliances' databases and the replication between them, over TLS on the loopback."""
+
+import asyncio
+import contextlib
+import random
+import socket
+import sqlite3
+import ssl
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from appliance.standby.link_certificates import link_context, make_link_certificate
+from appliance.standby.replica import Replica
+from appliance.standby.replication_frames import ReplicationError
+from appliance.standby.replication_receiver import ReplicationReceiver
+from appliance.standby.replication_sender import ReplicationSender
+from appliance.standby.replication_transport import ReplicationListener, follow_at
+from appliance.store.writer_thread import Database, StoreError
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER NOT NULL, note TEXT) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS host (name TEXT PRIMARY KEY, address TEXT NOT NULL UNIQUE) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS tree (id INTEGER PRIMARY KEY CHECK (id = 1), data BLOB NOT NULL, weight REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS mark (number INTEGER PRIMARY KEY);
+"""
+Tables = dict[str, list[tuple[Any, ...]]]
+
+
+def tables_of(path: Path) -> Tables:
+    """Return all rows of a state file."""
+    with contextlib.closing(sqlite3.connect(path)) as reader:
+        return {
+            table: reader.execute(f"SELECT * FROM {table} ORDER BY 1").fetchall()  # noqa: S608  names below
+            for table in ("thing", "host", "tree", "mark")
+        }
+
+
+def change_randomly(database: Database, chosen: random.Random) -> None:
+    """Make one random change, of one to 100 rows, or of a large value."""
+    kind = chosen.randrange(7)
+    name = f"row {chosen.randrange(50)}"
+    if kind < 3:
+        database.put("thing", name, chosen.randrange(-5, 5), chosen.choice([None, "note", "ä" * 100]))
+    elif kind == 3:
+        database.delete("thing", ("name", ">", name), ("size", "<=", chosen.randrange(5)))
+    elif kind == 4:
+        database.put("host", name, f"10.0.0.{chosen.randrange(20)}")
+    elif kind == 5:
+        size = chosen.choice([10, 1000, 200_000])
+        database.put("tree", 1, chosen.randbytes(size), chosen.random(), ahead=False)
+    else:
+        with database.together():
+            for number in range(chosen.randrange(1, 100)):
+                database.put("thing", f"row {number % 60}", number, None)
+            database.delete("host", name=name)
+
+
+def certificates(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
+    """Return the TLS contexts of the active appliance and of the standby."""
+    homes = [directory / "certificates-active", directory / "certificates-standby"]
+    for home in homes:
+        home.mkdir(exist_ok=True)
+    active, standby = (make_link_certificate(home) for home in homes)
+    return link_context(homes[0], standby, server=True), link_context(homes[1], active, server=False)
+
+
+def listening_socket() -> socket.socket:
+    """Return a listening socket on a free port of the loopback."""
+    listening = socket.socket()
+    listening.bind(("127.0.0.1", 0))
+    listening.listen()
+    return listening
+
+
+class ActiveSide:
+    """The database of the active appliance, which listens for its standby."""
+
+    def __init__(
+        self,
+        path: Path,
+        context: ssl.SSLContext,
+        *,
+        epoch: int = 1,
+        room: int = 32 << 20,
+        schema: str = SCHEMA,
+        listening: socket.socket | None = None,
+    ) -> None:
+        self.epoch = epoch
+        self.database = Database(path, schema, failed=print)
+        self.sender = ReplicationSender(self.database, lambda: self.epoch, room=room)
+        self._socket = listening or listening_socket()
+        self.port: int = self._socket.getsockname()[1]
+        self._task = asyncio.create_task(ReplicationListener(self.sender, context).run(self._socket))
+
+    async def close(self) -> None:
+        """End the link, and close the database."""
+        self.sender.close()
+        self._task.cancel()
+        await asyncio.wait([self._task])
+        self._socket.close()
+        await asyncio.to_thread(self.database.close)
+
+
+class StandbySide:
+    """A standby, which connects again and again; `ends` has the reasons why links ended."""
+
+    def __init__(
+        self, path: Path, context: ssl.SSLContext, port: Callable[[], int], *, largest: int = 1 << 30
+    ) -> None:
+        self.ends: list[str] = []
+        self.replica = Replica(path, SCHEMA, failed=print, largest=largest)
+        self._context = context
+        self._port = port
+        self._task = asyncio.create_task(self._run())
+
+    async def _run(self) -> None:
+        receiver = ReplicationReceiver(self.replica, lambda _epoch: True)
+        while True:
+            try:
+                await follow_at("127.0.0.1", self._port(), self._context, receiver)
+            except (ReplicationError, StoreError) as error:
+                self.ends.append(str(error))
+            await asyncio.sleep(0.02)
+
+    async def close(self) -> None:
+        """End the link, and close the database."""
+        self._task.cancel()
+        await asyncio.wait([self._task])
+        self.replica.close()
+
+
+class CuttingProxy:
+    """A proxy between the two, which closes a connection after a random number of bytes, often in a frame."""
+
+    def __init__(self, port: Callable[[], int], chosen: random.Random) -> None:
+        self.cutting = True
+        self.cuts = 0
+        self._target = port
+        self._chosen = chosen
+        self._server: asyncio.Server | None = None
+
+    async def start(self) -> int:
+        """Listen; return the port."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    async def close(self) -> None:
+        """Listen no longer."""
+        assert self._server is not None
+        self._server.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        left = self._chosen.choice([3000, 20_000, 300_000]) + self._chosen.randrange(3000)
+        try:
+            reader_there, writer_there = await asyncio.open_connection("127.0.0.1", self._target())
+        except OSError:
+            writer.close()
+            return
+
+        async def pass_on(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+            nonlocal left
+            with contextlib.suppress(OSError):
+                while data := await source.read(1500):
+                    left -= len(data)
+                    if self.cutting and left < 0:
+                        sink.write(data[: self._chosen.randrange(len(data))])
+                        self.cuts += 1
+                        break
+                    sink.write(data)
+                    await sink.drain()
+            writer.close()
+            writer_there.close()
+
+        await asyncio.gather(pass_on(reader, writer_there), pass_on(reader_there, writer))
+
+
+@contextlib.asynccontextmanager
+async def replicated(directory: Path, **options: Any) -> AsyncIterator[tuple[ActiveSide, StandbySide]]:
+    """Run an active appliance and its standby."""
+    server, client = certificates(directory)
+    active = ActiveSide(directory / "active.db", server, **options)
+    standby = StandbySide(directory / "standby.db", client, lambda: active.port)
+    try:
+        yield active, standby
+    finally:
+        await standby.close()
+        await active.close()

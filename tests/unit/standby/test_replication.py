@@ -1,0 +1,411 @@
+"""Replication of the state between two databases, over TLS."""
+
+import asyncio
+import random
+import socket
+import ssl
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.standby import replication_frames, replication_sender
+from appliance.standby.link_certificates import link_context, make_link_certificate
+from appliance.standby.replication_frames import (
+    Changes,
+    FromActive,
+    ReplicationError,
+    ReplicationLink,
+    SnapshotBegin,
+    SnapshotEnd,
+    Stored,
+)
+from tests.support.replication import (
+    SCHEMA,
+    ActiveSide,
+    CuttingProxy,
+    StandbySide,
+    certificates,
+    change_randomly,
+    replicated,
+    tables_of,
+)
+from tests.support.waiting import allowed
+
+pytestmark = pytest.mark.anyio
+SECONDS = 20
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    """Wait for a condition."""
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+def require_equal(directory: Path) -> None:
+    """Both databases have the same rows."""
+    assert tables_of(directory / "standby.db") == tables_of(directory / "active.db")
+
+
+async def test_changes_arrive_and_are_acknowledged(tmp_path: Path) -> None:
+    """When `acknowledged` returns, the standby's file has the change, and all changes before it."""
+    async with asyncio.timeout(SECONDS), replicated(tmp_path) as (active, standby):
+        chosen = random.Random(1)  # noqa: S311  draws examples
+        for _ in range(30):
+            for _ in range(20):
+                change_randomly(active.database, chosen)
+            await active.sender.acknowledged(active.database.number)
+            assert standby.replica.position.number == active.database.number
+            assert active.sender.lag()[:4] == (True, 0, 0, None)
+            assert active.sender.lag().caught_up
+            require_equal(tmp_path)
+        assert not standby.ends
+
+
+@pytest.mark.parametrize("seed", range(6))
+async def test_nothing_is_lost_however_often_the_link_is_cut(tmp_path: Path, seed: int) -> None:
+    """The link is cut in frames, either side restarts, and memory is short; acknowledged changes are at the standby."""
+    chosen = random.Random(seed)  # noqa: S311  draws examples
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server, room=20_000)
+    proxy = CuttingProxy(lambda: active.port, chosen)
+    port = await proxy.start()
+    standby = StandbySide(tmp_path / "standby.db", client, lambda: port)
+    mark = 0
+    async with asyncio.timeout(2 * SECONDS):
+        for step in range(60):
+            for _ in range(chosen.randrange(1, 15)):
+                change_randomly(active.database, chosen)
+            mark += 1
+            active.database.put("mark", mark)
+            if step % 3 == 0:
+                await active.sender.acknowledged(active.database.number)
+                assert (mark,) in tables_of(tmp_path / "standby.db")["mark"]
+            if step % 20 == 13:
+                await standby.close()
+                standby = StandbySide(tmp_path / "standby.db", client, lambda: port)
+            if step % 20 == 17:
+                await active.close()
+                active = ActiveSide(tmp_path / "active.db", server, room=20_000)
+        proxy.cutting = False
+        await active.sender.acknowledged(active.database.number)
+        require_equal(tmp_path)
+        assert proxy.cuts > 3
+    await standby.close()
+    await active.close()
+    await proxy.close()
+
+
+async def test_a_standby_that_was_away_for_long_gets_a_snapshot(tmp_path: Path) -> None:
+    """Memory for it is bounded; the snapshot is of a state that changes while it is sent."""
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server, room=10_000)
+    chosen = random.Random(2)  # noqa: S311  draws examples
+    for number in range(3000):
+        active.database.put("thing", f"away {number}", number, "x" * 1000)
+    lag = active.sender.lag()
+    assert (lag.connected, lag.changes, lag.caught_up) == (False, 3000, False)
+    assert 0 < lag.bytes <= 10_000
+    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+    async with asyncio.timeout(SECONDS):
+        await until(lambda: active.sender.lag().connected)
+        while standby.replica.position.number < 3000:
+            change_randomly(active.database, chosen)
+            await asyncio.sleep(0)
+        await active.sender.acknowledged(active.database.number)
+        require_equal(tmp_path)
+    await standby.close()
+    await active.close()
+
+
+async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: Path) -> None:
+    """No snapshot is sent while the changes are still in memory."""
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+    async with asyncio.timeout(SECONDS):
+        active.database.put("thing", "a", 1, None)
+        await active.sender.acknowledged(1)
+        await standby.close()
+        for number in range(500):
+            active.database.put("thing", f"row {number}", number, "x" * 1000)
+        async with connected(tmp_path, active) as link:
+            await link.send(standby.replica.position)
+            received = 0
+            while received < 500:
+                message = await link.receive(10)
+                assert isinstance(message, Changes)
+                assert message.first == 2 + received
+                received += len(message.changes)
+                await link.send(Stored(1, message.history, 1 + received))
+    await active.close()
+
+
+@asynccontextmanager
+async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[ReplicationLink[FromActive]]:
+    """Connect as the standby does, to lie."""
+    _server, client = certificates(directory)
+    reader, writer = await asyncio.open_connection("127.0.0.1", active.port, ssl=client)
+    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    try:
+        yield link
+    finally:
+        await link.close()
+
+
+async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
+    """Take a snapshot without storing it; return its beginning."""
+    begin = await link.receive(10)
+    assert isinstance(begin, SnapshotBegin)
+    await link.send(Stored(0, "", 0))
+    while not isinstance(await link.receive(10), SnapshotEnd):
+        await link.send(Stored(0, "", 0))
+    return begin
+
+
+async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: Path) -> None:
+    """The link ends, and a caller who waits gets no answer."""
+    server, _client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    active.database.put("thing", "a", 1, None)
+    history = active.database.history
+    async with asyncio.timeout(SECONDS):
+        waiting = asyncio.create_task(active.sender.acknowledged(1))
+        for lie in (Stored(1, history, 2), Stored(1, history, 1 << 61)):
+            async with connected(tmp_path, active) as link:
+                await link.send(Stored(0, "", 0))
+                await take_snapshot(link)
+                await link.send(lie)
+                with pytest.raises(ReplicationError, match=r"closed the link|lost"):
+                    while True:
+                        await link.receive(10)
+            assert not waiting.done()
+        active.database.put("thing", "b", 1, None)
+        async with connected(
+            tmp_path, active
+        ) as link:  # a position that was never sent is that of another state
+            await link.send(Stored(1, history, 2))
+            begin = await take_snapshot(link)
+            assert begin.number == 2
+            assert not waiting.done()
+            await link.send(Stored(1, history, 2))
+            await waiting
+            await link.send(Stored(1, history, 0))
+            with pytest.raises(ReplicationError, match=r"closed the link|lost"):
+                while True:
+                    await link.receive(10)
+    await active.close()
+
+
+async def test_a_standby_that_lost_what_it_acknowledged_is_not_believed_any_longer(tmp_path: Path) -> None:
+    """It gets what it lost, and the changes count as acknowledged only then."""
+    server, _client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    history = active.database.history
+    async with asyncio.timeout(SECONDS):
+        async with connected(tmp_path, active) as link:
+            await link.send(Stored(0, "", 0))
+            await take_snapshot(link)
+            await link.send(Stored(1, history, 0))
+            for number in (1, 2, 3):
+                active.database.put("thing", str(number), 1, None)
+            number = 0
+            while number < 3:
+                message = await link.receive(10)
+                assert isinstance(message, Changes)
+                number = message.first + len(message.changes) - 1
+                await link.send(Stored(1, history, number))
+            await active.sender.acknowledged(3)
+        async with connected(tmp_path, active) as link:
+            await link.send(Stored(1, history, 1))
+            await take_snapshot(link)
+            assert active.sender.lag().changes == 3
+    await active.close()
+
+
+async def test_an_earlier_active_appliance_is_refused(tmp_path: Path) -> None:
+    """A standby that has seen a larger epoch takes nothing, and the active appliance learns the reason."""
+    async with asyncio.timeout(SECONDS), replicated(tmp_path, epoch=5) as (active, standby):
+        active.database.put("thing", "a", 1, None)
+        await active.sender.acknowledged(1)
+        active.epoch = 4
+        active.database.put("thing", "b", 1, None)
+        await until(lambda: "epoch 4 has ended: epoch 5 has begun" in standby.ends)
+        assert [row[0] for row in tables_of(tmp_path / "standby.db")["thing"]] == ["a"]
+        reason = "the standby has seen epoch 5, and this appliance is active in 4"
+        await until(lambda: f"the active appliance refuses: {reason}" in standby.ends)
+        assert active.sender.lag().reason == reason
+        active.epoch = 6
+        await active.sender.acknowledged(2)
+        require_equal(tmp_path)
+        assert standby.replica.position.epoch == 6
+
+
+async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
+    """A standby that restarts does not wait until its earlier connection times out."""
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    async with asyncio.timeout(SECONDS):
+        async with connected(tmp_path, active) as silent:
+            await silent.send(Stored(0, "", 0))
+            await silent.receive(10)
+            standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+            active.database.put("thing", "a", 1, None)
+            await active.sender.acknowledged(1)
+            with pytest.raises(ReplicationError):
+                while True:
+                    await silent.receive(10)
+    await standby.close()
+    await active.close()
+
+
+async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that reads nothing, or answers nothing, does not hold the link for ever."""
+    monkeypatch.setattr(replication_sender, "_SILENCE_SECONDS", 0.5)
+    server, _client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    for number in range(20):
+        active.database.put("tree", 1, bytes(1 << 20), float(number))
+    async with asyncio.timeout(SECONDS), connected(tmp_path, active) as link:
+        await link.send(Stored(0, "", 0))
+        await until(lambda: active.sender.lag().connected)
+        await until(lambda: not active.sender.lag().connected)
+    await active.close()
+
+
+async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
+    """Another certificate, none, an older TLS, and no TLS at all get nothing; the standby also checks its side."""
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    strange = tmp_path / "strange"
+    strange.mkdir()
+    make_link_certificate(strange)
+    theirs = (tmp_path / "certificates-active" / "standby.pem").read_text()
+    other = link_context(strange, theirs, server=False)
+    none = ssl.create_default_context(cadata=theirs)
+    none.check_hostname = False
+    old = link_context(tmp_path / "certificates-standby", theirs, server=False)
+    old.minimum_version, old.maximum_version = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_2
+    mistrusting = link_context(
+        tmp_path / "certificates-standby", (strange / "standby.pem").read_text(), server=False
+    )
+    async with asyncio.timeout(SECONDS):
+        for context in (other, none, old, mistrusting, None):
+            with pytest.raises((ReplicationError, OSError)):
+                reader, writer = await asyncio.open_connection("127.0.0.1", active.port, ssl=context)
+                link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+                try:
+                    await link.send(Stored(0, "", 0))
+                    await link.receive(10)
+                finally:
+                    await link.close()
+            assert not active.sender.lag().connected
+        standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+        await active.sender.acknowledged(0)
+        await until(lambda: active.sender.lag().caught_up)
+    await standby.close()
+    await active.close()
+
+
+async def test_connections_without_a_handshake_are_limited(tmp_path: Path) -> None:
+    """They are closed at once beyond a number, and the others after a time; the standby then connects."""
+    server, client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    idle = [socket.create_connection(("127.0.0.1", active.port)) for _ in range(40)]
+    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+    async with asyncio.timeout(SECONDS):
+        await until(lambda: active.sender.lag().caught_up)
+    for connection in idle:
+        connection.close()
+    await standby.close()
+    await active.close()
+
+
+async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, asyncio.StreamWriter]:
+    """Return a reader, the writer whose bytes it reads, and the reader's own writer."""
+    here, there = socket.socketpair()
+    reader, writer = await asyncio.open_connection(sock=here)
+    _, other = await asyncio.open_connection(sock=there)
+    return reader, other, writer
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"\xff\xff\xff\xff", "a frame of 4294967295 bytes"),
+        (b"\x08\x00\x00\x01", "a frame of 134217729 bytes; at most 134217728"),
+        (b"\x00\x00\x00\x00", "malformed"),
+        (b"\x00\x00\x00\x01\xc1", "malformed"),
+        (b"\x00\x00\x00\x10half", "closed the link"),
+        (b"\x00\x00", "closed the link"),
+    ],
+)
+async def test_a_bad_frame_ends_the_link(data: bytes, reason: str) -> None:
+    """The error has the reason."""
+    reader, other, writer = await pair_of_links()
+    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    other.write(data)
+    other.close()
+    with pytest.raises(ReplicationError, match=reason):
+        await link.receive(allowed(10))
+    await link.close()
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        ["changes", 1, "h", 1, [["drop", "thing"]]],
+        ["changes", 1, "h", 1, ["DROP TABLE thing"]],
+        ["changes", -1, "h", 1, []],
+        ["changes", 1 << 63, "h", 1, []],
+        ["changes", 1, "h" * 65, 1, []],
+        ["rows", [["delete", "thing", [["name", "=", "a"]]]]],
+        ["sql", "DROP TABLE thing"],
+        [[[[[[]]]]]],
+        ["changes", 1, "h", 1, [["put", "thing", 7]]],
+    ],
+)
+async def test_a_message_of_another_form_ends_the_link(message: Any) -> None:
+    """It is never carried out."""
+    reader, other, writer = await pair_of_links()
+    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    body = msgspec.msgpack.encode(message)
+    other.write(len(body).to_bytes(4, "big") + body)
+    with pytest.raises(ReplicationError, match="malformed"):
+        await link.receive(allowed(10))
+    other.close()
+    await link.close()
+
+
+async def test_a_change_too_large_for_a_frame_is_an_error_with_a_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The standby stays behind, and catches up once the value is smaller."""
+    async with asyncio.timeout(SECONDS), replicated(tmp_path) as (active, standby):
+        await until(lambda: active.sender.lag().caught_up)
+        for module in (replication_frames, replication_sender):
+            monkeypatch.setattr(module, "LARGEST_FRAME", 100_000)
+        active.database.put("tree", 1, bytes(200_000), 1.0)
+        await until(lambda: len(standby.ends) > 2)
+        assert "a change has 200034 bytes, and the standby gets at most 100000" in active.sender.lag().reason
+        assert standby.replica.position.number == 0
+        active.database.put("tree", 1, bytes(20_000), 1.0)
+        await active.sender.acknowledged(2)
+        require_equal(tmp_path)
+
+
+async def test_the_standby_tells_why_it_refuses(tmp_path: Path) -> None:
+    """A table that only the active appliance has is named on both sides."""
+    server, client = certificates(tmp_path)
+    more = SCHEMA + "CREATE TABLE IF NOT EXISTS newer (name TEXT PRIMARY KEY) WITHOUT ROWID;"
+    active = ActiveSide(tmp_path / "active.db", server, schema=more)
+    active.database.put("newer", "a")
+    standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
+    async with asyncio.timeout(SECONDS):
+        await until(lambda: any("no table 'newer'" in end for end in standby.ends))
+        await until(lambda: "the standby refuses: a change does not fit: the" in active.sender.lag().reason)
+    await standby.close()
+    await active.close()
