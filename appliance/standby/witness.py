@@ -1,0 +1,840 @@
+#!/usr/bin/env python3
+"""Hold the lease of two appliances on the robot's own computer, and enforce it in the robot's firewall.
+
+    witness.py shut   [--settings FILE]                              at boot: shut out both appliances
+    witness.py serve  [--settings FILE]                              answer the appliances
+    witness.py begin  [--settings FILE] --in-sync a,b --epoch N      write the lease again, after damage
+    witness.py remove [--settings FILE]                              remove the firewall rules
+
+This file runs alone, with the standard library of Python 3.5 to 3.12 and the program `nft` or `iptables`.
+
+1. A claim is granted only after the lease has expired, to an appliance in the in-sync set. A grant increments the
+   epoch, saves it, and changes the firewall before it is answered. If one of these fails, nothing is granted.
+2. Only the holder changes the in-sync set. Each change is on the disk before it is answered.
+3. Every start waits one expiry before the first grant. After a reboot both appliances are shut out; a renewal of the
+   holder admits it again, since no other appliance has had a grant.
+4. A damaged or missing lease shuts out both appliances, until an operator runs `begin`.
+
+The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
+holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
+Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
+acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping and requests to the
+witness continue. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+"""
+
+import argparse
+import fcntl
+import hashlib
+import hmac
+import ipaddress
+import json
+import os
+import platform
+import re
+import select
+import shutil
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import time
+from typing import Any, Callable, Dict, List, NamedTuple, Optional, Set, Tuple
+
+EXPIRY = 1.2  # seconds after a renewal until another appliance may have the lease
+LONGEST = 512  # bytes of a datagram
+HIGHEST = 1 << 53  # of numbers and epochs, which JSON carries exactly
+REQUEST, ANSWER = b"rosrv lease request 1\0", b"rosrv lease answer 1\0"
+OPERATIONS = ("renew", "claim", "remove", "add", "release")
+TABLE = "rosrv_witness"
+_CHAINS = "rosrv-witness"
+_JUMPS = (
+    ("filter", (("INPUT", "in"), ("OUTPUT", "out"), ("FORWARD", "forward"))),
+    ("nat", (("OUTPUT", "nat"), ("PREROUTING", "nat"))),
+    ("raw", (("OUTPUT", "raw"),)),
+)
+MARK = 0x72777431  # of the witness's own segments, which the connection tracker must not see
+SETTINGS = "/etc/rosrv-witness.json"
+BOOT_ID = "/proc/sys/kernel/random/boot_id"
+_MAC = hashlib.sha256().digest_size
+_NAME = re.compile(r"[a-z][a-z0-9-]{0,31}\Z")
+_TUNNEL_PORTS = (500, 4500)
+_FREEBIND, _SO_MARK = (
+    15,
+    36,
+)  # socket options that Python 3.5 does not name; FREEBIND: the network may be down
+_PROGRAM_SECONDS = 2.0
+_CHECK_SECONDS = 1.0
+_RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
+_BATCH = 256  # datagrams between two checks of the time
+_LINES, _LINES_SECONDS = 20, 10.0
+_ESTABLISHED = ("01", "04", "05", "06", "08")  # in /proc/net/tcp: all states in which the peer may still send
+_MAPPED = "0000000000000000FFFF0000"  # an IPv4 address in /proc/net/tcp6
+
+Program = Callable[[List[str], str], str]
+
+
+class WitnessError(Exception):
+    """A request, a setting or the system that prevents an operation; the text says how to go on."""
+
+
+LeaseRecord = NamedTuple(
+    "LeaseRecord", [("epoch", int), ("holder", str), ("in_sync", Tuple[str, ...]), ("boot", str)]
+)
+"""The lease on the disk. `holder` is empty before the first grant; `boot` identifies the boot of its last change."""
+
+AppliancePeer = NamedTuple("AppliancePeer", [("address", str), ("key", bytes)])
+
+WitnessSettings = NamedTuple(
+    "WitnessSettings",
+    [
+        ("listen", Tuple[str, int]),
+        ("fixed", str),
+        ("ports", Tuple[str, ...]),
+        ("appliances", Dict[str, AppliancePeer]),
+        ("state", str),
+    ],
+)
+"""`fixed` is the address that the robot's nodes use; `ports` are translated to the holder."""
+
+
+# ---- Datagrams
+
+
+def seal(purpose: bytes, name: str, key: bytes, body: Dict[str, Any]) -> bytes:
+    """Return a datagram to or from the appliance `name`: its name, the authentication code, the body as JSON."""
+    label = name.encode("ascii")
+    text = json.dumps(body, sort_keys=True, separators=(",", ":")).encode("ascii")
+    head = bytes([len(label)]) + label
+    return head + hmac.new(key, purpose + head + text, hashlib.sha256).digest() + text
+
+
+def name_in(datagram: bytes) -> str:
+    """Return the name of the appliance in a datagram, which is not authenticated yet; empty if it has none."""
+    if not 1 + _MAC < len(datagram) <= LONGEST:
+        return ""
+    name = datagram[1 : 1 + datagram[0]].decode("ascii", "replace")
+    return name if _NAME.match(name) else ""
+
+
+def unseal(purpose: bytes, key: bytes, datagram: bytes) -> Optional[Dict[str, Any]]:
+    """Return the body of a datagram with a name, or None if its authentication code is wrong."""
+    end = 1 + datagram[0]
+    code, text = datagram[end : end + _MAC], datagram[end + _MAC :]
+    expected = hmac.new(key, purpose + datagram[:end] + text, hashlib.sha256).digest()
+    if not hmac.compare_digest(code, expected):
+        return None
+    try:
+        body = json.loads(text.decode("ascii"))
+    except ValueError:
+        return None
+    return body if isinstance(body, dict) else None
+
+
+def is_count(value: object) -> bool:
+    """Whether this is a number that an appliance may send: 0 to `HIGHEST`."""
+    return type(value) is int and 0 <= value <= HIGHEST
+
+
+# ---- The lease
+
+
+class LeaseFile:
+    """The lease on the disk, which is replaced as a whole."""
+
+    def __init__(self, path: str, names: Tuple[str, ...]) -> None:
+        self.path = path
+        self._names = names
+        self._lock = -1
+
+    def __enter__(self) -> "LeaseFile":
+        """Keep other processes from this lease. Raises `WitnessError` if one uses it."""
+        os.makedirs(os.path.dirname(os.path.abspath(self.path)), mode=0o700, exist_ok=True)
+        self._lock = os.open(self.path + ".lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self.__exit__()
+            raise WitnessError(
+                "another witness uses %s; stop it first: systemctl stop rosrv-witness" % self.path
+            ) from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._lock)
+        self._lock = -1
+
+    def read(self) -> LeaseRecord:
+        """Return the lease. Raises `WitnessError` if it is missing or damaged."""
+        try:
+            with open(self.path, "rb") as file:
+                content = file.read(4096)
+            code, _, text = content.partition(b"\n")
+            if code.decode("ascii") != hashlib.sha256(text).hexdigest():
+                raise ValueError("its checksum is wrong")
+            body = json.loads(text.decode("ascii"))
+            record = LeaseRecord(body["epoch"], body["holder"], tuple(body["in_sync"]), body["boot"])
+            if not (is_count(record.epoch) and record.in_sync and set(record.in_sync) <= set(self._names)):
+                raise ValueError("it does not fit the settings")
+            if record.holder and record.holder not in record.in_sync:
+                raise ValueError("its holder is not in sync")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise WitnessError(
+                "the lease %s cannot be used: %s; both appliances are shut out. Run: witness.py begin --in-sync NAMES"
+                " --epoch N, with the appliances that have all data and an epoch greater than both appliances show"
+                % (self.path, error)
+            ) from error
+        return record
+
+    def write(self, record: LeaseRecord) -> None:
+        """Save the lease. Raises `WitnessError` if the old one stays; any other error leaves it uncertain."""
+        body = {
+            "epoch": record.epoch,
+            "holder": record.holder,
+            "in_sync": list(record.in_sync),
+            "boot": record.boot,
+        }
+        text = json.dumps(body, sort_keys=True).encode("ascii")
+        content = hashlib.sha256(text).hexdigest().encode("ascii") + b"\n" + text
+        folder, new = os.path.dirname(os.path.abspath(self.path)), self.path + ".new"
+        try:
+            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            try:
+                if os.write(descriptor, content) != len(content):
+                    raise OSError("the disk is full")
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            raise WitnessError("the lease %s cannot be saved: %s" % (self.path, error)) from error
+        os.rename(new, self.path)
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+class Witness:
+    """The rules of the lease.
+
+    `save` writes the lease; `admit` changes the firewall to admit one appliance, or none (""). Both raise
+    `WitnessError` if nothing has changed. `boot` is the present boot. Without a `record`, every request is refused.
+    """
+
+    def __init__(
+        self,
+        *,
+        record: Optional[LeaseRecord],
+        save: Callable[[LeaseRecord], None],
+        admit: Callable[[str], None],
+        boot: str,
+        clock: Callable[[], float],
+    ) -> None:
+        self.record = record
+        self._save = save
+        self._admit = admit
+        self._boot = boot
+        self._clock = clock
+        self._expires = clock() + EXPIRY
+        # Within one boot the rules of an earlier process stay, so that its end alone changes nothing.
+        self.admitted = record.holder if record is not None and record.boot == boot else ""
+        admit(self.admitted)
+
+    def enforce_again(self) -> None:
+        """Write the firewall rules again, because another program changed them. Raises `WitnessError`."""
+        holder = self.record.holder if self.record is not None else ""
+        self._enforce(holder if self.admitted == holder else "")
+
+    def left(self) -> float:
+        """Return the seconds until the lease expires, or 0."""
+        return max(0.0, self._expires - self._clock())
+
+    def handle(self, name: str, operation: str, epoch: int, other: str) -> str:
+        """Carry out a request of the appliance `name`. Return an empty text, or the reason of the refusal."""
+        if self.record is None:
+            return "the lease is damaged: run witness.py begin on the robot"
+        if epoch > self.record.epoch:
+            return (
+                "the witness knows only epoch %d: run witness.py begin with a greater epoch"
+                % self.record.epoch
+            )
+        try:
+            if operation == "claim":
+                return self._claim(self.record, name)
+            if (self.record.holder, self.record.epoch) != (name, epoch):
+                return "%s holds epoch %d" % (self.record.holder or "no appliance", self.record.epoch)
+            if operation == "renew":
+                self._renew(self.record)
+            elif operation == "release":
+                self._expires = self._clock()
+            else:
+                self._change_in_sync(self.record, {name, other} if operation == "add" else {name})
+        except WitnessError as error:
+            return str(error)
+        return ""
+
+    def _claim(self, before: LeaseRecord, name: str) -> str:
+        if self._clock() < self._expires:
+            return "%s holds the lease for another %.1f s" % (before.holder or "no appliance", self.left())
+        if name not in before.in_sync:
+            return "%s is not in sync" % name
+        self._change(before._replace(epoch=before.epoch + 1, holder=name, boot=self._boot))
+        try:
+            self._enforce(name)
+        except WitnessError:
+            self._change(before)
+            raise
+        self._expires = self._clock() + EXPIRY
+        return ""
+
+    def _renew(self, record: LeaseRecord) -> None:
+        if self.admitted != record.holder:
+            self._change(record._replace(boot=self._boot))
+            self._enforce(record.holder)
+        self._expires = self._clock() + EXPIRY
+
+    def _change_in_sync(self, record: LeaseRecord, wanted: Set[str]) -> None:
+        if wanted != set(record.in_sync):
+            self._change(record._replace(in_sync=tuple(sorted(wanted))))
+
+    def _change(self, record: LeaseRecord) -> None:
+        self._save(record)
+        self.record = record
+
+    def _enforce(self, name: str) -> None:
+        before, self.admitted = self.admitted, "?"  # after a failure, the next renewal tries again
+        try:
+            self._admit(name)
+        except WitnessError:
+            self._admit(before if before != "?" else "")
+            self.admitted = before
+            raise
+        self.admitted = name
+
+
+class WitnessGate:
+    """Check datagrams: each request is authenticated, and newer than all earlier ones of its appliance.
+
+    A request has the witness's nonce of this start, which no earlier recording can have, and a rising number. The
+    answer repeats both and the appliance's own nonce. An old nonce or number is answered with the present ones.
+    """
+
+    def __init__(self, witness: Witness, appliances: Dict[str, AppliancePeer], nonce: str) -> None:
+        self._witness = witness
+        self._appliances = appliances
+        self._nonce = nonce
+        self._last = dict.fromkeys(appliances, 0)
+        self.rejected = 0
+
+    def answer(self, datagram: bytes, address: str) -> Optional[bytes]:
+        """Return the answer to a datagram from `address`, or None for one that is not authenticated."""
+        name = name_in(datagram)
+        appliance = self._appliances.get(name)
+        body = None
+        if appliance is not None and appliance.address == address:
+            body = unseal(REQUEST, appliance.key, datagram)
+        if appliance is None or body is None or not self._well_formed(body):
+            self.rejected += 1
+            return None
+        return seal(ANSWER, name, appliance.key, self._answer(name, body))
+
+    def _well_formed(self, body: Dict[str, Any]) -> bool:
+        return (
+            set(body) == {"boot", "session", "number", "do", "epoch"}
+            and all(isinstance(body[field], str) and len(body[field]) <= 32 for field in ("boot", "session"))
+            and is_count(body["number"])
+            and is_count(body["epoch"])
+            and body["do"] in OPERATIONS
+        )
+
+    def _answer(self, name: str, body: Dict[str, Any]) -> Dict[str, Any]:
+        answer = {"boot": self._nonce, "session": body["session"], "number": body["number"]}  # type: Dict[str, Any]
+        if body["boot"] != self._nonce or body["number"] <= self._last[name]:
+            answer.update(stale=True, last=self._last[name])
+            return answer
+        self._last[name] = body["number"]
+        (other,) = set(self._appliances) - {name}
+        reason = self._witness.handle(name, body["do"], body["epoch"], other)
+        record = self._witness.record
+        answer.update(
+            ok=not reason,
+            reason=reason[:200].encode("ascii", "replace").decode("ascii"),
+            epoch=record.epoch if record is not None else 0,
+            holder=record.holder if record is not None else "",
+            in_sync=list(record.in_sync) if record is not None else [],
+        )
+        return answer
+
+
+# ---- The firewall
+
+
+def nft_rules(settings: WitnessSettings, admitted: str) -> str:
+    """Return the nftables file that admits one appliance, or none, as one transaction."""
+    names = sorted(settings.appliances)
+    control = "{ %s }" % ", ".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
+    translate, arriving, leaving = [], ['iif "lo" accept'], []  # type: List[str], List[str], List[str]
+    for name in names:
+        address = settings.appliances[name].address
+        if name == admitted:
+            ports = ", ".join(settings.ports)
+            translate.append("ip daddr %s tcp dport { %s } dnat to %s" % (settings.fixed, ports, address))
+            continue
+        for rules, side, port in ((arriving, "saddr", "dport"), (leaving, "daddr", "sport")):
+            match = "ip %s %s" % (side, address)
+            rules += [
+                "%s udp %s %s accept" % (match, port, control),
+                "%s udp %s %s accept" % (match, "dport" if port == "sport" else "sport", control),
+                "%s ip protocol { icmp, esp } accept" % match,
+                "%s ip protocol tcp reject with tcp reset" % match,
+                "%s drop" % match,
+            ]
+    addresses = ", ".join(settings.appliances[name].address for name in names)
+    arriving.append("udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses))
+    leaving += [
+        "ip daddr %s ip protocol tcp reject with tcp reset" % settings.fixed,
+        "ip daddr %s drop" % settings.fixed,
+    ]
+    chains = (
+        ("untracked", "filter hook output priority -300", ["meta mark %d notrack" % MARK]),
+        ("translate_own", "nat hook output priority -100", translate),
+        ("translate_others", "nat hook prerouting priority -100", translate),
+        ("arriving", "filter hook input priority 0", arriving),
+        ("leaving", "filter hook output priority 0", leaving),
+        ("forwarded", "filter hook forward priority 0", arriving[1:-1] + leaving),
+    )
+    return "table ip %s\ndelete table ip %s\ntable ip %s {\n%s}\n" % (
+        TABLE,
+        TABLE,
+        TABLE,
+        "".join(
+            "    chain %s {\n        type %s; policy accept;\n%s    }\n"
+            % (name, hook, "".join("        %s\n" % rule for rule in rules))
+            for name, hook, rules in chains
+        ),
+    )
+
+
+def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, List[str]]) -> str:
+    """Return the input of `iptables-restore --noflush` that admits one appliance, or none.
+
+    Tables change one after the other. The filter comes first: until the translation follows, connections to the fixed
+    address are rejected or go to the new holder. `present` has the rules of each built-in chain, such as `nat OUTPUT`.
+    Our jump becomes the first rule, before any that accepts established connections.
+    """
+    names = sorted(settings.appliances)
+    control = ",".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
+    translate, coming, going = [], [], []  # type: List[str], List[str], List[str]
+    reset = "-p tcp -j REJECT --reject-with tcp-reset"
+    for name in names:
+        address = settings.appliances[name].address
+        if name == admitted:
+            translate += [
+                "-d %s -p tcp --dport %s -j DNAT --to-destination %s"
+                % (settings.fixed, ports.replace("-", ":"), address)
+                for ports in settings.ports
+            ]
+            continue
+        for rules, side in ((coming, "-s"), (going, "-d")):
+            rules += ["%s %s %s" % (side, address, rule) for rule in _passing(control)]
+            rules += ["%s %s %s" % (side, address, reset), "%s %s -j DROP" % (side, address)]
+    going += ["-d %s %s" % (settings.fixed, reset), "-d %s -j DROP" % settings.fixed]
+    requests = ["-s %s -j RETURN" % settings.appliances[name].address for name in names]
+    requests.append("-p udp --dport %d -j DROP" % settings.listen[1])
+    chains = {
+        "in": ["-i lo -j RETURN", *coming, *requests],
+        "out": going,
+        "forward": coming + going,
+        "nat": translate,
+        "raw": ["-m mark --mark %d -j CT --notrack" % MARK],
+    }
+    lines = []  # type: List[str]
+    for table, jumps in _JUMPS:
+        own = sorted({name for _, name in jumps})
+        lines.append("*" + table)
+        lines += [":%s-%s - [0:0]" % (_CHAINS, name) for name in own]
+        lines += ["-A %s-%s %s" % (_CHAINS, name, rule) for name in own for rule in chains[name]]
+        for chain, name in jumps:
+            jump = "%s -j %s-%s" % (chain, _CHAINS, name)
+            rules = present.get("%s %s" % (table, chain), [])
+            if rules[:1] != ["-A " + jump]:
+                lines += ["-D " + jump] * rules.count("-A " + jump)
+                lines.append("-I " + jump)
+        lines.append("COMMIT")
+    return "\n".join(lines) + "\n"
+
+
+def _passing(control: str) -> List[str]:
+    ports = ["-p udp -m multiport --%ss %s -j RETURN" % (side, control) for side in ("dport", "sport")]
+    return [*ports, "-p icmp -j RETURN", "-p esp -j RETURN"]
+
+
+def without_iptables_rules(saved: str) -> str:
+    """Return the input of `iptables-restore --noflush` that removes our rules from the output of `iptables-save`."""
+    lines, own = [], []  # type: List[str], List[str]
+    for line in saved.splitlines():
+        if line.startswith("*"):
+            lines.append(line)
+        elif line.startswith(":%s-" % _CHAINS):
+            own.append(line[1:].split()[0])
+        elif (
+            line.startswith("-A ")
+            and line.split()[-1].startswith(_CHAINS + "-")
+            and line.split()[1] not in own
+        ):
+            lines.append(line.replace("-A", "-D", 1))
+        elif line == "COMMIT":
+            lines += ["-F " + chain for chain in own] + ["-X " + chain for chain in own] + [line]
+            own = []
+    return "\n".join(lines) + "\n"
+
+
+def run_program(command: List[str], text: str) -> str:
+    """Run a program with `text` as its input, and return its output. Raises `WitnessError`."""
+    try:
+        done = subprocess.run(
+            command,
+            input=text,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            universal_newlines=True,
+            timeout=_PROGRAM_SECONDS,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise WitnessError("%s: %s" % (command[0], error)) from error
+    if done.returncode:
+        raise WitnessError("%s: %s" % (command[0], " ".join(done.stderr.split())[:150]))
+    return done.stdout
+
+
+def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
+    """Return nft or iptables. Before Linux 4.18, translations of nft and iptables exclude one another."""
+    version = tuple(int(number) for number in re.findall(r"\d+", release)[:2])
+    if find("nft") and version >= (4, 18):
+        return "nft"
+    if find("iptables-restore"):
+        return "iptables"
+    raise WitnessError("neither `nft` nor `iptables` is installed: sudo apt install nftables")
+
+
+class LeaseFirewall:
+    """The robot's firewall, by `nft` or `iptables`."""
+
+    def __init__(self, settings: WitnessSettings, backend: str, run: Program = run_program) -> None:
+        self._settings = settings
+        self._backend = backend
+        self._run = run
+        self._written = []  # type: List[str]
+
+    def admit(self, name: str) -> None:
+        """Admit one appliance, or none (""). Raises `WitnessError`."""
+        self._written = []
+        if self._backend == "nft":
+            self._run(["nft", "-f", "-"], nft_rules(self._settings, name))
+        else:
+            text = iptables_rules(self._settings, name, self._chains())
+            self._run(["iptables-restore", "--noflush"], text)
+        self._written = self._present()
+
+    def intact(self) -> bool:
+        """Whether the rules are still those that were written. Raises `WitnessError`."""
+        return self._written == self._present()
+
+    def remove(self) -> None:
+        """Remove all rules. Raises `WitnessError`."""
+        if self._backend == "nft":
+            self._run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE))
+        else:
+            self._run(["iptables-restore", "--noflush"], without_iptables_rules("\n".join(self._saved())))
+
+    def _saved(self) -> List[str]:
+        return [line for line in self._run(["iptables-save"], "").splitlines() if not line.startswith("#")]
+
+    def _chains(self) -> Dict[str, List[str]]:
+        found, table = {}, ""  # type: Dict[str, List[str]], str
+        for line in self._saved():
+            table = line[1:] if line.startswith("*") else table
+            if line.startswith("-A "):
+                found.setdefault("%s %s" % (table, line.split()[1]), []).append(line)
+        return found
+
+    def _present(self) -> List[str]:
+        if self._backend == "nft":
+            return [self._run(["nft", "list", "table", "ip", TABLE], "")]
+        chains = self._chains()
+        jumps = [chains.get("%s %s" % (table, chain), [""])[0] for table, rows in _JUMPS for chain, _ in rows]
+        return jumps + [rule for name in sorted(chains) if _CHAINS in name for rule in chains[name]]
+
+
+# ---- Idle connections
+
+
+def sockets_with(addresses: Set[str], tables: List[str]) -> List[Tuple[str, int, str, int]]:
+    """Return local address and port, and those of the peer, of each connection with one of these addresses.
+
+    `tables` are the contents of /proc/net/tcp and /proc/net/tcp6.
+    """
+    found = []
+    for line in [line for table in tables for line in table.splitlines()[1:]]:
+        fields = line.split()
+        if fields[3] in _ESTABLISHED:
+            (own, own_port), (peer, peer_port) = (_end(fields[1]), _end(fields[2]))
+            if peer in addresses:
+                found.append((own, own_port, peer, peer_port))
+    return found
+
+
+def _end(text: str) -> Tuple[str, int]:
+    address, _, port = text.partition(":")
+    if address.startswith(_MAPPED):
+        address = address[len(_MAPPED) :]
+    if len(address) != 8:
+        return "", 0
+    return socket.inet_ntoa(struct.pack("=I", int(address, 16))), int(port, 16)
+
+
+def segment_outside_window(own: str, own_port: int, peer: str, peer_port: int, number: int) -> bytes:
+    """Return an IPv4 packet from the peer to the own socket: an acknowledgement with some sequence number."""
+    ends = socket.inet_aton(peer) + socket.inet_aton(own)
+    tcp = struct.pack("!HHIIBBHHH", peer_port, own_port, number, number, 5 << 4, 0x10, 0, 0, 0)
+    words = struct.unpack("!16H", ends + struct.pack("!BBH", 0, socket.IPPROTO_TCP, len(tcp)) + tcp)
+    total = sum(words)
+    total = (total & 0xFFFF) + (total >> 16)
+    checksum = ~(total + (total >> 16)) & 0xFFFF
+    header = struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(tcp), 0, 0, 64, socket.IPPROTO_TCP, 0)
+    return header + ends + tcp[:16] + struct.pack("!H", checksum) + tcp[18:]
+
+
+class IdleConnections:
+    """Reset local connections with an appliance that is no longer admitted, also those in which nothing is sent."""
+
+    def __init__(self, settings: WitnessSettings) -> None:
+        self._settings = settings
+        self._raw = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+        self._raw.setsockopt(socket.SOL_SOCKET, _SO_MARK, MARK)
+        self._raw.setblocking(False)
+        self._left = []  # type: List[Tuple[str, int, str, int]]
+        self._rounds = 0
+
+    def reset(self, admitted: str) -> None:
+        """Begin to reset all present connections with other appliances, and with the fixed address."""
+        addresses = {peer.address for name, peer in self._settings.appliances.items() if name != admitted}
+        self._left = sockets_with(addresses | {self._settings.fixed}, _socket_tables())
+        self._rounds = _RESET_ROUNDS
+        self.go_on()
+
+    def go_on(self) -> bool:
+        """Send a segment to each connection that remains; return whether another round is needed."""
+        if not self._left:
+            return False
+        peers = {peer for _, _, peer, _ in self._left}
+        present = set(sockets_with(peers, _socket_tables()))
+        self._left = [ends for ends in self._left if ends in present]
+        self._rounds -= 1
+        for own, own_port, peer, peer_port in self._left:
+            number = struct.unpack("!I", os.urandom(4))[0]
+            try:
+                self._raw.sendto(segment_outside_window(own, own_port, peer, peer_port, number), (own, 0))
+            except OSError:
+                continue  # the next round sends it again
+        if self._rounds <= 0:
+            self._left = []
+        return bool(self._left)
+
+
+def _socket_tables() -> List[str]:
+    tables = []
+    for path in ("/proc/net/tcp", "/proc/net/tcp6"):
+        if os.path.exists(path):
+            with open(path, encoding="ascii") as file:
+                tables.append(file.read())
+    return tables
+
+
+# ---- The program
+
+
+def read_settings(path: str) -> WitnessSettings:
+    """Return the settings of a file that only root can read, since it has the keys. Raises `WitnessError`."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            if stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077:
+                raise ValueError("other users can read its keys: chmod 600 %s" % path)
+            body = json.loads(file.read(65536))
+        host, _, port = body["listen"].rpartition(":")
+        appliances = {}
+        for name, one in body["appliances"].items():
+            if not _NAME.match(name):
+                raise ValueError("the name %r is not valid; use a-z, 0-9 and -" % name)
+            if not re.match(r"[0-9a-f]{64}\Z", one["key"]):
+                raise ValueError("the key of %s does not have 64 hexadecimal digits" % name)
+            appliances[name] = AppliancePeer(_address(one["address"]), bytes.fromhex(one["key"]))
+        addresses = {one.address for one in appliances.values()} | {_address(body["fixed"])}
+        if len(appliances) != 2 or len(addresses) != 3 or len({one.key for one in appliances.values()}) != 2:
+            raise ValueError("it needs two appliances with different keys, and three different addresses")
+        ports = tuple(_ports(text) for text in body["ports"])
+        if not ports:
+            raise ValueError("ports is empty; list those of the ROS master and the relay, such as 11311")
+        settings = WitnessSettings(
+            (_address(host), int(_ports(port))),
+            _address(body["fixed"]),
+            ports,
+            appliances,
+            str(body["state"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = "%s is missing" % error if isinstance(error, KeyError) else str(error)
+        raise WitnessError("the settings %s cannot be used: %s" % (path, reason)) from error
+    return settings
+
+
+def _address(text: str) -> str:
+    address = ipaddress.IPv4Address(text)
+    if address.is_multicast or address.is_unspecified or address.is_loopback:
+        raise ValueError("%s cannot be an address of the robot's network" % text)
+    return str(address)
+
+
+def _ports(text: str) -> str:
+    first, _, last = text.partition("-")
+    if not (first.isdigit() and (last or first).isdigit() and 0 < int(first) <= int(last or first) < 65536):
+        raise ValueError("%r is not a port or a range such as 20000-20999" % text)
+    return text
+
+
+class BoundedLog:
+    """Lines on standard error; of more than a few in some seconds, only the number is printed."""
+
+    def __init__(self, write: Callable[[str], Any], clock: Callable[[], float]) -> None:
+        self._write = write
+        self._clock = clock
+        self._since = clock()
+        self._lines = 0
+
+    def add(self, text: str) -> None:
+        """Print a line, or count it."""
+        now = self._clock()
+        if now - self._since > _LINES_SECONDS:
+            if self._lines > _LINES:
+                self._write("%d more lines were left out\n" % (self._lines - _LINES))
+            self._since, self._lines = now, 0
+        self._lines += 1
+        if self._lines <= _LINES:
+            self._write(text + "\n")
+
+
+def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
+    """Answer the appliances until the process ends."""
+    log = BoundedLog(sys.stderr.write, time.monotonic)
+    firewall, idle = LeaseFirewall(settings, backend), IdleConnections(settings)
+
+    def admit(name: str) -> None:
+        firewall.admit(name)
+        idle.reset(name)
+        log.add("the robot admits %s" % (name or "no appliance"))
+
+    try:
+        record = lease.read()  # type: Optional[LeaseRecord]
+    except WitnessError as error:
+        record = None
+        log.add(str(error))
+    with open(BOOT_ID, encoding="ascii") as file:
+        boot = file.read().strip()
+    witness = Witness(record=record, save=lease.write, admit=admit, boot=boot, clock=time.monotonic)
+    gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as requests:
+        requests.setsockopt(socket.SOL_IP, _FREEBIND, 1)
+        requests.bind(settings.listen)
+        requests.setblocking(False)
+        log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
+        checked = reset = time.monotonic()
+        rejected = 0
+        while True:  # until the process is ended; each turn is bounded
+            ready, _, _ = select.select([requests], [], [], 0.2)
+            for _ in range(_BATCH if ready else 0):
+                if not _answer_one(requests, gate):
+                    break
+            now = time.monotonic()
+            if now - reset >= _RESET_SECONDS:
+                reset = now
+                idle.go_on()
+            if now - checked >= _CHECK_SECONDS:
+                checked = now
+                _check(firewall, witness, log)
+                if gate.rejected > rejected:
+                    log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
+                    rejected = gate.rejected
+
+
+def _answer_one(requests: socket.socket, gate: WitnessGate) -> bool:
+    try:
+        datagram, (address, port) = requests.recvfrom(LONGEST + 1)
+        answer = gate.answer(datagram, address)
+        if answer is not None:
+            requests.sendto(answer, (address, port))
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # no route to the appliance at present; it asks again
+    return True
+
+
+def _check(firewall: LeaseFirewall, witness: Witness, log: BoundedLog) -> None:
+    try:
+        if not firewall.intact():
+            log.add("another program changed the firewall rules of the witness; they are written again")
+            witness.enforce_again()
+    except WitnessError as error:
+        log.add(str(error))
+
+
+def begin(settings: WitnessSettings, lease: LeaseFile, in_sync: List[str], epoch: int) -> None:
+    """Write the lease again, without a holder. Raises `WitnessError`."""
+    wrong = [name for name in in_sync if name not in settings.appliances]
+    if wrong or not in_sync:
+        raise WitnessError("--in-sync: %r is not an appliance of the settings" % ",".join(wrong))
+    if not 0 < epoch < HIGHEST:
+        raise WitnessError("--epoch: use a number greater than the epoch that both appliances show")
+    try:
+        before = lease.read().epoch
+    except WitnessError:
+        before = 0  # damaged or missing: the reason for this command
+    if epoch <= before:
+        raise WitnessError("--epoch: the lease has epoch %d already; use a greater number" % before)
+    lease.write(LeaseRecord(epoch, "", tuple(sorted(set(in_sync))), ""))
+
+
+def main(arguments: List[str]) -> int:
+    """Run a command; return the exit status."""
+    parser = argparse.ArgumentParser(description="The witness of two appliances, on the robot's computer.")
+    parser.add_argument("command", choices=("shut", "serve", "begin", "remove"))
+    parser.add_argument("--settings", default=SETTINGS, help="default: %(default)s")
+    parser.add_argument("--backend", choices=("nft", "iptables"), help="default: nft, on Linux 4.18 or newer")
+    parser.add_argument("--in-sync", default="", help="begin: the appliances that have all data, such as a,b")
+    parser.add_argument("--epoch", type=int, default=0, help="begin: greater than both appliances show")
+    chosen = parser.parse_args(arguments)
+    try:
+        settings = read_settings(chosen.settings)
+        lease = LeaseFile(settings.state, tuple(sorted(settings.appliances)))
+        if chosen.command == "begin":
+            with lease:
+                begin(settings, lease, [name for name in chosen.in_sync.split(",") if name], chosen.epoch)
+            return 0
+        backend = chosen.backend or chosen_backend(platform.release(), shutil.which)
+        if chosen.command == "serve":
+            with lease:
+                serve(settings, backend, lease)
+        elif chosen.command == "shut":
+            LeaseFirewall(settings, backend).admit("")
+        else:
+            LeaseFirewall(settings, backend).remove()
+    except (WitnessError, OSError) as error:
+        sys.stderr.write("witness.py: %s\n" % error)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
