@@ -1,0 +1,239 @@
+"""The lease as an appliance sees it: active or passive, by times and messages alone.
+
+This module reads no clock and no socket. Its owner passes the time with each message, sends what comes back, and calls
+`tick` when `next_event` is due. A time is the appliance's own monotonic clock; clocks are never compared.
+
+1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
+   promise that was given. The witness and the other appliance count a whole expiry from a later time.
+2. A passive appliance becomes active only by the witness. A grant that arrives while it has promised not to claim waits
+   until the promise ends: the other appliance may rely on it.
+3. An appliance that starts may have given a promise before, so it claims one expiry later.
+4. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
+   It waits for the standby again before it asks the witness to add it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from appliance.standby.witness import EXPIRY
+
+RENEW_SECONDS = 0.3
+CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different speeds
+SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
+_MOST_PENDING = 16
+
+Operation = Literal["renew", "claim", "remove", "add", "release"]
+
+
+class LeaseError(Exception):
+    """An order that is not possible now; the text says what to do."""
+
+
+@dataclass(frozen=True)
+class WitnessRequest:
+    """A request to the witness. `sequence` orders the requests of this process; `sent` is its time."""
+
+    operation: Operation
+    epoch: int
+    sequence: int
+    sent: float
+
+
+@dataclass(frozen=True)
+class WitnessAnswer:
+    """An answer of the witness, with the lease after the request."""
+
+    ok: bool
+    reason: str
+    epoch: int
+    holder: str
+    in_sync: frozenset[str]
+
+
+@dataclass(frozen=True)
+class PromiseRequest:
+    """A request of the active appliance: do not claim for one expiry."""
+
+    epoch: int
+    session: str
+    number: int
+
+
+@dataclass(frozen=True)
+class ClaimPromise:
+    """The promise not to claim for one expiry; it repeats the request."""
+
+    epoch: int
+    session: str
+    number: int
+
+
+@dataclass(frozen=True)
+class TakeOver:
+    """The order to claim now. It ends the promises up to this number, which the sender no longer relies on."""
+
+    epoch: int
+    session: str
+    number: int
+
+
+PeerMessage = PromiseRequest | ClaimPromise | TakeOver
+Outgoing = Sequence[WitnessRequest | PeerMessage]
+
+
+class ApplianceLease:
+    """The state of one appliance. `epoch` is the highest that it has stored; `session` is new at each start."""
+
+    def __init__(self, name: str, other: str, session: str, epoch: int, now: float) -> None:
+        self.epoch = epoch
+        self.held: int | None = None
+        self.answers_alone = False
+        self.refusal = ""
+        self._name = name
+        self._other = other
+        self._session = session
+        self._valid_until = now
+        self._promised_until = now + EXPIRY
+        self._promised_to: PromiseRequest | None = None
+        self._next_round = now
+        self._sequence = 0
+        self._asked: dict[int, float] = {}
+        self._number = 0
+        self._heard = now - EXPIRY
+        self._last_add = 0
+        # A switchover: requests and promises up to these numbers no longer make this appliance active.
+        self._switching_until: float | None = None
+        self._released = False
+        self._void_sequence = self._void_number = 0
+
+    def is_active(self, now: float) -> bool:
+        """Whether this appliance may decide, relay and answer."""
+        return self.held is not None and self._promised_until <= now < self._valid_until
+
+    def may_answer(self, now: float, *, acknowledged: bool) -> bool:
+        """Whether a change may be answered now; `acknowledged` by the standby."""
+        return self.is_active(now) and (acknowledged or self.answers_alone)
+
+    def next_event(self, now: float) -> float:
+        """Return the time of the next `tick`, or of the next change of `is_active`."""
+        changes = (self._valid_until, self._promised_until)
+        return min([self._next_round, *(time for time in changes if time > now)])
+
+    def follow(self, epoch: int) -> bool:
+        """Whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
+        if epoch < self.epoch or epoch == self.held:
+            return False
+        self._learn(epoch)
+        return True
+
+    def tick(self, now: float, *, waiting_since: float | None, caught_up: bool) -> Outgoing:
+        """Return what is due.
+
+        `waiting_since`: the time of the oldest change that waits for the standby. `caught_up`: the standby has
+        acknowledged all changes.
+        """
+        if now < self._next_round:
+            return ()
+        self._next_round = now + RENEW_SECONDS
+        if self.held is None:
+            return (self._to_witness("claim", now),) if now >= self._promised_until else ()
+        if self._switching_until is not None:
+            if now < self._switching_until:
+                return (self._take_over() if self._released else self._to_witness("release", now),)
+            self._switching_until = None  # the other appliance did not claim
+        due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
+        if self.is_active(now):
+            due.append(self._ask(now))
+            if not self.answers_alone and waiting_since is not None and now - waiting_since > SILENCE:
+                due.append(self._to_witness("remove", now))
+            elif self.answers_alone and caught_up:
+                self.answers_alone = False
+                due.append(self._to_witness("add", now))
+                self._last_add = self._sequence
+        return due
+
+    def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
+        """Take an answer of the witness to a request of this process."""
+        self.refusal = answer.reason
+        if answer.epoch < self.epoch:
+            return ()
+        if answer.holder != self._name:
+            self._learn(answer.epoch)
+            return ()
+        if not answer.ok:
+            return ()
+        if request.operation == "claim" and answer.epoch > request.epoch:
+            self.held = self.epoch = answer.epoch
+            self._switching_until = None
+        if self.held != answer.epoch:
+            return ()
+        if request.sequence > self._last_add:
+            self.answers_alone = self._other not in answer.in_sync
+        if request.operation in ("claim", "renew") and request.sequence > self._void_sequence:
+            self._valid_until = max(self._valid_until, request.sent + CONFIDENCE)
+        if request.operation == "release" and self._switching_until is not None:
+            self._released = True
+            return (self._take_over(),)
+        return ()
+
+    def received(self, now: float, message: PeerMessage) -> Outgoing:
+        """Take a message of the other appliance."""
+        match message:
+            case PromiseRequest():
+                if not self.follow(message.epoch):
+                    return ()
+                self._promised_until = max(self._promised_until, now + EXPIRY)
+                self._promised_to = message
+                return (ClaimPromise(message.epoch, message.session, message.number),)
+            case ClaimPromise(epoch, session, number):
+                asked = self._asked.get(number)
+                if session == self._session and epoch == self.held and asked is not None:
+                    self._heard = max(self._heard, asked)
+                    if self.is_active(now) and number > self._void_number:
+                        self._valid_until = max(self._valid_until, asked + CONFIDENCE)
+            case TakeOver(epoch, session, number):
+                promised = self._promised_to
+                if (
+                    promised is not None
+                    and (promised.epoch, promised.session) == (epoch, session)
+                    and promised.number <= number
+                    and epoch == self.epoch
+                ):
+                    self._promised_until = self._next_round = now
+                    self._promised_to = None
+                    return self.tick(now, waiting_since=None, caught_up=False)
+        return ()
+
+    def switch_over(self, now: float) -> Outgoing:
+        """Become passive, and let the other appliance claim at once. Raises `LeaseError`."""
+        if not self.is_active(now):
+            raise LeaseError("this appliance is not active; give the order to the other one")
+        if self.answers_alone or now - self._heard > SILENCE:
+            raise LeaseError(
+                f"{self._other} is not ready to take over; wait until it answers and has all data"
+            )
+        self._valid_until = now
+        self._void_sequence, self._void_number = self._sequence, self._number
+        self._switching_until, self._released = now + 2 * EXPIRY, False
+        self._next_round = now
+        return self.tick(now, waiting_since=None, caught_up=False)
+
+    def _learn(self, epoch: int) -> None:
+        if epoch > self.epoch:
+            self.epoch = epoch
+            self.held = None
+
+    def _to_witness(self, operation: Operation, now: float) -> WitnessRequest:
+        self._sequence += 1
+        epoch = self.epoch if self.held is None else self.held
+        return WitnessRequest(operation, epoch, self._sequence, now)
+
+    def _ask(self, now: float) -> PromiseRequest:
+        self._number += 1
+        self._asked[self._number] = now
+        self._asked.pop(self._number - _MOST_PENDING, None)
+        return PromiseRequest(self.epoch, self._session, self._number)
+
+    def _take_over(self) -> TakeOver:
+        return TakeOver(self.epoch, self._session, self._void_number)

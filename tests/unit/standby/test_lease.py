@@ -1,0 +1,283 @@
+"""The lease as an appliance sees it: when it is active, and what it sends."""
+
+import pytest
+
+from appliance.standby.lease import (
+    CONFIDENCE,
+    ApplianceLease,
+    ClaimPromise,
+    LeaseError,
+    Outgoing,
+    PromiseRequest,
+    TakeOver,
+    WitnessAnswer,
+    WitnessRequest,
+)
+from appliance.standby.witness import EXPIRY
+from appliance.standby.witness_link import WitnessChannel
+from tests.unit.standby.test_witness import KEYS, Robot
+
+BOTH, ALONE = frozenset("ab"), frozenset("a")
+
+
+class Lease:
+    """The lease of `a`, with a clock."""
+
+    def __init__(self, epoch: int = 1) -> None:
+        self.now = 50.0
+        self.lease = ApplianceLease("a", "b", "session", epoch, self.now)
+
+    def later(self, seconds: float) -> "Lease":
+        """Move the clock."""
+        self.now += seconds
+        return self
+
+    def tick(self, *, waiting_since: float | None = None, caught_up: bool = False) -> Outgoing:
+        """Return what is due."""
+        return self.lease.tick(self.now, waiting_since=waiting_since, caught_up=caught_up)
+
+    def operations(self, *, waiting_since: float | None = None, caught_up: bool = False) -> list[str]:
+        """Return the operations that are due at the witness."""
+        due = self.tick(waiting_since=waiting_since, caught_up=caught_up)
+        return [one.operation for one in due if isinstance(one, WitnessRequest)]
+
+    def request(self, operation: str) -> WitnessRequest:
+        """Return the request that is due."""
+        (found,) = [
+            one for one in self.tick() if isinstance(one, WitnessRequest) and one.operation == operation
+        ]
+        return found
+
+    def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
+        """Answer a request: granted, unless the test says otherwise."""
+        full = {"ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH} | answer
+        return self.lease.answered(request, WitnessAnswer(**full))  # type: ignore[arg-type]
+
+    def active(self) -> bool:
+        """Whether it is active now."""
+        return self.lease.is_active(self.now)
+
+
+def active_lease() -> Lease:
+    """Return a lease that has just been granted."""
+    lease = Lease().later(EXPIRY)
+    lease.answered(lease.request("claim"))
+    assert lease.active()
+    return lease
+
+
+def asked_by(lease: Lease) -> PromiseRequest:
+    """Return the request for a promise that is due."""
+    return next(one for one in lease.tick() if isinstance(one, PromiseRequest))
+
+
+def test_a_start_waits_one_expiry_before_it_claims() -> None:
+    """It may have given a promise before it ended."""
+    lease = Lease()
+    assert lease.operations() == []
+    assert lease.later(EXPIRY - 0.01).operations() == []
+    assert lease.later(0.31).operations() == ["claim"]
+
+
+def test_it_is_passive_after_0_8_of_an_expiry_without_renewal_or_promise() -> None:
+    """The time counts from the request."""
+    lease = active_lease()
+    assert lease.later(CONFIDENCE - 0.01).active()
+    assert lease.lease.next_event(lease.now) <= lease.now + 0.011
+    assert not lease.later(0.02).active()
+
+
+def test_a_renewal_counts_from_the_time_when_it_was_sent() -> None:
+    """A late answer is worth less; it makes a holder active again that no other appliance replaced."""
+    lease = active_lease().later(0.5)
+    renewal = lease.request("renew")
+    lease.later(0.9)
+    assert not lease.active()
+    lease.answered(renewal)
+    assert lease.active() and not lease.later(0.1).active()
+
+
+def test_a_promise_alone_keeps_it_active() -> None:
+    """R3: a dead witness changes nothing."""
+    lease = active_lease()
+    for _ in range(20):
+        asked = asked_by(lease.later(0.3))
+        lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+        assert lease.active()
+    lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, "other", asked.number))
+    assert not lease.later(CONFIDENCE - 0.49).active()
+
+
+def test_a_promise_makes_no_passive_appliance_active() -> None:
+    """Only the witness does."""
+    lease = active_lease()
+    asked = asked_by(lease.later(0.9))
+    lease.later(0.1)
+    assert not lease.active()
+    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    assert not lease.active()
+
+
+def test_it_does_not_claim_while_its_promise_lasts() -> None:
+    """A grant that is on its way waits until the promise ends."""
+    lease = Lease().later(EXPIRY)
+    claim = lease.request("claim")
+    assert list(lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))) == [
+        ClaimPromise(1, "theirs", 7)
+    ]
+    assert lease.later(0.3).operations() == []
+    lease.answered(claim)
+    assert not lease.active()
+    renewal = lease.later(0.4).request("renew")
+    lease.answered(renewal)
+    assert not lease.active()
+    assert lease.later(EXPIRY - 0.69).active()
+
+
+def test_it_promises_nothing_to_an_older_epoch() -> None:
+    """A newer epoch ends its own."""
+    lease = active_lease()
+    assert list(lease.lease.received(lease.now, PromiseRequest(1, "theirs", 1))) == []
+    assert lease.active()
+    assert not lease.lease.follow(1) and not lease.lease.follow(2), "data of an older epoch, or of its own"
+    assert list(lease.lease.received(lease.now, PromiseRequest(3, "theirs", 1))) != []
+    assert not lease.active() and lease.lease.epoch == 3
+
+
+def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
+    """It claims like any other."""
+    lease = active_lease().later(0.3)
+    lease.answered(lease.request("renew"), ok=False, reason="b holds epoch 3", epoch=3, holder="b")
+    assert not lease.active() and lease.lease.refusal == "b holds epoch 3"
+    assert lease.later(0.3).operations() == ["claim"]
+
+
+def test_a_smaller_epoch_is_ignored() -> None:
+    """A witness that lost its lease grants nothing."""
+    lease = Lease(epoch=9).later(EXPIRY)
+    lease.answered(lease.request("claim"), epoch=2)
+    assert not lease.active()
+
+
+def test_it_answers_alone_only_after_the_removal() -> None:
+    """R2: it asks for the removal when an answer has waited for half an expiry."""
+    lease = active_lease()
+    now = lease.later(0.3).now
+    assert lease.operations(waiting_since=now) == ["renew"]
+    renewal, removal = (
+        one for one in lease.later(0.61).tick(waiting_since=now) if isinstance(one, WitnessRequest)
+    )
+    assert removal.operation == "remove"
+    lease.answered(renewal)
+    assert not lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.may_answer(lease.now, acknowledged=True)
+    lease.answered(removal, in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+
+
+def test_it_waits_for_the_standby_before_it_is_added() -> None:
+    """An older answer does not change that."""
+    lease = active_lease().later(0.3)
+    old = lease.request("renew")
+    lease.answered(old, in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.later(0.3).operations(caught_up=True) == ["renew", "add"]
+    lease.answered(old, in_sync=ALONE)
+    assert not lease.lease.may_answer(lease.now, acknowledged=False)
+    lease.answered(lease.later(0.3).request("renew"), in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False), "the addition was lost"
+
+
+def in_a_switchover() -> tuple[Lease, TakeOver]:
+    """Return a lease that is handed over, and its order to the other appliance."""
+    lease = active_lease()
+    asked = asked_by(lease.later(0.3))
+    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    (release,) = lease.lease.switch_over(lease.now)
+    assert isinstance(release, WitnessRequest) and release.operation == "release"
+    assert not lease.active()
+    (order,) = lease.answered(release)
+    assert isinstance(order, TakeOver)
+    return lease, order
+
+
+def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
+    """The standby claims at once."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number))
+    assert standby.later(0.1).operations() == []
+    (claim,) = standby.lease.received(standby.now, order)
+    assert isinstance(claim, WitnessRequest) and claim.operation == "claim"
+
+
+def test_a_late_order_does_not_end_a_later_promise() -> None:
+    """The other appliance did not hand over in the end, and relies on the new promise."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
+    assert list(standby.lease.received(standby.now, order)) == []
+    assert standby.later(0.3).operations() == []
+
+
+def test_older_answers_do_not_undo_a_switchover() -> None:
+    """If the other appliance does not claim, the holder renews after a while."""
+    lease = active_lease().later(0.3)
+    renewal, asked = lease.tick()
+    assert isinstance(renewal, WitnessRequest) and isinstance(asked, PromiseRequest)
+    promise = ClaimPromise(asked.epoch, asked.session, asked.number)
+    lease.lease.received(lease.now, promise)
+    lease.lease.switch_over(lease.now)
+    lease.answered(renewal)
+    lease.lease.received(lease.now, promise)
+    assert not lease.active()
+    assert lease.later(0.3).operations() == ["release"]
+    lease.answered(lease.later(2 * EXPIRY).request("renew"))
+    assert lease.active()
+
+
+def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
+    """Nothing changes."""
+    with pytest.raises(LeaseError, match="not active; give the order to the other one"):
+        Lease().lease.switch_over(50.0)
+    lease = active_lease()
+    with pytest.raises(LeaseError, match="b is not ready to take over"):
+        lease.lease.switch_over(lease.now)
+    assert lease.active()
+
+
+# ---- The datagrams
+
+
+def exchanged(channel: WitnessChannel, robot: Robot, request: WitnessRequest) -> WitnessAnswer | None:
+    """Return the witness's answer to a request."""
+    datagram = robot.gate.answer(channel.write(request), "10.0.0.2")
+    assert datagram is not None
+    found = channel.read(datagram)
+    return None if found is None else found[1]
+
+
+def test_a_new_appliance_learns_nonce_and_number() -> None:
+    """The first answer carries them; a restarted appliance goes on behind the last number."""
+    robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
+    for session in ("one", "two"):
+        channel = WitnessChannel("a", KEYS["a"], session)
+        assert exchanged(channel, robot, claim) is None
+        assert exchanged(channel, robot, claim) is not None
+    assert robot.disk is not None and robot.disk.holder == "a"
+
+
+def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
+    """An answer of an earlier process, one that came twice, and damaged ones."""
+    robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
+    channel, restarted = WitnessChannel("a", KEYS["a"], "one"), WitnessChannel("a", KEYS["a"], "two")
+    exchanged(channel, robot, claim)
+    datagram = robot.gate.answer(channel.write(claim), "10.0.0.2")
+    assert datagram is not None
+    restarted.write(claim)
+    restarted.write(claim)
+    for wrong in (b"", datagram[:20], datagram[:-1] + b" ", datagram + b"\0"):
+        assert channel.read(wrong) is None
+    assert restarted.read(datagram) is None
+    assert channel.read(datagram) is not None
+    assert channel.read(datagram) is None
