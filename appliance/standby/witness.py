@@ -18,8 +18,8 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
 holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
 Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
-acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping and requests to the
-witness continue. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and requests to
+the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
 """
 
 import argparse
@@ -54,7 +54,7 @@ _JUMPS = (
     ("raw", (("OUTPUT", "raw"),)),
 )
 MARK = 0x72777431  # of the witness's own segments, which the connection tracker must not see
-SETTINGS = "/etc/rosrv-witness.json"
+SETTINGS = "/etc/rosrv/witness.json"
 BOOT_ID = "/proc/sys/kernel/random/boot_id"
 _MAC = hashlib.sha256().digest_size
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,31}\Z")
@@ -387,6 +387,7 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
                 "%s udp %s %s accept" % (match, port, control),
                 "%s udp %s %s accept" % (match, "dport" if port == "sport" else "sport", control),
                 "%s ip protocol { icmp, esp } accept" % match,
+                "%s tcp flags & rst == rst accept" % match,
                 "%s ip protocol tcp reject with tcp reset" % match,
                 "%s drop" % match,
             ]
@@ -467,7 +468,7 @@ def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, 
 
 def _passing(control: str) -> List[str]:
     ports = ["-p udp -m multiport --%ss %s -j RETURN" % (side, control) for side in ("dport", "sport")]
-    return [*ports, "-p icmp -j RETURN", "-p esp -j RETURN"]
+    return [*ports, "-p icmp -j RETURN", "-p esp -j RETURN", "-p tcp --tcp-flags RST RST -j RETURN"]
 
 
 def without_iptables_rules(saved: str) -> str:
@@ -539,8 +540,11 @@ class LeaseFirewall:
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Whether the rules are still those that were written. Raises `WitnessError`."""
-        return self._written == self._present()
+        """Whether the rules are still those that were written; a removed table cannot be listed."""
+        try:
+            return self._written == self._present()
+        except WitnessError:
+            return False
 
     def remove(self) -> None:
         """Remove all rules. Raises `WitnessError`."""
