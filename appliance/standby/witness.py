@@ -18,8 +18,8 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
 holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
 Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
-acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and requests to
-the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and
+requests to the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
 """
 
 import argparse
@@ -729,9 +729,14 @@ class BoundedLog:
             self._write(text + "\n")
 
 
+def _write_error(text: str) -> None:
+    sys.stderr.write(text)
+    sys.stderr.flush()  # before Python 3.9 a pipe gets the text only when the buffer is full
+
+
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     """Answer the appliances until the process ends."""
-    log = BoundedLog(sys.stderr.write, time.monotonic)
+    log = BoundedLog(_write_error, time.monotonic)
     firewall, idle = LeaseFirewall(settings, backend), IdleConnections(settings)
 
     def admit(name: str) -> None:

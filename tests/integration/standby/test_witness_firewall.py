@@ -1,4 +1,4 @@
-"""The witness with the kernel's firewall and real connections: a robot, two appliances and an attacker on one network."""
+"""The witness with the kernel's firewall and real connections: a robot, two appliances, an attacker on one network."""
 
 import asyncio
 import contextlib
