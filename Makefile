@@ -9,7 +9,7 @@ unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance roswire rosmop tests examples benchmarks distribution
-LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py certifier.py events.py)
+LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py lease_at_large.py certifier.py events.py)
 LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
 # What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.
 CONTAINERS := tests/system/containers
@@ -112,7 +112,7 @@ release: ## everything anew, with provenance and checksums that KEY=FILE signs
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done
 
-prove: ## check what is proved: the proofs in Coq, the code of events, the model of the insertion, its mutants and traces (docs/dev/assurance.md)
+prove: ## check what is proved: the proofs in Coq, the code of events, the models of the insertion and the lease, their mutants and traces (docs/dev/assurance.md)
 	@scripts/setup --proofs
 	$(PYTEST) tests/proofs -n auto --dist loadfile --quiet --durations=5
 

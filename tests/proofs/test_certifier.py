@@ -13,9 +13,9 @@ from rosmop.certify.check import AutomatonTables, Verdicts, certify
 from rosmop.certify.machines import StateMachineFollower
 from rosmop.tests.certify.test_certify import broken, properties, tables_of
 from tests.support.requirements import need_program
-from tests.support.spin import MODEL
+from tests.support.spin import INSERTION
 
-PROOFS = MODEL.parent
+PROOFS = INSERTION.path.parent
 
 
 def _run(folder: Path, *command: str, given: str = "") -> str:

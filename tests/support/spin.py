@@ -1,25 +1,75 @@
-"""Run Spin on `proofs/insertion.pml`: bounds, mutants, and the result of an exhaustive search."""
+"""Run Spin on the models in `proofs/`: bounds, mutants, and the result of an exhaustive search."""
 
 import re
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from tests.support.requirements import need_program
 
-MODEL = Path(__file__).parents[2] / "proofs" / "insertion.pml"
-
+_PROOFS = Path(__file__).parents[2] / "proofs"
 _MEGABYTES = 2000
 _DEPTH = 1_000_000
-_PROPERTIES = {
-    "barred": "barred",
-    "judge": "judged",
-    "last": "whole",
-    "published": "connected",
-    "1": "accepted",
-}
-"""The first name in an assertion, and the property's name in the head of the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A model, with the first name in each assertion and the property's name in the head of the model."""
+
+    path: Path
+    properties: Mapping[str, str]
+
+
+INSERTION = Model(
+    _PROOFS / "insertion.pml",
+    {"barred": "barred", "judge": "judged", "last": "whole", "published": "connected", "1": "accepted"},
+)
+LEASE = Model(
+    _PROOFS / "lease.pml",
+    {
+        "admits": "fenced",
+        "whole": "whole",
+        "leads": "single",
+        "epoch": "growing",
+        "up": "served",
+        "1": "accepted",
+    },
+)
+
+
+class Bounded(Protocol):
+    """The bounds within which a model is searched."""
+
+    @property
+    def model(self) -> Model:
+        """Return the model."""
+
+    @property
+    def defined(self) -> list[str]:
+        """Return the definitions for the model."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseBounds:
+    """The number of grants of the lease; with `last_fault`, each state is also followed without further faults."""
+
+    grants: int
+    last_fault: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.grants}-grants" + "-last-fault" * self.last_fault
+
+    @property
+    def model(self) -> Model:
+        """Return the model of the lease."""
+        return LEASE
+
+    @property
+    def defined(self) -> list[str]:
+        """Return the definitions for the model."""
+        return [f"-DGRANTS={self.grants}"] + ["-DLAST_FAULT"] * self.last_fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +94,11 @@ class Bounds:
         return "-".join([*said, *["refusing"] * self.refusing, *["at-rest"] * (not self.sending)])
 
     @property
+    def model(self) -> Model:
+        """Return the model of the insertion."""
+        return INSERTION
+
+    @property
     def defined(self) -> list[str]:
         """Return the definitions for the model."""
         numbers = {
@@ -66,15 +121,17 @@ class Found:
 
 
 def search(
-    folder: Path, bounds: Bounds, mutant: str = "", model: Path = MODEL, *, large: bool = False
+    folder: Path, bounds: Bounded, mutant: str = "", traced: Path | None = None, *, large: bool = False
 ) -> Found:
-    """Check every reachable state of the model, in `folder`. Fails when the states do not fit into memory.
+    """Check every reachable state of the model, or of its copy with a trace, in `folder`.
+
+    Fails when the states do not fit into memory.
 
     With `large`, the checker is compiled with optimization, which takes four seconds.
     """
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []
-    _run(folder, spin, "-a", *bounds.defined, *wrong, str(model))
+    _run(folder, spin, "-a", *bounds.defined, *wrong, str(traced or bounds.model.path))
     _run(
         folder,
         compiler,
@@ -92,7 +149,7 @@ def search(
     assert states is not None, said
     broken = re.search(r"pan:1: assertion violated \W*(\w+)", said)
     if broken is not None:
-        return Found(_PROPERTIES.get(broken[1], broken[0]), int(states[1]))
+        return Found(bounds.model.properties.get(broken[1], broken[0]), int(states[1]))
     assert "errors: 0" in said, said
     assert "not completed" not in said, said
     assert "too small" not in said, said
@@ -103,18 +160,20 @@ Step = tuple[str, int, int]
 """A step of a trace: the event, and the two numbers that it is about."""
 
 
-def accepts(folder: Path, bounds: Bounds, trace: Sequence[Step]) -> bool:
+def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:
     """Whether an execution of the model leaves this trace; all executions are tried."""
     filled = "".join(
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)
     )
-    model = folder / "traced.pml"
+    traced = folder / "traced.pml"
     head = f"#define TRACE\n#define LENGTH {len(trace)}\n"
-    model.write_text(
-        f"{head}{MODEL.read_text()}\n".replace("init {", f"inline fill_trace() {{\n{filled}}}\n\ninit {{")
+    traced.write_text(
+        f"{head}{bounds.model.path.read_text()}\n".replace(
+            "init {", f"inline fill_trace() {{\n{filled}}}\n\ninit {{"
+        )
     )
-    found = search(folder, bounds, model=model).broken
+    found = search(folder, bounds, traced=traced).broken
     assert found in ("", "accepted"), found
     return bool(found)
 

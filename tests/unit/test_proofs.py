@@ -2,14 +2,15 @@
 
 import ast
 import re
+from collections.abc import Collection
 
 import pytest
 
-from tests.proofs.test_insertion_mutants import MUTANTS
-from tests.support.spin import MODEL
+from tests.proofs import test_insertion_mutants, test_lease_mutants
+from tests.support.spin import INSERTION, LEASE, Model
 
-ROOT = MODEL.parents[1]
-TEXT = MODEL.read_text()
+ROOT = INSERTION.path.parents[1]
+TEXT = INSERTION.path.read_text()
 NAMED = sorted(
     set(re.findall(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", TEXT, re.MULTILINE))
 )
@@ -40,6 +41,11 @@ def test_every_process_names_what_it_models() -> None:
     assert len(NAMED) == len(set(re.findall(r"= (appliance/\S+ \S+)", TEXT)))
 
 
-def test_every_mutant_is_tried() -> None:
+@pytest.mark.parametrize(
+    ("model", "mutants"),
+    [(INSERTION, test_insertion_mutants.MUTANTS), (LEASE, test_lease_mutants.MUTANTS)],
+    ids=["insertion", "lease"],
+)
+def test_every_mutant_is_tried(model: Model, mutants: Collection[str]) -> None:
     """The table has exactly the mutants of the model."""
-    assert set(re.findall(r"MUTANT_(\w+)", TEXT)) == set(MUTANTS)
+    assert set(re.findall(r"MUTANT_(\w+)", model.path.read_text())) == set(mutants)

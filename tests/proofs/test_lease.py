@@ -1,0 +1,20 @@
+"""Check the model of the lease (`proofs/lease.pml`) exhaustively.
+
+Bounds that take longer are in `test_lease_at_large.py`, wrong rules in `test_lease_mutants.py`.
+"""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.spin import LeaseBounds, search
+
+BOUNDS = [LeaseBounds(grants=2), LeaseBounds(grants=1, last_fault=True)]
+
+
+@pytest.mark.parametrize("bounds", BOUNDS, ids=str)
+def test_every_order_keeps_the_promises(tmp_path: Path, bounds: LeaseBounds) -> None:
+    """No reachable state of the model breaks a property, and the number of states is large enough to be meaningful."""
+    found = search(tmp_path, bounds, large=True)
+    assert found.broken == ""
+    assert found.states > 100_000

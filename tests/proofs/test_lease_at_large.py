@@ -1,0 +1,17 @@
+"""Check the model of the lease within bounds that take minutes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.spin import LeaseBounds, search
+
+BOUNDS = [LeaseBounds(grants=3), LeaseBounds(grants=2, last_fault=True)]
+
+
+@pytest.mark.parametrize("bounds", BOUNDS, ids=str)
+def test_every_order_keeps_the_promises(tmp_path: Path, bounds: LeaseBounds) -> None:
+    """No reachable state of the model breaks a property, and there are many."""
+    found = search(tmp_path, bounds, large=True)
+    assert found.broken == ""
+    assert found.states > 1_000_000
