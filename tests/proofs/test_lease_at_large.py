@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.spin import LeaseBounds, search
 
-BOUNDS = [LeaseBounds(grants=3), LeaseBounds(grants=2, last_fault=True)]
+BOUNDS = [LeaseBounds(grants=4), LeaseBounds(grants=3, last_fault=True)]
 
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
@@ -14,4 +14,4 @@ def test_every_order_keeps_the_promises(tmp_path: Path, bounds: LeaseBounds) -> 
     """No reachable state of the model breaks a property, and there are many."""
     found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
-    assert found.states > 1_000_000
+    assert found.states > 2_000_000

@@ -12,6 +12,7 @@ from tests.support.requirements import need_program
 _PROOFS = Path(__file__).parents[2] / "proofs"
 _MEGABYTES = 2000
 _DEPTH = 1_000_000
+_STEPS = 200  # of a trace in an inline, whose text Spin limits to 64 KB
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,15 +163,18 @@ Step = tuple[str, int, int]
 
 def accepts(folder: Path, bounds: Bounded, trace: Sequence[Step]) -> bool:
     """Whether an execution of the model leaves this trace; all executions are tried."""
-    filled = "".join(
+    steps = [
         f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
         for place, (what, one, other) in enumerate(trace)
-    )
+    ]
+    parts = ["".join(steps[start : start + _STEPS]) for start in range(0, len(steps), _STEPS)]
+    inlines = [f"inline fill_{number}() {{\n{part}}}\n" for number, part in enumerate(parts)]
+    filled = "; ".join(["skip", *(f"fill_{number}()" for number in range(len(parts)))])
     traced = folder / "traced.pml"
     head = f"#define TRACE\n#define LENGTH {len(trace)}\n"
     traced.write_text(
         f"{head}{bounds.model.path.read_text()}\n".replace(
-            "init {", f"inline fill_trace() {{\n{filled}}}\n\ninit {{"
+            "init {", f"{''.join(inlines)}inline fill_trace() {{ {filled} }}\n\ninit {{"
         )
     )
     found = search(folder, bounds, traced=traced).broken
