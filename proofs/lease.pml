@@ -11,8 +11,8 @@
  *       from the time at which they were given. An appliance that has promised does not claim, and does not become
  *       active by an earlier claim, until its promise is over. One that starts waits as long as if it had promised.
  *       A standby gives no promise while the witness tells it that the lease has expired.
- *   R4  A reboot of the robot shuts out both appliances until the holder renews, or until the next grant. The epoch, the
- *       holder and the in-sync set are read from disk. After each start the witness grants nothing for one expiry.
+ *   R4  A reboot of the robot shuts out both appliances until the holder renews, or until the next grant. The epoch,
+ *       the holder and the in-sync set are read from disk. After each start the witness grants nothing for one expiry.
  *   R5  Every appliance keeps the greatest epoch that it has heard of on its disk. It follows, and promises to, only a
  *       holder of that epoch or a later one; an active appliance that hears of a later epoch becomes passive.
  *   R6  A write is on the disk of an appliance before the appliance counts as having it.
@@ -23,8 +23,8 @@
  *   single   never do both appliances pass the check that comes before each answer: active, and within 0.8 of an expiry
  *   growing  the epoch of the witness only grows
  * and, with LAST_FAULT, from every reachable state:
- *   served   ROUNDS expiries after the last fault, and from then on, one appliance is admitted, active, reaches the robot,
- *            and can acknowledge writes, if an appliance of the in-sync set is up and reaches the robot
+ *   served   ROUNDS expiries after the last fault, and from then on, one appliance is admitted, active, reaches the
+ *            robot, and can acknowledge writes, if an appliance of the in-sync set is up and reaches the robot
  *
  * `single` is about the check. An answer that was checked, and then delayed by a pause of the process, can leave later.
  * The robot rejects it. Other hosts can get it: a stale answer to a query. An acknowledgement is safe at any time, so
@@ -36,12 +36,13 @@
  * together; a switchover. Only the number of grants is bounded, by GRANTS. Writes have no bound: only the one that is
  * not acknowledged yet is distinguished.
  *
- * Time has no numbers. A period may end at any time, however short or long, with two exceptions: the lease expires at the
- * witness only after the holder's 0.8 of every renewal, including one whose answer is still in flight; and a promise
- * ends only after the other's 0.8 of it. This is sound, that is, it includes every real execution, if the appliance counts
- * from the time at which it asked, which is not later than the time at which the other one starts to count; if the rates of
- * two clocks differ by less than a fifth; and if the appliance's clock continues while it sleeps (CLOCK_BOOTTIME).
- * Clocks are never compared. A switchover needs no message here: once the holder is passive, the lease may expire.
+ * Time has no numbers. A period may end at any time, however short or long, with two exceptions: the lease expires at
+ * the witness only after the holder's 0.8 of every renewal, including one whose answer is still in flight; and a
+ * promise ends only after the other's 0.8 of it. This is sound, that is, it includes every real execution, if the
+ * appliance counts from the time at which it asked, which is not later than the time at which the other one starts to
+ * count; if the rates of two clocks differ by less than a fifth; and if the appliance's clock continues while it sleeps
+ * (CLOCK_BOOTTIME). Clocks are never compared. A switchover needs no message here: once the holder is passive, the
+ * lease may expire.
  *
  * Requests are numbered by the appliance and carry the witness's boot nonce, so the witness drops a request that was
  * overtaken by a later one, and the appliance drops the answer to one. So one exchange of each appliance with the
@@ -50,8 +51,8 @@
  *
  * `tests/proofs/test_lease.py` has the bounds that are checked, `test_lease_mutants.py` the mutants.
  *
- * With TRACE the steps that leave an event are taken only in the order of a trace (`kind`, `first`, `second`, LENGTH), and all
- * others at any time. `tests/support/lease_traces.py` defines the events.
+ * With TRACE the steps that leave an event are taken only in the order of a trace (`kind`, `first`, `second`, LENGTH),
+ * and all others at any time. `tests/support/lease_traces.py` defines the events.
  */
 
 #ifndef GRANTS
@@ -80,7 +81,7 @@ bool whole[2] = true;          /* it has every acknowledged write */
 /* In its memory: */
 bool up[2] = true;
 bool leads[2];
-bool partner[2];               /* the other may be in the in-sync set, so it must have a write before it is acknowledged */
+bool partner[2];               /* the other may be in the in-sync set, so it must have each acknowledged write */
 bool writing[2];               /* a write is stored, and not acknowledged */
 bool synced[2];                /* the other has everything that this one has stored */
 /* Periods. They end whether the appliance takes steps or not. */
@@ -95,7 +96,7 @@ byte wire_epoch[2];            /* of an answer: the witness's epoch */
 bool wire_other[2];            /* of an answer: the other is in the in-sync set */
 bool fresh[2];                 /* of an answer: 0.8 of an expiry since the request is not over */
 bool orphan[2];                /* of a request: who sent it has crashed */
-bool offered[2];               /* the answer with a promise is in flight, and 0.8 of an expiry since the request not over */
+bool offered[2];               /* the answer with a promise is in flight, and as fresh */
 
 #ifdef MUTANT_OVERTAKEN
 bool late;                     /* a request to add the other comes after a later request */
@@ -107,7 +108,8 @@ byte seen;                     /* only for what is asserted: the greatest epoch 
 #ifdef TRACE
 short at;
 mtype = {
-    granted, renewed, released, refused, removed, added, promised, activated, passive, crashed, started, rebooted, acknowledged
+    granted, renewed, released, refused, removed, added, promised, activated, passive, crashed, started, rebooted,
+    acknowledged
 };
 hidden mtype kind[LENGTH];
 hidden byte first[LENGTH], second[LENGTH];
@@ -251,7 +253,8 @@ end:
         give_promise(me)
        }
     :: atomic {
-        up[me] && leads[me] && offered[me] && EVENT(promised, OTHER(me), me) -> LOGGED; offered[me] = false; trusted[me] = true
+        up[me] && leads[me] && offered[me] && EVENT(promised, OTHER(me), me) ->
+        LOGGED; offered[me] = false; trusted[me] = true
        }
 #ifdef TRACE
     :: atomic { up[me] && EVENT(promised, OTHER(me), me) -> LOGGED }    /* too late, or twice */
@@ -362,7 +365,8 @@ end:
         :: (wire[x] == remove || wire[x] == add) && holder != x -> answer_denied(x)
 #ifdef TRACE
         /* It refuses: 1 because another holds the lease, 2 who is not in the in-sync set, 0 for a reason of its own. */
-        :: EVENT(refused, x, 0) || (EVENT(refused, x, 1) && holder != x) || (EVENT(refused, x, 2) && !(in_sync & BIT(x))) ->
+        :: EVENT(refused, x, 0) || (EVENT(refused, x, 1) && holder != x) ||
+            (EVENT(refused, x, 2) && !(in_sync & BIT(x))) ->
             LOGGED; answer_denied(x)
         :: EVENT(released, x, epoch) && holder == x && OWN_LIMIT_OVER(x) -> LOGGED; running = false
 #endif
@@ -441,6 +445,11 @@ inline finish_request() {
 #endif
 }
 
+inline lose(x) {
+    wire[x] = none; orphan[x] = false;
+    fresh[x] = false; wire_epoch[x] = 0; wire_other[x] = false
+}
+
 inline crash(x) {
 #ifdef TRACE
     shown[x] = 0;
@@ -453,8 +462,7 @@ inline crash(x) {
     term[x] = 0;
 #endif
     if
-    :: wire[x] == held || wire[x] == denied ->
-        wire[x] = none; fresh[x] = false; wire_epoch[x] = 0; wire_other[x] = false
+    :: wire[x] == held || wire[x] == denied -> lose(x)
     :: wire[x] == claim || wire[x] == remove || wire[x] == add -> orphan[x] = true
     :: else
     fi
@@ -467,8 +475,8 @@ proctype Faults() POSSIBLE {
 end:
     do
     /* A message is lost. */
-    :: atomic { wire[0] != none -> wire[0] = none; orphan[0] = false; fresh[0] = false; wire_epoch[0] = 0; wire_other[0] = false }
-    :: atomic { wire[1] != none -> wire[1] = none; orphan[1] = false; fresh[1] = false; wire_epoch[1] = 0; wire_other[1] = false }
+    :: atomic { wire[0] != none -> lose(0) }
+    :: atomic { wire[1] != none -> lose(1) }
 #ifdef MUTANT_OVERTAKEN
     :: atomic { wire[0] == add -> wire[0] = none; orphan[0] = false; late = true }
 #endif
@@ -539,9 +547,9 @@ end:
 /* --- after the last fault --------------------------------------------------------------------------------- */
 
 #ifdef LAST_FAULT
-/* The last fault leaves each link up or down for good, and each appliance up or not. Then an expiry is long enough for some
-   exchanges, and a period that is not renewed in it ends. Here the appliances do all that they can do, in one order
-   or the other; they do not write. */
+/* The last fault leaves each link up or down for good, and each appliance up or not. Then an expiry is long enough for
+   some exchanges, and a period that is not renewed in it ends. Here the appliances do all that they can do, in one
+   order or the other; they do not write. */
 
 bool near[2];                  /* the appliance and the robot reach each other */
 bool between;                  /* the appliances reach each other */
@@ -550,7 +558,8 @@ hidden byte now_leased[2], now_trusted[2], now_promise[2], now_running;    /* re
 hidden byte turns;
 
 #define CAN_ASK(x) (near[x] && holder == x)
-#define SERVES(x) (up[x] && near[x] && leads[x] && leased[x] && admits == BIT(x) && (!partner[x] || (between && up[OTHER(x)])))
+#define ACKNOWLEDGES(x) (!partner[x] || (between && up[OTHER(x)]))
+#define SERVES(x) (up[x] && near[x] && leads[x] && leased[x] && admits == BIT(x) && ACKNOWLEDGES(x))
 #define CAN_SERVE(x) (up[x] && near[x] && in_sync & BIT(x))
 
 inline ask_witness(x) {
