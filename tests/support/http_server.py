@@ -5,6 +5,7 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from functools import partial
 
 import pytest
 
@@ -17,7 +18,7 @@ from appliance.quotas.table import (
     RVMASTER_FAREWELLS,
     RVMASTER_REQUESTS,
 )
-from appliance.rpc.connection_table import ConnectionTable
+from appliance.rpc.connection_table import ConnectionTable, Patience
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
@@ -50,6 +51,7 @@ class Shares:
     arriving: Bounds = RVMASTER_ARRIVALS.bounds
     clock: Callable[[], float] = time.thread_time
     first: Program | None = None
+    patience: Patience | None = None
 
 
 def post(body: bytes, *headers: str, path: str = "/", length: int | None = None) -> bytes:
@@ -113,7 +115,12 @@ class Server:
         self.requests: list[HttpRequest] = []
         self.at_once: AtOnce = not_at_once
         self.troubles: list[str] = []
-        self.connection_table: ConnectionTable[Address] = ConnectionTable(
+        table = (
+            partial(ConnectionTable[Address], patience=shares.patience)
+            if shares.patience
+            else ConnectionTable
+        )
+        self.connection_table: ConnectionTable[Address] = table(
             _named,
             connections=shares.connections,
             held=shares.held,

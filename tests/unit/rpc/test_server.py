@@ -2,11 +2,13 @@
 
 import asyncio
 import ipaddress
+import math
 import socket
 
 import pytest
 
-from appliance.quotas.pool import Bounds
+from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.rpc.connection_table import Stage
 from appliance.rpc.processor_time import TURN_SECONDS
 from appliance.rpc.server import HttpRequest, NoAnswerError
 from appliance.rpc.source_queues import first_for
@@ -301,3 +303,31 @@ async def test_pieces_that_arrive_while_a_host_waits_for_its_turn_are_read_in_or
         assert not server.requests
         await client.response()
         assert [one.body for one in server.requests] == [bytes(range(256))]
+
+
+async def test_a_request_in_service_keeps_its_connection() -> None:
+    """A connection whose handler waits is not evicted, even if all other connections are evicted at once."""
+    begun, go = asyncio.Event(), asyncio.Event()
+
+    async def handler(request: HttpRequest) -> bytes:
+        begun.set()
+        await go.wait()
+        return b"answer to " + request.body
+
+    def patience(_quota_class: QuotaClass, stage: Stage, _own: bool) -> float:
+        return math.inf if stage is Stage.SERVED else 0.0
+
+    shares = Shares(connections=Bounds(1, 1, 0, 0), patience=patience)
+    async with serving(handler, shares=shares) as server:
+        client = await server.connect()
+        await client.send(post(b"robot"))
+        async with asyncio.timeout(WAIT):
+            await begun.wait()
+        other = await server.connect("127.0.0.2")
+        assert (await other.response())[0] == 503
+        go.set()
+        status, _headers, answer = await client.response()
+        assert (status, answer) == (200, b"answer to robot")
+        third = await server.connect("127.0.0.2")  # the first connection is idle, and makes room
+        await third.send(post(b"third"))
+        assert (await third.response())[0] == 200
