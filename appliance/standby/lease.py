@@ -1,14 +1,17 @@
 """The lease as an appliance sees it: active or passive, by times and messages alone.
 
 This module reads no clock and no socket. Its owner passes the time with each message, sends what comes back, and calls
-`tick` when `next_event` is due. A time is the appliance's own monotonic clock; clocks are never compared.
+`tick` when `next_event` is due. A time is that of the appliance's own clock, which must run while the machine sleeps
+(CLOCK_BOOTTIME); clocks are never compared.
 
 1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
    promise that was given. The witness and the other appliance count a whole expiry from a later time.
 2. A passive appliance becomes active only by the witness. A grant that arrives while it has promised not to claim waits
    until the promise ends: the other appliance may rely on it.
-3. An appliance that starts may have given a promise before, so it claims one expiry later.
-4. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
+3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
+   off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
+4. An appliance that starts may have given a promise before, so it claims one expiry later.
+5. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
    It waits for the standby again before it asks the witness to add it.
 """
 
@@ -23,7 +26,7 @@ CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different sp
 SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
 _MOST_PENDING = 16
 
-Operation = Literal["renew", "claim", "remove", "add", "release"]
+Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
 
 class LeaseError(Exception):
@@ -42,13 +45,14 @@ class WitnessRequest:
 
 @dataclass(frozen=True)
 class WitnessAnswer:
-    """An answer of the witness, with the lease after the request."""
+    """An answer of the witness, with the lease after the request. `expired`: no appliance has renewed it in time."""
 
     ok: bool
     reason: str
     epoch: int
     holder: str
     in_sync: frozenset[str]
+    expired: bool
 
 
 @dataclass(frozen=True)
@@ -101,6 +105,7 @@ class ApplianceLease:
         self._asked: dict[int, float] = {}
         self._number = 0
         self._heard = now - EXPIRY
+        self._expired = False
         self._last_add = 0
         # A switchover: requests and promises up to these numbers no longer make this appliance active.
         self._switching_until: float | None = None
@@ -137,7 +142,7 @@ class ApplianceLease:
             return ()
         self._next_round = now + RENEW_SECONDS
         if self.held is None:
-            return (self._to_witness("claim", now),) if now >= self._promised_until else ()
+            return (self._to_witness("claim" if now >= self._promised_until else "look", now),)
         if self._switching_until is not None:
             if now < self._switching_until:
                 return (self._take_over() if self._released else self._to_witness("release", now),)
@@ -158,6 +163,7 @@ class ApplianceLease:
         self.refusal = answer.reason
         if answer.epoch < self.epoch:
             return ()
+        self._expired = answer.expired
         if answer.holder != self._name:
             self._learn(answer.epoch)
             return ()
@@ -181,7 +187,7 @@ class ApplianceLease:
         """Take a message of the other appliance."""
         match message:
             case PromiseRequest():
-                if not self.follow(message.epoch):
+                if not self.follow(message.epoch) or self._expired:
                     return ()
                 self._promised_until = max(self._promised_until, now + EXPIRY)
                 self._promised_to = message

@@ -42,10 +42,10 @@ import time
 from typing import Any, Callable, Dict, List, NamedTuple, Optional, Set, Tuple
 
 EXPIRY = 1.2  # seconds after a renewal until another appliance may have the lease
-LONGEST = 512  # bytes of a datagram
+LONGEST = 1024  # bytes of a datagram
 HIGHEST = 1 << 53  # of numbers and epochs, which JSON carries exactly
 REQUEST, ANSWER = b"rosrv lease request 1\0", b"rosrv lease answer 1\0"
-OPERATIONS = ("renew", "claim", "remove", "add", "release")
+OPERATIONS = ("renew", "claim", "remove", "add", "release", "look")
 TABLE = "rosrv_witness"
 _CHAINS = "rosrv-witness"
 _JUMPS = (
@@ -260,8 +260,8 @@ class Witness:
                 % self.record.epoch
             )
         try:
-            if operation == "claim":
-                return self._claim(self.record, name)
+            if operation in ("claim", "look"):
+                return self._claim(self.record, name) if operation == "claim" else ""
             if (self.record.holder, self.record.epoch) != (name, epoch):
                 return "%s holds epoch %d" % (self.record.holder or "no appliance", self.record.epoch)
             if operation == "renew":
@@ -363,6 +363,7 @@ class WitnessGate:
             epoch=record.epoch if record is not None else 0,
             holder=record.holder if record is not None else "",
             in_sync=list(record.in_sync) if record is not None else [],
+            expired=not self._witness.left(),
         )
         return answer
 

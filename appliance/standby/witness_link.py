@@ -25,6 +25,7 @@ class _AnswerBody(msgspec.Struct, frozen=True):
     epoch: _Count = 0
     holder: str = ""
     in_sync: frozenset[str] = frozenset()
+    expired: bool = False
 
 
 class WitnessChannel:
@@ -70,7 +71,8 @@ class WitnessChannel:
         if body.stale:
             self._boot, self._number = body.boot, max(self._number, body.last)
             return None
-        return request, WitnessAnswer(body.ok, body.reason, body.epoch, body.holder, body.in_sync)
+        answer = WitnessAnswer(body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired)
+        return request, answer
 
 
 class WitnessLink(asyncio.DatagramProtocol):

@@ -50,7 +50,9 @@ class Lease:
 
     def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
         """Answer a request: granted, unless the test says otherwise."""
-        full = {"ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH} | answer
+        full = {
+            "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
+        } | answer  # fmt: skip
         return self.lease.answered(request, WitnessAnswer(**full))  # type: ignore[arg-type]
 
     def active(self) -> bool:
@@ -74,8 +76,8 @@ def asked_by(lease: Lease) -> PromiseRequest:
 def test_a_start_waits_one_expiry_before_it_claims() -> None:
     """It may have given a promise before it ended."""
     lease = Lease()
-    assert lease.operations() == []
-    assert lease.later(EXPIRY - 0.01).operations() == []
+    assert lease.operations() == ["look"]
+    assert lease.later(EXPIRY - 0.01).operations() == ["look"]
     assert lease.later(0.31).operations() == ["claim"]
 
 
@@ -125,13 +127,25 @@ def test_it_does_not_claim_while_its_promise_lasts() -> None:
     assert list(lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))) == [
         ClaimPromise(1, "theirs", 7)
     ]
-    assert lease.later(0.3).operations() == []
+    assert lease.later(0.3).operations() == ["look"]
     lease.answered(claim)
     assert not lease.active()
     renewal = lease.later(0.4).request("renew")
     lease.answered(renewal)
     assert not lease.active()
     assert lease.later(EXPIRY - 0.69).active()
+
+
+def test_it_promises_nothing_after_the_lease_has_expired() -> None:
+    """An active appliance that is cut off from the robot loses the promises, and the robot gets the other one."""
+    lease, asked = Lease().later(EXPIRY), PromiseRequest(1, "theirs", 7)
+    assert lease.lease.received(lease.now, asked)
+    look = lease.request("look")
+    lease.answered(look, epoch=1, holder="b", expired=True)
+    assert not lease.lease.received(lease.later(0.3).now, asked)
+    assert lease.later(EXPIRY).operations() == ["claim"]
+    lease.answered(look, epoch=1, holder="b", expired=False)
+    assert lease.lease.received(lease.now, asked)
 
 
 def test_it_promises_nothing_to_an_older_epoch() -> None:
@@ -206,7 +220,7 @@ def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
     standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number))
-    assert standby.later(0.1).operations() == []
+    assert standby.later(0.1).operations() == ["look"]
     (claim,) = standby.lease.received(standby.now, order)
     assert isinstance(claim, WitnessRequest) and claim.operation == "claim"
 
@@ -217,7 +231,7 @@ def test_a_late_order_does_not_end_a_later_promise() -> None:
     standby = Lease().later(EXPIRY)
     standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
     assert list(standby.lease.received(standby.now, order)) == []
-    assert standby.later(0.3).operations() == []
+    assert standby.later(0.3).operations() == ["look"]
 
 
 def test_older_answers_do_not_undo_a_switchover() -> None:

@@ -13,6 +13,7 @@ from appliance.standby import witness as program
 from appliance.standby.witness import (
     ANSWER,
     EXPIRY,
+    LONGEST,
     REQUEST,
     AppliancePeer,
     BoundedLog,
@@ -196,16 +197,28 @@ def test_an_answer_repeats_session_and_number() -> None:
     """It has the lease as it is after the request."""
     assert answered(Robot().expired(), request()) == {
         "boot": "nonce", "session": "mine", "number": 1, "ok": True, "reason": "", "epoch": 2, "holder": "a",
-        "in_sync": ["a", "b"],
+        "in_sync": ["a", "b"], "expired": False,
     }  # fmt: skip
+
+
+def test_a_look_changes_nothing() -> None:
+    """It says whether the lease has expired."""
+    robot = Robot().expired()
+    answers = [
+        answered(robot, request(do=operation, number=number, epoch=epoch))
+        for number, (operation, epoch) in enumerate((("look", 1), ("claim", 1), ("look", 2)), 1)
+    ]
+    assert [one and (one["ok"], one["epoch"], one["expired"]) for one in answers] == [
+        (True, 1, True), (True, 2, False), (True, 2, False),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("datagram", "address"),
     [
         (b"", "10.0.0.2"),
-        (b"\xff" * 512, "10.0.0.2"),
-        (request() + b" " * 512, "10.0.0.2"),
+        (b"\xff" * LONGEST, "10.0.0.2"),
+        (request() + b" " * LONGEST, "10.0.0.2"),
         (request(key=KEYS["b"]), "10.0.0.2"),
         (request(), "10.0.0.3"),
         (request()[:-1] + b"]", "10.0.0.2"),
