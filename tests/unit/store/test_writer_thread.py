@@ -19,7 +19,7 @@ import pytest
 
 from appliance.store import ahead as ahead_module
 from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
-from appliance.store.changes import Change, ChangeError, Put, Tables
+from appliance.store.changes import Change, ChangeError, Delete, Put, Tables
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
@@ -330,6 +330,20 @@ def test_changes_behind_a_missing_one_are_left_out(tmp_path: Path) -> None:
     ahead.append([encoded(3, "later")])
     ahead.close()
     assert names_after_start(tmp_path) == ["kept"]
+
+
+def test_changes_that_the_database_has_are_not_repeated(tmp_path: Path) -> None:
+    """A power failure may leave an old content of the file, though the database has later changes."""
+    file = tmp_path / "state.ahead"
+    leave_behind(file, encoded(1, "a"))
+    old = file.read_bytes()
+    leave_behind(file, Encoded(2, msgspec.msgpack.encode(Delete("thing", [("name", "=", "a")]))))
+    assert names_after_start(tmp_path) == []
+    file.write_bytes(old)
+    assert names_after_start(tmp_path) == []
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    assert database.number == 2
+    database.close()
 
 
 def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path) -> None:
