@@ -16,6 +16,7 @@ from appliance.store.changes import Change, Put
 
 LARGEST_FRAME = 128 << 20  # more than a parameter tree, the largest value of the state
 _PIECE = 256 << 10
+_WRITE_SECONDS = 30.0
 _LENGTH = struct.Struct(">I")
 _LONGEST_REASON = 500
 
@@ -109,13 +110,18 @@ class ReplicationLink(Generic[M]):
                 f"a change has {len(body)} bytes, and the standby gets at most {LARGEST_FRAME}: make"
                 " limits.parameter_bytes smaller"
             )
+        await self._write(_LENGTH.pack(len(body)) + body[:_PIECE])
+        for begin in range(_PIECE, len(body), _PIECE):
+            await asyncio.sleep(0)  # encryption of all pieces at once would hold the loop
+            await self._write(body[begin : begin + _PIECE])
+
+    async def _write(self, data: bytes) -> None:
+        self._writer.write(data)
         try:
-            self._writer.writelines((_LENGTH.pack(len(body)), body[:_PIECE]))
-            await self._writer.drain()
-            for begin in range(_PIECE, len(body), _PIECE):
-                await asyncio.sleep(0)  # encryption of all pieces at once would hold the loop
-                self._writer.write(body[begin : begin + _PIECE])
+            async with asyncio.timeout(_WRITE_SECONDS):
                 await self._writer.drain()
+        except TimeoutError as error:
+            raise ReplicationError(f"the other appliance took nothing for {_WRITE_SECONDS:g} s") from error
         except OSError as error:
             raise ReplicationError(f"the link was lost: {error}") from error
 

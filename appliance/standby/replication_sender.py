@@ -91,7 +91,8 @@ class ReplicationSender:
     async def acknowledged(self, number: int) -> None:
         """Wait until this appliance and the standby have all changes up to this number on their disks.
 
-        Raises `StoreError` if this appliance cannot write. While the standby is away, this waits until it is back.
+        While the standby is away, this waits until it is back. Raises `StoreError` if this appliance cannot write, and
+        `ReplicationError` when the sender is closed.
         """
         await self._database.settled()
         if number > self._acknowledged:
@@ -126,8 +127,8 @@ class ReplicationSender:
                 await asyncio.wait([own])
             finally:
                 own.cancel()
-            if self._link is own:
-                self._link = None
+                if self._link is own:
+                    self._link = None
             if own.cancelled():
                 raise ReplicationError(
                     "the standby opened another link, or this appliance is no longer active"
@@ -141,8 +142,11 @@ class ReplicationSender:
             await link.close()
 
     def close(self) -> None:
-        """End the link, and keep no further changes."""
+        """End the link, and keep no further changes; callers of `acknowledged` get an error."""
         self._database.unfollow(self._feed)
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_exception(ReplicationError("this appliance is no longer active"))
         if self._link is not None:
             self._link.cancel()
 
@@ -213,6 +217,7 @@ class ReplicationSender:
 
     async def _send(self, link: ReplicationLink[FromStandby], position: int | None) -> None:
         while True:
+            await self._free_to_send(_CHANGES_UNANSWERED)
             changes = None if position is None else self._feed.after(position, _BATCH)
             if (
                 position is None
@@ -222,9 +227,10 @@ class ReplicationSender:
                 position = await self._send_snapshot(link)
                 continue
             bodies = [msgspec.Raw(change.body) for change in changes]
-            await self._free_to_send(_CHANGES_UNANSWERED)
             self._note_sent(position + len(changes))
-            await link.send(EncodedChanges(self._epoch(), self._database.history, position + 1, bodies))
+            await self._post(
+                link, EncodedChanges(self._epoch(), self._database.history, position + 1, bodies)
+            )
             position = self._sent
             if self._feed.after(position, 0) == []:
                 self._changed.clear()
@@ -240,24 +246,25 @@ class ReplicationSender:
             found = copy.execute("SELECT number FROM journal").fetchone()
             number = found[0] if found else 0
             self._note_sent(number)
-            self._unanswered += 1
-            await link.send(SnapshotBegin(self._epoch(), self._database.history, number))
+            await self._post(link, SnapshotBegin(self._epoch(), self._database.history, number))
             rows = 0
             puts = _rows_of(copy, self._database.tables)
             while (put := await _in_thread(next, puts, None)) is not None:
                 await self._free_to_send(_ROWS_UNANSWERED)
-                await link.send(SnapshotRows([put]))
+                await self._post(link, SnapshotRows([put]))
                 rows += len(put.rows)
-            self._unanswered += 1
-            await link.send(SnapshotEnd(rows))
+            await self._post(link, SnapshotEnd(rows))
         return number
 
     async def _free_to_send(self, most: int) -> None:
-        """Wait until at most `most` messages are unanswered, with the next one."""
+        """Wait until fewer than `most` messages are unanswered."""
         while self._unanswered >= most:
             self._answered.clear()
             await self._answered.wait()
+
+    async def _post(self, link: ReplicationLink[FromStandby], message: msgspec.Struct) -> None:
         self._unanswered += 1
+        await link.send(message)
 
     def _note_sent(self, number: int) -> None:
         self._sent = number

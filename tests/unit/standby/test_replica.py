@@ -75,6 +75,24 @@ def test_changes_and_their_number_are_stored_together(tmp_path: Path) -> None:
     again.close()
 
 
+def test_each_commit_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite's log is synchronized in each transaction, so an acknowledged change survives a power failure."""
+    connections: list[sqlite3.Connection] = []
+    connect = sqlite3.connect
+
+    def noted(*arguments: Any, **options: Any) -> sqlite3.Connection:
+        connections.append(connect(*arguments, **options))
+        return connections[-1]
+
+    monkeypatch.setattr(sqlite3, "connect", noted)
+    replica = begun(tmp_path)
+    modes = [
+        connections[-1].execute(f"PRAGMA {mode}").fetchone()[0] for mode in ("synchronous", "journal_mode")
+    ]
+    assert modes == [2, "wal"]
+    replica.close()
+
+
 BAD: list[tuple[FromActive, str]] = [
     (changes(thing("a"), epoch=2), "epoch 2 has ended: epoch 3 has begun"),
     (changes(epoch=2), "epoch 2 has ended"),

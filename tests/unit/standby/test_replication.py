@@ -276,6 +276,47 @@ async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.
     await active.close()
 
 
+async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
+    """When the sender is closed, `acknowledged` is an error; later changes are not kept."""
+    server, _client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    async with asyncio.timeout(SECONDS):
+        active.database.put("thing", "a", 1, None)
+        waiting = asyncio.create_task(active.sender.acknowledged(1))
+        await until(lambda: active.sender.lag().waiting_since is not None)
+        async with connected(tmp_path, active) as link:
+            await link.send(Stored(0, "", 0))
+            await link.receive(10)
+            active.sender.close()
+            with pytest.raises(ReplicationError, match="no longer active"):
+                await waiting
+            await until(lambda: not active.sender.lag().connected)
+        size = active.sender.lag().bytes
+        active.database.put("thing", "b", 1, None)
+        assert active.sender.lag().bytes == size
+        assert active.sender.lag().waiting_since is None
+    await active.close()
+
+
+@pytest.mark.parametrize("receiving", [True, False])
+async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
+    monkeypatch: pytest.MonkeyPatch, *, receiving: bool
+) -> None:
+    """Neither does one that writes nothing."""
+    monkeypatch.setattr(replication_frames, "_WRITE_SECONDS", 0.1)
+    reader, other, writer = await pair_of_links()
+    link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+    with pytest.raises(
+        ReplicationError, match="sent nothing for 0.1 s" if receiving else "took nothing for 0.1 s"
+    ):
+        if receiving:
+            await link.receive(0.1)
+        else:
+            await link.send(bytes(64 << 20))
+    await link.close()
+    other.close()
+
+
 async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
     """Another certificate, none, an older TLS, and no TLS at all get nothing; the standby also checks its side."""
     server, client = certificates(tmp_path)
