@@ -208,7 +208,7 @@ class Database:
 
         The copy is one step: with fewer pages at a time, each commit would start it again. Changes are still written.
         """
-        path = self._path.with_suffix(".copy")
+        path = self._path.with_suffix(".new")
         path.unlink(missing_ok=True)  # a killed process may have left a part
         copy = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
         try:

@@ -157,12 +157,12 @@ async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[Replic
 
 
 async def take_snapshot(link: ReplicationLink[FromActive]) -> SnapshotBegin:
-    """Take a snapshot without storing it; return its beginning."""
+    """Take a snapshot without storing it; return its beginning. The stored state is of another history."""
     begin = await link.receive(10)
     assert isinstance(begin, SnapshotBegin)
-    await link.send(Stored(0, "", 0))
+    await link.send(Stored(0, "other", 1))
     while not isinstance(await link.receive(10), SnapshotEnd):
-        await link.send(Stored(0, "", 0))
+        await link.send(Stored(0, "other", 1))
     return begin
 
 
@@ -178,6 +178,7 @@ async def test_an_acknowledgement_of_an_unsent_change_is_not_counted(tmp_path: P
             async with connected(tmp_path, active) as link:
                 await link.send(Stored(0, "", 0))
                 await take_snapshot(link)
+                assert not waiting.done()
                 await link.send(lie)
                 with pytest.raises(ReplicationError, match=r"closed the link|lost"):
                     while True:

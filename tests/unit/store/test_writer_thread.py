@@ -446,7 +446,7 @@ def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tm
 
 def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
     """Its rows are those up to its number, while another thread writes; a killed process may have left a part."""
-    (tmp_path / "state.copy").write_bytes(b"a part")
+    (tmp_path / "state.new").write_bytes(b"a part")
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "0", 0)
     database.query("SELECT 1")
