@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.standby import replication_frames, replication_sender
+from appliance.standby import replication_frames, replication_sender, replication_transport
 from appliance.standby.link_certificates import link_context, make_link_certificate
 from appliance.standby.replication_frames import (
     Changes,
@@ -352,13 +352,21 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
     await active.close()
 
 
-async def test_connections_without_a_handshake_are_limited(tmp_path: Path) -> None:
+async def test_connections_without_a_handshake_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They are closed at once beyond a number, and the others after a time; the standby then connects."""
+    monkeypatch.setattr(replication_transport, "_HANDSHAKE_SECONDS", 0.5)
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
     idle = [socket.create_connection(("127.0.0.1", active.port)) for _ in range(40)]
     standby = StandbySide(tmp_path / "standby.db", client, lambda: active.port)
     async with asyncio.timeout(SECONDS):
+        loop = asyncio.get_running_loop()
+        for connection in idle[-20:]:
+            connection.setblocking(False)
+            assert await loop.sock_recv(connection, 1) == b""
+        assert not active.sender.lag().connected
         await until(lambda: active.sender.lag().caught_up)
     for connection in idle:
         connection.close()
