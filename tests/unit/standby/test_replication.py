@@ -1,11 +1,12 @@
 """Replication of the state between two databases, over TLS."""
 
 import asyncio
+import contextlib
 import random
 import socket
+import sqlite3
 import ssl
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,30 @@ import pytest
 
 from appliance.standby import replication_frames, replication_sender, replication_transport
 from appliance.standby.link_certificates import link_context, make_link_certificate
+from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import (
     Changes,
     FromActive,
+    Refused,
     ReplicationError,
     ReplicationLink,
     SnapshotBegin,
     SnapshotEnd,
+    SnapshotRows,
     Stored,
+)
+from appliance.standby.replication_receiver import ReplicationReceiver
+from appliance.standby.replication_sender import ReplicationSender
+from appliance.store.access_tokens import make_token
+from appliance.store.changes import Put
+from appliance.store.host_tables import HostBlockRow, HostRow, RevokedCertificateRow
+from appliance.store.state_file import SCHEMA as STATE_SCHEMA
+from appliance.store.state_file import (
+    IncarnationRow,
+    PermissionRow,
+    RegistrationRow,
+    RevisionRow,
+    StateStore,
 )
 from tests.support.replication import (
     SCHEMA,
@@ -144,7 +161,7 @@ async def test_a_standby_that_was_away_shortly_gets_only_the_changes(tmp_path: P
     await active.close()
 
 
-@asynccontextmanager
+@contextlib.asynccontextmanager
 async def connected(directory: Path, active: ActiveSide) -> AsyncIterator[ReplicationLink[FromActive]]:
     """Connect as the standby does, to lie."""
     _server, client = certificates(directory)
@@ -263,6 +280,20 @@ async def test_a_new_link_ends_the_earlier_one(tmp_path: Path) -> None:
     await active.close()
 
 
+async def test_a_quiet_link_stays_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without changes, the active appliance sends a message in each interval, once the earlier ones are answered."""
+    monkeypatch.setattr(replication_sender, "_HEARTBEAT_SECONDS", 0.05)
+    server, _client = certificates(tmp_path)
+    active = ActiveSide(tmp_path / "active.db", server)
+    async with asyncio.timeout(SECONDS), connected(tmp_path, active) as link:
+        await link.send(Stored(0, "", 0))
+        await take_snapshot(link)
+        for _ in range(5):
+            await link.send(Stored(1, active.database.history, 0))
+            assert await link.receive(10) == Changes(1, active.database.history, 1, [])
+    await active.close()
+
+
 async def test_a_silent_standby_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that reads nothing, or answers nothing, does not hold the link for ever."""
     monkeypatch.setattr(replication_sender, "_SILENCE_SECONDS", 0.5)
@@ -374,12 +405,112 @@ async def test_connections_without_a_handshake_are_limited(
     await active.close()
 
 
+Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+async def pair_of_streams() -> tuple[Streams, Streams]:
+    """Return the two ends of a connection."""
+    here, there = socket.socketpair()
+    return await asyncio.open_connection(sock=here), await asyncio.open_connection(sock=there)
+
+
 async def pair_of_links() -> tuple[asyncio.StreamReader, asyncio.StreamWriter, asyncio.StreamWriter]:
     """Return a reader, the writer whose bytes it reads, and the reader's own writer."""
-    here, there = socket.socketpair()
-    reader, writer = await asyncio.open_connection(sock=here)
-    _, other = await asyncio.open_connection(sock=there)
+    (reader, writer), (_, other) = await pair_of_streams()
     return reader, other, writer
+
+
+async def test_a_standby_follows_only_an_accepted_epoch(tmp_path: Path) -> None:
+    """The caller decides; the active appliance gets the reason, for changes and for a snapshot."""
+    replica = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail)
+    for message in (Changes(7, "", 1, [Put("mark", [(1,)])]), SnapshotBegin(7, "h", 1)):
+        ends, others = await pair_of_streams()
+        link: ReplicationLink[Stored | Refused] = ReplicationLink(*others, Stored | Refused)
+        receiver = ReplicationReceiver(replica, lambda epoch: epoch == 8)
+        following = asyncio.create_task(receiver.follow(*ends))
+        async with asyncio.timeout(SECONDS):
+            assert await link.receive(10) == Stored(0, "", 0)
+            await link.send(message)
+            reason = "an appliance of epoch 7 is not accepted as the active one"
+            assert await link.receive(10) == Refused(reason)
+            with pytest.raises(ReplicationError, match=reason):
+                await following
+        await link.close()
+    assert replica.position == Stored(0, "", 0)
+    replica.close()
+
+
+async def test_a_link_that_ends_in_a_snapshot_leaves_nothing_open(tmp_path: Path) -> None:
+    """The state is as before, and no transaction holds the file."""
+    replica = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail)
+    ends, others = await pair_of_streams()
+    link: ReplicationLink[Stored] = ReplicationLink(*others, Stored)
+    following = asyncio.create_task(ReplicationReceiver(replica, lambda _epoch: True).follow(*ends))
+    async with asyncio.timeout(SECONDS):
+        for message in (SnapshotBegin(7, "h", 1), SnapshotRows([Put("mark", [(1,)])])):
+            await link.receive(10)
+            await link.send(message)
+        await link.receive(10)
+        await link.close()
+        with pytest.raises(ReplicationError, match="closed the link"):
+            await following
+    with contextlib.closing(sqlite3.connect(tmp_path / "standby.db", timeout=0)) as other:
+        other.execute("INSERT INTO mark VALUES (2)")
+    assert replica.position == Stored(0, "", 0)
+    replica.close()
+
+
+async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
+    """Control finds on the standby what it has saved on the active appliance, by snapshot and by changes."""
+    for name in ("active", "standby"):
+        (tmp_path / name).mkdir()
+    store = StateStore(tmp_path / "active", failed=pytest.fail)
+    node = IncarnationRow("k", "/n", "10.0.0.1", "http://r:1/", "10.0.0.2", 1, 2, True, "live", 1.5, (3, 4))
+    token, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
+
+    def save(key: str) -> None:
+        store.save_incarnation(node._replace(key=key))
+        store.save_registration(RegistrationRow(key, "publication", "/a", "*", 1))
+        store.save_permission(PermissionRow(key, "topic", "/a", "10.0.0.9", "/listener"))
+        store.note_parameter(f"/{key}", [1.5, {"c": b"x"}])
+        store.parameter_owned(f"/{key}/x", "10.0.0.8")
+        store.parameters_disowned(f"/{key}")
+        store.save_tokens(token)
+        store.save_token_use(token.id, 5)
+        store.save_setting(key, "value")
+        store.hosts.save(HostRow(key, f"10.1.0.{key}", "ab", 5.0, 1.0, None))
+        store.hosts.save_revoked(RevokedCertificateRow(key, "n", 4.0, 9.0))
+        store.hosts.forget_revoked(5.0)
+        store.hosts.save_block(HostBlockRow(f"10.1.0.{key}", 4.0, None, "alice", ""))
+        store.save_revision(RevisionRow(int(key), "text", "p.ini", 1.0, "disk", "note"))
+
+    save("1")
+    store.save_parameters({"1": [1.5]})
+    sender = ReplicationSender(store.database, lambda: 1)
+    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
+    ends, others = await pair_of_streams()
+    tasks = [
+        asyncio.create_task(sender.serve(*ends)),
+        asyncio.create_task(ReplicationReceiver(replica, lambda _epoch: True).follow(*others)),
+    ]
+    async with asyncio.timeout(SECONDS):
+        await sender.acknowledged(store.database.number)
+        save("2")
+        store.forget_incarnation("1")
+        await sender.acknowledged(store.database.number)
+    sender.close()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    replica.close()
+    await asyncio.to_thread(store.close)
+    expected, found = (StateStore(tmp_path / name, failed=pytest.fail) for name in ("active", "standby"))
+    for table in found.database.tables:
+        query = f"SELECT * FROM {table}"  # noqa: S608  a table of the schema
+        assert found.database.query(query) == expected.database.query(query), table
+    assert found.load_registry()[0] == [node._replace(key="2")]
+    assert found.load_parameters() == {"1": [1.5]}
+    assert found.database.number == expected.database.number
+    expected.close()
+    found.close()
 
 
 @pytest.mark.parametrize(
