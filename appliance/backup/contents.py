@@ -14,7 +14,7 @@ MOST_FILES = 10_000  # a usual backup has about twenty
 _LONGEST_NAME = 100  # bytes that fit into a tar header without an extension
 _DATABASES = "control/"  # the only part with databases
 # Files that exist only while the appliance runs, or that the next start makes again. `.ahead` files are also left out:
-# the copied database does not have their statements yet.
+# the copied database does not have their changes yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
 _LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, recorded messages
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT

@@ -18,8 +18,10 @@ import msgspec
 import pytest
 
 from appliance.store import ahead as ahead_module
+from appliance.store import writer_thread
 from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
-from appliance.store.changes import Change, ChangeError, Delete, Put, Tables
+from appliance.store.change_feed import ChangeFeed
+from appliance.store.changes import Change, ChangeError, Delete, Put, Tables, joined
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
@@ -420,6 +422,22 @@ def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> 
         query = "SELECT * FROM thing ORDER BY name"
         assert other.execute(query).fetchall() == database.query(query)
     database.close()
+
+
+def test_a_feed_that_begins_during_a_change_has_the_whole_change(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A large value, which is encoded for feeds only, is encoded then."""
+    feeds: list[ChangeFeed] = []
+
+    def late(changes: Sequence[tuple[Change, bool]]) -> Iterator[tuple[Change, bool]]:
+        yield from joined(changes)
+        feeds.append(database.follow(lambda: None, 1 << 20))
+
+    monkeypatch.setattr(writer_thread, "joined", late)
+    database.put("thing", "large", 1, ahead=False)
+    changes = feeds[0].after(0, 1 << 20)
+    assert changes == [Encoded(1, msgspec.msgpack.encode(Put("thing", [("large", 1)])))]
 
 
 def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tmp_path: Path) -> None:
