@@ -153,13 +153,15 @@ byte shown[2];                 /* the epoch under which the trace shows the appl
 
 /* --- an appliance ----------------------------------------------------------------------------------------- */
 
+/* = appliance/standby/lease.py ApplianceLease._learn */
 inline make_passive(x) {
     leads[x] = false;
     leased[x] = false; trusted[x] = false; offered[x] = false;
     partner[x] = false; writing[x] = false; synced[x] = false
 }
 
-/* It hears of a later epoch. */
+/* It hears of a later epoch.
+ = appliance/standby/lease.py ApplianceLease.follow */
 inline hear_epoch(x, e) {
     if
     :: e > term[x] -> term[x] = e
@@ -167,7 +169,8 @@ inline hear_epoch(x, e) {
     fi
 }
 
-/* It has an answer that it holds the lease. */
+/* It has an answer that it holds the lease.
+ = appliance/standby/lease.py ApplianceLease.answered */
 inline hold(x, e, other_in_sync) {
     leads[x] = true; leased[x] = true;
     term[x] = e; partner[x] = other_in_sync
@@ -179,6 +182,7 @@ inline copy_from(x) {
     term[OTHER(x)] = term[x]
 }
 
+/* = appliance/standby/lease.py ApplianceLease.received */
 inline give_promise(x) {
     promise[OTHER(x)] = true; offered[x] = true;
     term[OTHER(x)] = term[x]
@@ -195,6 +199,7 @@ inline give_promise(x) {
 #define FOLLOWS(y, x) (up[y] && !leads[y] && term[y] <= term[x])
 #endif
 
+/* = appliance/standby/lease.py ApplianceLease.tick */
 proctype Appliance(byte me) POSSIBLE {
 end:
     do
@@ -307,7 +312,8 @@ inline answer_denied(x) {
     orphan[x] = false
 }
 
-/* R1: on disk. */
+/* R1: on disk.
+ = appliance/standby/witness.py Witness._claim */
 inline grant(x) {
 #ifndef MUTANT_SAME_EPOCH
     epoch++;
@@ -316,7 +322,8 @@ inline grant(x) {
     holder = x; running = true; granting = true
 }
 
-/* R1: in the firewall. */
+/* R1: in the firewall.
+ = appliance/standby/witness.py Witness._enforce */
 inline admit_holder() {
     granting = false;
 #ifdef MUTANT_NOT_FENCED
@@ -331,7 +338,8 @@ inline admit_holder() {
 #else
 #define MAY_REMOVE(x) (holder == x)
 #endif
-/* It admits the holder again, if the robot has rebooted. */
+/* It admits the holder again, if the robot has rebooted.
+ = appliance/standby/witness.py Witness._renew */
 inline renew(x) {
     running = true;
 #ifndef MUTANT_RENEWED_SHUT
@@ -339,6 +347,7 @@ inline renew(x) {
 #endif
 }
 
+/* = appliance/standby/witness.py Witness.handle */
 proctype Witness() POSSIBLE {
     byte x;
 end:

@@ -10,13 +10,15 @@ from tests.proofs import test_insertion_mutants, test_lease_mutants
 from tests.support.spin import INSERTION, LEASE, Model
 
 ROOT = INSERTION.path.parents[1]
-TEXT = INSERTION.path.read_text()
-NAMED = sorted(
-    set(re.findall(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", TEXT, re.MULTILINE))
-)
+_NAME = re.compile(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", re.MULTILINE)
 
 
-@pytest.mark.parametrize(("path", "name"), NAMED)
+def named(model: Model) -> list[tuple[str, str]]:
+    """Return the code that a model names: files, and functions in them."""
+    return sorted(set(_NAME.findall(model.path.read_text())))
+
+
+@pytest.mark.parametrize(("path", "name"), named(INSERTION) + named(LEASE))
 def test_the_model_names_existing_code(path: str, name: str) -> None:
     """The code that a step models exists under the name that the step gives."""
     inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
@@ -30,15 +32,21 @@ def test_the_model_names_existing_code(path: str, name: str) -> None:
         inside = found[0].body
 
 
-def test_every_process_names_what_it_models() -> None:
-    """Every process except the observer at rest names its code, before or inside the process, in a checked notation."""
-    parts = re.split(r"^proctype (\w+)", TEXT, flags=re.MULTILINE)
+@pytest.mark.parametrize(
+    ("model", "others"),
+    [(INSERTION, {"Rest"}), (LEASE, {"Time", "Faults", "Observer", "LastFault"})],
+    ids=["insertion", "lease"],
+)
+def test_every_process_names_what_it_models(model: Model, others: set[str]) -> None:
+    """Every process except `others` names its code, before or inside the process, in a checked notation."""
+    text = model.path.read_text()
+    parts = re.split(r"^proctype (\w+)", text, flags=re.MULTILINE)
     heads = [part.rpartition("\n}\n")[2] for part in parts[0:-1:2]]
     bodies = [part.partition("\n}\n")[0] for part in parts[2::2]]
     processes = dict(zip(parts[1::2], zip(heads, bodies, strict=True), strict=True))
     without = {name for name, texts in processes.items() if "= appliance/" not in "".join(texts)}
-    assert without == {"Rest"}
-    assert len(NAMED) == len(set(re.findall(r"= (appliance/\S+ \S+)", TEXT)))
+    assert without == others
+    assert len(named(model)) == len(set(re.findall(r"= (appliance/\S+ \S+)", text)))
 
 
 @pytest.mark.parametrize(
