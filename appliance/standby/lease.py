@@ -164,10 +164,10 @@ class ApplianceLease:
         if answer.epoch < self.epoch:
             return ()
         self._expired = answer.expired
-        if answer.holder != self._name:
-            self._learn(answer.epoch)
-            return ()
-        if not answer.ok:
+        if answer.holder != self._name or not answer.ok:
+            self._learn(
+                answer.epoch
+            )  # perhaps of a grant to this appliance whose answer was lost: it claims again
             return ()
         if request.operation == "claim" and answer.epoch > request.epoch:
             self.held = self.epoch = answer.epoch

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.lease_traces import lease_accepts
+from tests.unit.standby.simulation import History
 
 TAKEOVER = """\
 started witness
@@ -125,3 +126,11 @@ def test_a_line_that_is_not_an_event_is_an_error(tmp_path: Path, line: str, erro
     """The error names the line and says what is allowed."""
     with pytest.raises(ValueError, match=error):
         lease_accepts(tmp_path, [line])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_the_product_does_is_an_execution(seed: int, tmp_path: Path) -> None:
+    """The witness and the lease of the product leave a trace of the model in a random history of faults."""
+    events: list[str] = []
+    History(seed, on_event=events.append).run()
+    assert lease_accepts(tmp_path, events)

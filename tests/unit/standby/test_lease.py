@@ -166,6 +166,14 @@ def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
     assert lease.later(0.3).operations() == ["claim"]
 
 
+def test_a_grant_whose_answer_was_lost_is_claimed_again() -> None:
+    """The witness has a later epoch for this appliance than the appliance knows."""
+    lease = active_lease().later(0.3)
+    lease.answered(lease.request("renew"), ok=False, reason="a holds epoch 3", epoch=3)
+    assert (lease.lease.epoch, lease.lease.held) == (3, None)
+    assert lease.later(0.3).operations() == ["claim"]
+
+
 def test_a_smaller_epoch_is_ignored() -> None:
     """A witness that lost its lease grants nothing."""
     lease = Lease(epoch=9).later(EXPIRY)
