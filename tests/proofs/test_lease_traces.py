@@ -129,7 +129,7 @@ def test_a_line_that_is_not_an_event_is_an_error(tmp_path: Path, line: str, erro
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_what_the_product_does_is_an_execution(seed: int, tmp_path: Path) -> None:
+def test_a_history_of_the_product_is_an_execution(seed: int, tmp_path: Path) -> None:
     """The witness and the lease of the product leave a trace of the model in a random history of faults."""
     events: list[str] = []
     History(seed, on_event=events.append).run()

@@ -53,7 +53,7 @@ class Lease:
         full = {
             "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
         } | answer  # fmt: skip
-        return self.lease.answered(request, WitnessAnswer(**full))  # type: ignore[arg-type]
+        return self.lease.answered(request, WitnessAnswer(**full))  # type: ignore[arg-type]  # of several types
 
     def active(self) -> bool:
         """Whether it is active now."""
