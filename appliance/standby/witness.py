@@ -529,6 +529,7 @@ class LeaseFirewall:
         self._backend = backend
         self._run = run
         self._written = []  # type: List[str]
+        self._rules = 0
 
     def admit(self, name: str) -> None:
         """Admit one appliance, or none (""). Raises `WitnessError`."""
@@ -538,14 +539,22 @@ class LeaseFirewall:
         else:
             text = iptables_rules(self._settings, name, self._chains())
             self._run(["iptables-restore", "--noflush"], text)
+            self._rules = text.count("-A %s-" % _CHAINS)
         self._written = self._present()
 
     def intact(self) -> bool:
-        """Whether the rules are still those that were written; a removed table cannot be listed."""
+        """Whether the rules are still those that were written; a removed table cannot be listed.
+
+        Another program may have changed them before they were read for the first time. So the jumps, which must be
+        first, and the number of rules are compared with what was written.
+        """
         try:
-            return self._written == self._present()
+            present = self._present()
         except WitnessError:
             return False
+        jumps = ["-A %s -j %s-%s" % (chain, _CHAINS, name) for _, rows in _JUMPS for chain, name in rows]
+        whole = present[: len(jumps)] == jumps and len(present) == len(jumps) + self._rules
+        return present == self._written and (whole or self._backend == "nft")
 
     def remove(self) -> None:
         """Remove all rules. Raises `WitnessError`."""

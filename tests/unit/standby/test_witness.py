@@ -18,10 +18,12 @@ from appliance.standby.witness import (
     AppliancePeer,
     BoundedLog,
     LeaseFile,
+    LeaseFirewall,
     LeaseRecord,
     Witness,
     WitnessError,
     WitnessGate,
+    WitnessSettings,
     chosen_backend,
     main,
     seal,
@@ -475,3 +477,14 @@ def test_it_imports_only_the_standard_library() -> None:
         )
     }
     assert imported <= sys.stdlib_module_names
+
+
+def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -> None:
+    """Another program flushes the filter between our change and our reading of it."""
+    settings = WitnessSettings(
+        ("10.0.0.1", 7411), "10.0.0.100", ("11311",),
+        {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease",
+    )  # fmt: skip
+    firewall = LeaseFirewall(settings, "iptables", lambda _command, _text: "*filter\nCOMMIT\n")
+    firewall.admit("a")
+    assert not firewall.intact()
