@@ -157,7 +157,7 @@ def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
 
 
 def test_rosmaster_killed_with_a_full_queue(working: Field) -> None:
-    """Calls are answered until a thousand changes wait for the ROS master; a new ROS master gets all of them."""
+    """Calls are answered until the host's share of changes waits for the ROS master; a new one gets all of them."""
     wanted = [f"/full/topic_{number}" for number in range(1600)]
     rosmaster = working.appliance.pids("rosmaster")[0]
     answers: list[Any] = []
@@ -174,7 +174,7 @@ def test_rosmaster_killed_with_a_full_queue(working: Field) -> None:
         registering = threading.Thread(target=working.robot.run, args=(register,), daemon=True)
         os.kill(rosmaster, signal.SIGSTOP)
         registering.start()
-        eventually(lambda: len(answers) >= 1000, "a thousand calls are answered")
+        eventually(lambda: len(answers) >= 500, "five hundred calls are answered")
         assert registering.is_alive()
         os.kill(rosmaster, signal.SIGKILL)
         registering.join(LIMIT)
