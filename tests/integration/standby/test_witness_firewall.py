@@ -28,7 +28,7 @@ ROBOT, FIXED = "10.77.0.10", "10.77.0.100"
 ADDRESSES = {"a": "10.77.0.2", "b": "10.77.0.3"}
 KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
 MASTER, NODE, WITNESS = 11311, 40000, 7411
-AT_ONCE = 2.0  # seconds; a hanging connection would last for hours
+AT_ONCE = LIMIT  # seconds; a hanging connection would last for hours
 BACKENDS = ("nft", "iptables-nft", "iptables-legacy")
 
 
@@ -146,7 +146,7 @@ class Site:
         """Whether a connection is refused at once; one that begins while rules change may get no answer."""
         begun = time.monotonic()
         try:
-            self.connect(host, address, port, 2 * AT_ONCE).close()
+            self.connect(host, address, port, LIMIT / 3).close()
         except ConnectionRefusedError:
             return time.monotonic() - begun < AT_ONCE
         except TimeoutError:
