@@ -223,7 +223,7 @@ class ReplicationSender:
                 position is None
                 or changes is None
                 or sum(len(change.body) for change in changes) > LARGEST_FRAME - _OVERHEAD
-            ):  # in the snapshot, a smaller value may have replaced one that is too large
+            ):  # a snapshot has only the latest values, so a value that was too large may be gone
                 position = await self._send_snapshot(link)
                 continue
             bodies = [msgspec.Raw(change.body) for change in changes]

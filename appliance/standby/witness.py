@@ -328,7 +328,7 @@ class WitnessGate:
         self.rejected = 0
 
     def answer(self, datagram: bytes, address: str) -> Optional[bytes]:
-        """Return the answer to a datagram from `address`, or None for one that is not authenticated."""
+        """Return the answer to a datagram from `address`, or None if the datagram is not authenticated."""
         name = name_in(datagram)
         appliance = self._appliances.get(name)
         body = None

@@ -100,7 +100,7 @@ async def test_a_cancelled_task_ends(busy: bool, time: ProcessorTime) -> None:
 
 
 async def test_a_task_may_refuse_a_cancellation(time: ProcessorTime) -> None:
-    """A coroutine that catches the cancellation goes on; one that cancels itself ends at its next wait."""
+    """A coroutine may catch its cancellation and continue. A coroutine that cancels itself ends at its next wait."""
 
     async def refuses() -> str:
         try:

@@ -290,7 +290,7 @@ def test_a_new_appliance_learns_nonce_and_number() -> None:
 
 
 def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
-    """An answer of an earlier process, one that came twice, and damaged ones."""
+    """Answers to an earlier process, repeated answers and damaged answers are ignored."""
     robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
     channel, restarted = WitnessChannel("a", KEYS["a"], "one"), WitnessChannel("a", KEYS["a"], "two")
     exchanged(channel, robot, claim)

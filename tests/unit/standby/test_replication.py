@@ -334,7 +334,7 @@ async def test_a_caller_who_waits_learns_of_the_end(tmp_path: Path) -> None:
 async def test_an_appliance_that_reads_nothing_does_not_hold_the_link(
     monkeypatch: pytest.MonkeyPatch, *, receiving: bool
 ) -> None:
-    """Neither does one that writes nothing."""
+    """The link also ends if the peer sends nothing."""
     monkeypatch.setattr(replication_frames, "_WRITE_SECONDS", 0.1)
     reader, other, writer = await pair_of_links()
     link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
