@@ -449,6 +449,17 @@ def test_traffic_is_reported_once() -> None:
     assert story.topic.traffic() is None
 
 
+def test_delays_of_a_later_turn_are_reported_without_new_messages() -> None:
+    """The frames that monitors left were counted when they arrived, and their delays are counted when they pass."""
+    story = Story()
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(b"1"))
+    story.topic.traffic()
+    story.topic.go_on(batch(b"3"), story.now)
+    assert story.topic.traffic() == TopicTraffic("k", "/chatter", 0, 0, 0, 1, [1] + [0] * 10, 0.0, "m")
+
+
 def test_a_withdrawn_topic_cuts_served_and_waiting_subscribers() -> None:
     """Each subscriber is cut with the reason."""
     story = Story()
