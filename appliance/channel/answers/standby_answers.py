@@ -1,0 +1,50 @@
+"""The state of an appliance that is one of two (docs/standby.md)."""
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from appliance.channel.answers.field_docs import Moment, doc
+
+
+class OtherAppliance(msgspec.Struct, frozen=True):
+    """The other appliance, as this one sees it."""
+
+    name: str
+    address: str
+    connected: Annotated[bool, doc("whether the replication between both is open")]
+    in_sync: Annotated[bool, doc("whether it has all acknowledged changes, so that it may take over")]
+    behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
+    behind_bytes: Annotated[int, doc("bytes of these changes that are kept in memory")]
+    waiting_seconds: Annotated[float | None, doc("age of the oldest answer that waits for it; null: none waits")]
+    reason: Annotated[str, doc("why the last replication ended; empty: it is open, or never began")]
+
+
+class WitnessSeen(msgspec.Struct, frozen=True):
+    """The witness on the robot, as this appliance sees it."""
+
+    address: str
+    answered_seconds: Annotated[float | None, doc("seconds since its last answer; null: it never answered")]
+    holder: Annotated[str, doc("the appliance that has the lease; empty: none yet")]
+    refusal: Annotated[str, doc("why it refused the last request; empty: it did not")]
+
+
+class StandbyState(msgspec.Struct, frozen=True):
+    """The state of two appliances, of which one is active."""
+
+    name: Annotated[str, doc("this appliance")]
+    address: str
+    role: Annotated[
+        Literal["active", "standby"],
+        doc("active: the robot's nodes use this appliance; standby: it is ready to take over, or catches up"),
+    ]
+    epoch: Annotated[int, doc("number of the takeover that this appliance knows last")]
+    since: Annotated[Moment, doc("when it took its role")]
+    fixed: Annotated[str, doc("the address at which the robot's nodes reach the active appliance")]
+    wait: Annotated[
+        Literal["standby", "none"],
+        doc("whether an answer to a node waits until the other appliance has stored the change"),
+    ]
+    answers_alone: Annotated[bool, doc("active: the other appliance is not in sync, so no answer waits for it")]
+    other: OtherAppliance
+    witness: WitnessSeen

@@ -1,0 +1,80 @@
+"""The file that makes an appliance one of two: names, addresses and keys. `rosrv standby join` writes it."""
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from appliance.base.atomic_files import write_whole
+
+FOLDER = "standby"
+FILE = "membership.json"
+PORT = 7412
+"""The default port of both appliances: promises (UDP) and replication (TCP)."""
+
+_Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
+_Key = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+_Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
+
+
+class MembershipError(ValueError):
+    """A membership that cannot be used; the text names the file and the reason."""
+
+
+class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """This appliance, the other one, and the witness on the robot.
+
+    `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see them. `fixed`
+    is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal) authenticate datagrams
+    to the witness and to the other appliance; the certificates (PEM) and the key (PEM) are those of the replication.
+    """
+
+    name: _Name
+    other: _Name
+    address: str
+    other_address: str
+    fixed: str
+    witness: str
+    witness_port: _Port
+    port: _Port = PORT
+    witness_key: _Key
+    peer_key: _Key
+    certificate: str
+    key: str
+    other_certificate: str
+
+    def __post_init__(self) -> None:
+        for text in (self.address, self.other_address, self.fixed, self.witness):
+            address = ipaddress.IPv4Address(text)
+            if address.is_unspecified or address.is_multicast or address.is_loopback:
+                raise ValueError(f"{text} cannot be an address of the robot's network")
+        if self.name == self.other or len({self.address, self.other_address, self.fixed, self.witness}) != 4:
+            raise ValueError(
+                "the two names must differ, and both appliances, the robot and the fixed address need an address each"
+            )
+        if self.witness_key == self.peer_key:
+            raise ValueError("the key of the witness and the key of the other appliance must differ")
+
+
+def path_of(state: Path) -> Path:
+    """Return the path of the membership in a state directory."""
+    return state / FOLDER / FILE
+
+
+def load_membership(path: Path) -> Membership | None:
+    """Return the membership in a file; None if the file is missing. Raises `MembershipError` and `OSError`."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Membership)
+    except FileNotFoundError:
+        return None
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise MembershipError(
+            f"{path} cannot be used: {error}; run `rosrv standby join` again, or `rosrv standby leave`"
+        ) from error
+
+
+def save_membership(path: Path, membership: Membership) -> None:
+    """Write the membership, readable by the file's owner only. Raises `OSError`."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    write_whole(path, msgspec.json.format(msgspec.json.encode(membership)), 0o600)
