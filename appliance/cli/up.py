@@ -19,9 +19,10 @@ from appliance.cli.up_inputs import read_inputs
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings
 from appliance.control.robot import own_address
+from appliance.standby.membership import Membership, MembershipError, load_membership, path_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of
-from appliance.supervisor.run import run_appliance
+from appliance.supervisor.run import StandbyStart, run_appliance
 from appliance.supervisor.supervisor import ControlReady
 
 _MOST_WARNINGS = 10
@@ -101,16 +102,40 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
     node_ports = read_inputs(settings)
+    membership = _membership_in(settings.state)
     run_appliance(
         settings,
         roles_of(
             api=settings.api_address is not None,
             syslog=settings.audit.syslog.to is not None,
             recorder=settings.recorder.enabled,
+            lease=membership is not None,
         ),
         partial(_announce, as_json=as_json),
         node_ports=node_ports,
+        standby=membership
+        and StandbyStart(membership, partial(_announce_standby, membership, as_json=as_json)),
     )
+
+
+def _membership_in(state: Path) -> Membership | None:
+    """Return the membership of an appliance that is one of two. Raises `StartError` if it cannot be used."""
+    try:
+        return load_membership(path_of(state))
+    except (MembershipError, OSError) as error:
+        raise StartError(str(error)) from error
+
+
+def _announce_standby(membership: Membership, *, as_json: bool) -> None:
+    """Print that this appliance could take over."""
+    event = {"event": "standby", "name": membership.name, "other": membership.other}
+    text = (
+        f"This appliance ({membership.name}) is ready to be active, or to take over from {membership.other}"
+        f" ({membership.other_address}): rosrv standby status"
+    )
+    with contextlib.suppress(OSError):
+        sys.stdout.write(f"{json.dumps(event) if as_json else text}\n")
+        sys.stdout.flush()
 
 
 def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:

@@ -68,6 +68,7 @@ class IsolationSettings:
     """The appliance's namespace, and the ports forwarded to it."""
 
     ports: tuple[PortRange, ...]  # TCP
+    datagrams: tuple[PortRange, ...] = ()  # UDP
     name: str = "rosrv"
     directory: Path = Path("/run/rosrv")  # for the record and the lock; shared by all appliances of a host
 
@@ -393,7 +394,7 @@ def isolation_rules(
             rules.append(no_router(f"the host is no IPv{family} router", PacketVerdict.DROP))
         rules += [_loopback(family, inward), *_true_sources(family, end, inward)]
         rules += [_forward("TCP", ports, end, outward) for ports in settings.ports]
-        rules += [_forward("UDP", ports, end, outward) for ports in udp]
+        rules += [_forward("UDP", ports, end, outward) for ports in (*settings.datagrams, *udp)]
         masqueraded = partial(PacketRule, chain=Chain.SOURCE_NAT, source=end.network, leaves_on=outward)
         rules.append(masqueraded(f"the appliance's own connections, IPv{family}", PacketVerdict.MASQUERADE))
     return tuple(rules)

@@ -104,13 +104,23 @@ class ApplianceLease:
         self._sequence = 0
         self._asked: dict[int, float] = {}
         self._number = 0
-        self._heard = now - EXPIRY
+        self._started = self._heard = now - EXPIRY
         self._expired = False
         self._last_add = 0
         # A switchover: requests and promises up to these numbers no longer make this appliance active.
         self._switching_until: float | None = None
         self._released = False
         self._void_sequence = self._void_number = 0
+
+    @property
+    def valid_until(self) -> float:
+        """Return the time to which this appliance stays active if no further answer arrives."""
+        return self._valid_until
+
+    @property
+    def heard(self) -> float | None:
+        """Return the time of the last request of this appliance that the other one answered; None: no answer yet."""
+        return self._heard if self._heard > self._started else None
 
     def is_active(self, now: float) -> bool:
         """Whether this appliance may decide, relay and answer."""

@@ -10,11 +10,14 @@ from appliance.base.atomic_files import write_whole
 
 FOLDER = "standby"
 FILE = "membership.json"
+LEASE_FILE, LINK_FILE = "lease.json", "link.json"
+"""The parts of it that the supervisor writes for the process `lease` and for control."""
+
 PORT = 7412
 """The default port of both appliances: promises (UDP) and replication (TCP)."""
 
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
-_Key = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+_Key = Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?\Z")]
 _Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 
@@ -27,7 +30,8 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see them. `fixed`
     is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal) authenticate datagrams
-    to the witness and to the other appliance; the certificates (PEM) and the key (PEM) are those of the replication.
+    to the witness and to the other appliance; the certificates (PEM) and the key (PEM) are those of the replication. A
+    process gets only the secrets that it needs; the others are empty.
     """
 
     name: _Name
@@ -53,8 +57,16 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             raise ValueError(
                 "the two names must differ, and both appliances, the robot and the fixed address need an address each"
             )
-        if self.witness_key == self.peer_key:
+        if self.witness_key and self.witness_key == self.peer_key:
             raise ValueError("the key of the witness and the key of the other appliance must differ")
+
+    def for_lease(self) -> "Membership":
+        """Return the membership with the secrets of the lease only."""
+        return msgspec.structs.replace(self, certificate="", key="", other_certificate="")
+
+    def for_control(self) -> "Membership":
+        """Return the membership with the secrets of the replication only."""
+        return msgspec.structs.replace(self, witness_key="", peer_key="")
 
 
 def path_of(state: Path) -> Path:
@@ -74,7 +86,7 @@ def load_membership(path: Path) -> Membership | None:
         ) from error
 
 
-def save_membership(path: Path, membership: Membership) -> None:
-    """Write the membership, readable by the file's owner only. Raises `OSError`."""
+def save_membership(path: Path, membership: Membership, owner: tuple[int, int] | None = None) -> None:
+    """Write the membership, readable by its owner (user id, group id) only. Raises `OSError`."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    write_whole(path, msgspec.json.format(msgspec.json.encode(membership)), 0o600)
+    write_whole(path, msgspec.json.format(msgspec.json.encode(membership)), 0o600, owner)

@@ -7,7 +7,9 @@ are sent rather than the database file, because the standby must not have to tru
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
 2. While the standby is away, at most `room` bytes of changes are kept. Making changes never waits for the standby:
    whether an answer does is the caller's decision (`acknowledged`).
-3. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
+3. While the appliance answers alone (`answer_alone`), `acknowledged` does not wait. This ends once the standby has all
+   changes.
+4. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
 """
 
 import asyncio
@@ -87,21 +89,31 @@ class ReplicationSender:
         self._reason = ""
         self._link: asyncio.Task[None] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
+        self.alone = False
 
     async def acknowledged(self, number: int) -> None:
         """Wait until this appliance and the standby have all changes up to this number on their disks.
 
-        While the standby is away, this waits until it is back. Raises `StoreError` if this appliance cannot write, and
-        `ReplicationError` when the sender is closed.
+        While the standby is away, this waits until it is back, or until this appliance answers alone. Raises
+        `StoreError` if this appliance cannot write, and `ReplicationError` when the sender is closed.
         """
+        if self.alone:
+            return
         await self._database.settled()
-        if number > self._acknowledged:
+        if number > self._acknowledged and not self.alone:
             waiter = self._loop.create_future()
             self._waiting[waiter] = (number, self._loop.time())
             try:
                 await waiter
             finally:
                 del self._waiting[waiter]
+
+    def answer_alone(self) -> None:
+        """Answer without the standby until it has all changes: the witness has removed it from the in-sync set."""
+        self.alone = True
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_result(None)
 
     def lag(self) -> ReplicationLag:
         """Return how far the standby is behind."""
@@ -211,6 +223,7 @@ class ReplicationSender:
             )
         self._acknowledged = stored.number
         self._feed.release(stored.number)
+        self.alone = self.alone and stored.number < self._database.number
         for waiter, (number, _since) in self._waiting.items():
             if number <= stored.number and not waiter.done():
                 waiter.set_result(None)

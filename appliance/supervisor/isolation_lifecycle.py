@@ -33,6 +33,7 @@ from appliance.network.firewall.firewall_rules import (
     ForwarderAccess,
     OwnNodeAccess,
     PortRange,
+    StandbyAccess,
 )
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import (
@@ -65,6 +66,7 @@ class AppliancePorts:
     api: int | None = None  # None: there is no REST
     api_networks: tuple[str, ...] = ()  # networks that may connect to REST; this machine always may
     own: int | None = None  # the port of the own node's master
+    standby: StandbyAccess | None = None  # on one of two appliances
     syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
 
 
@@ -299,6 +301,7 @@ class ContainerIsolation(NoIsolation):
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarder=self._forwarder(),
+            standby=self._ports.standby,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
             else None,
@@ -335,7 +338,13 @@ class NetnsIsolation(ContainerIsolation):
         forwarded = [PortRange.one(ports.master), nodes]
         if ports.api is not None:
             forwarded.append(PortRange.one(ports.api))
-        self._isolation = isolation or Isolation(Namespace.own(), IsolationSettings(ports=tuple(forwarded)))
+        datagrams: tuple[PortRange, ...] = ()
+        if ports.standby is not None:
+            datagrams = (PortRange.one(ports.standby.port),)
+            forwarded += datagrams
+        self._isolation = isolation or Isolation(
+            Namespace.own(), IsolationSettings(ports=tuple(forwarded), datagrams=datagrams)
+        )
         self._namespace = self._isolation.namespace
         self._others: dict[str, list[str]] = {}  # the last logged rules of other programs
 

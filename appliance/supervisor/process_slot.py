@@ -30,6 +30,7 @@ class ProcessSlot:
     short_runs: int = 0  # number of short runs in a row
     due: asyncio.TimerHandle | None = None
     wanted: bool = False  # for a role on demand: requested again since its last start
+    pardoned: bool = False  # the supervisor ends this process because the appliance is not active any more
     since: str = ""  # time of the last start
     reason: str = ""  # why the last run ended, in the process's own words if it sent any
     output: tuple[str, ...] = ()  # the last output lines of its program
@@ -58,7 +59,7 @@ class ProcessSlot:
         self.process = None
         self.since = process.since
         lived = time.monotonic() - process.started
-        self.short_runs = self.short_runs + 1 if lived < STABLE_SECONDS else 0
+        self.short_runs = self.short_runs + 1 if lived < STABLE_SECONDS and not self.pardoned else 0
         return lived
 
     def recovers(self) -> bool:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from appliance.base.shipped import DPKG
+from appliance.standby.membership import LEASE_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
 from appliance.supervisor.sandbox.folders import executables_of, folders_of
@@ -41,6 +42,10 @@ class Facts:
         """Return the part of the state directory with this name."""
         return self.state / name
 
+    def run(self, name: str) -> Path:
+        """Return a file that the supervisor writes for the other processes."""
+        return self.config.with_name(name)
+
 
 @dataclass(frozen=True)
 class ExternalProgram:
@@ -55,8 +60,9 @@ class Role:
     """One row of the table.
 
     Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
-    be ready first. `listens`: each process of the role gets the listening socket that the supervisor keeps for it.
-    `on_demand`: the role starts when control requests it, and does not restart after exit status 0.
+    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `listens`: each process
+    of the role gets the listening socket that the supervisor keeps for it. `on_demand`: the role starts when control
+    requests it, and does not restart after exit status 0.
 
     Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
     `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
@@ -83,6 +89,7 @@ class Role:
     asks: bool = False
     after: str | None = None
     outlives_control: bool = False
+    outlives_takeover: bool = False
     files: int = 1024
     readable_by: str | None = None
     listens: bool = False
@@ -119,6 +126,11 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
 _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
 ROLES = (
     Role(
+        "lease", "rosrv-lease", "lease", "appliance.standby.process:main",
+        path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True,
+        sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
+    ),
+    Role(
         "rosmaster", "rosmaster", "rosmaster",
         program=lambda facts: ExternalProgram(
             (str(SYSTEM_PYTHON), "-s", str(ROSMASTER), "--core", "-p", str(facts.rosmaster_port)),
@@ -135,6 +147,7 @@ ROLES = (
     _ours(
         "signer", "rosrv-signer", "signer", "appliance.ipsec.signer:main",
         secret=lambda facts: facts.ca_passphrase_file, network=False, outlives_control=True,
+        outlives_takeover=True,
     ),
     _ours(
         "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
@@ -144,7 +157,7 @@ ROLES = (
     _ours(
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
-        links=("relay", "signer", "compiler", "api", "charon", "syslog", "recorder"),
+        links=("relay", "signer", "compiler", "api", "charon", "syslog", "recorder", "lease"),
         readable_by="rosrv-api",
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, families=ROUTES, reads=(*folders_of(*facts.control_reads), str(DPKG)), binds=None,
@@ -207,10 +220,12 @@ ROLES = (
 """The roles in the order of their start."""
 
 
-def roles_of(*, api: bool = True, syslog: bool = False, recorder: bool = False) -> tuple[Role, ...]:
+def roles_of(
+    *, api: bool = True, syslog: bool = False, recorder: bool = False, lease: bool = False
+) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
-    wanted = {"api": api, "syslog": syslog, "recorder": recorder}
+    wanted = {"api": api, "syslog": syslog, "recorder": recorder, "lease": lease}
     return tuple(role for role in ROLES if wanted.get(role.name, True))
 
 

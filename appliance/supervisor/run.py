@@ -7,13 +7,16 @@ import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
 from appliance.network.close_ports import local_port_range
+from appliance.network.firewall.firewall_rules import StandbyAccess
 from appliance.network.firewall.iptables import load_modules
+from appliance.standby.membership import Membership
 from appliance.supervisor import signals
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
@@ -34,16 +37,25 @@ _FILES = 65_536  # open files: each kept socket counts twice while it is sent to
 log = structlog.get_logger()
 
 
+class StandbyStart(NamedTuple):
+    """The start of one of two appliances; `announce` is called once, when this appliance could take over."""
+
+    membership: Membership
+    announce: Callable[[], None]
+
+
 def run_appliance(
     settings: Settings,
     roles: tuple[Role, ...],
     ready: Callable[[ControlReady, Settings], None],
     *,
     node_ports: range,
+    standby: StandbyStart | None = None,
 ) -> None:
     """Run the appliance until it is stopped. Raises `StartError` if it cannot start or go on.
 
     `ready` is called once, when nodes may connect; it gets control's message and the settings with all ports chosen.
+    With `standby` the appliance is one of two.
     `node_ports` is the policy's `[Ports] range`: the firewall limits connections to it, and `netns` forwards it.
     """
     if settings.isolation == "none":
@@ -67,7 +79,7 @@ def run_appliance(
     drop_unused_capabilities()
     refuse_half_restored(settings.state)
     with signals.held():
-        _run(settings, roles, ready, node_ports)
+        _run(settings, roles, ready, node_ports, standby)
 
 
 def _run(
@@ -75,6 +87,7 @@ def _run(
     roles: tuple[Role, ...],
     ready: Callable[[ControlReady, Settings], None],
     node_ports: range,
+    standby: StandbyStart | None,
 ) -> None:
     """Lock the state directory, run the appliance, and clean up even if signals arrive."""
     manager = ServiceManager.of(os.environ)
@@ -91,14 +104,26 @@ def _run(
             api_networks=tuple(str(network) for network in settings.api_networks),
             syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
+            standby=_standby_access(standby.membership) if standby is not None else None,
         )
         isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
         state.write_config(json.dumps(plain(settings)))
+        if standby is not None:
+            state.write_membership(standby.membership)
         raise_file_limit(_FILES)
         isolation.build()
         try:
-            _supervise(settings, roles, state, isolation, ready, manager=manager, rosout_ports=ports.own_node)
+            _supervise(
+                settings,
+                roles,
+                state,
+                isolation,
+                ready,
+                manager=manager,
+                rosout_ports=ports.own_node,
+                stands_by=standby.announce if standby is not None else None,
+            )
         finally:
             isolation.remove()
     finally:
@@ -115,6 +140,10 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
         [node_ports, range(chosen.first, chosen.last + 1), *(range(port, port + 1) for port in taken)],
         _UNPRIVILEGED,
     )
+
+
+def _standby_access(membership: Membership) -> StandbyAccess:
+    return StandbyAccess(membership.other_address, membership.witness, membership.port)
 
 
 def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
@@ -184,6 +213,7 @@ def _supervise(
     *,
     manager: ServiceManager,
     rosout_ports: range,
+    stands_by: Callable[[], None] | None,
 ) -> None:
     with isolation.inside():
         require_free(*settings.listen_address)
@@ -195,6 +225,11 @@ def _supervise(
     def say_ready(said: ControlReady) -> None:
         ready(said, settings)
         manager.ready(f"nodes may connect: ROS_MASTER_URI={said.master}")
+
+    def say_standing_by() -> None:
+        if stands_by is not None:
+            stands_by()
+        manager.ready("ready to take over: rosrv standby status")
 
     async def supervise() -> None:
         supervisor = Supervisor(
@@ -216,6 +251,7 @@ def _supervise(
             listeners={"api": api} if api is not None else {},
             rings=RecorderRings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
             memory=MonitorMemory(state.path, settings.relays),
+            stands_by=say_standing_by if stands_by is not None else None,
         )
         async with manager.watched():
             try:

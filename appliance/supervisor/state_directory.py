@@ -21,6 +21,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
+from appliance.standby.membership import LEASE_FILE, LINK_FILE, Membership, path_of, save_membership
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.users import account_of
@@ -40,7 +41,7 @@ def foreign(path: Path) -> str | None:
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
-    if not found or _has_lock(path) or (path / _RESTORED).is_file():
+    if not found or _has_lock(path) or (path / _RESTORED).is_file() or path_of(path).is_file():
         return None
     more = " …" if len(found) > _SHOWN else ""
     return f"{path} is not the state directory of an appliance: it contains {', '.join(found[:_SHOWN])}{more}"
@@ -115,6 +116,16 @@ class StateDirectory:
         """Write the configuration for the children."""
         write_whole(self.config, text.encode(), 0o644)
 
+    def write_membership(self, membership: Membership) -> None:
+        """Write the membership for the two processes that need it, each with its secrets."""
+        for name, user, part in (
+            (LEASE_FILE, "rosrv-lease", membership.for_lease()),
+            (LINK_FILE, "rosrv", membership.for_control()),
+        ):
+            account = account_of(user)
+            owner = (account.uid, account.gid) if os.geteuid() == 0 else None
+            save_membership(self.config.with_name(name), part, owner)
+
     def open_admin_socket(self) -> socket.socket:
         """Return the listening socket for the other verbs; replace an old one."""
         path = self.path / ADMIN_SOCKET
@@ -136,7 +147,8 @@ class StateDirectory:
     def close(self) -> None:
         """Remove the files of a running appliance, and release the lock."""
         (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
-        self.config.unlink(missing_ok=True)
+        for name in (self.config.name, LEASE_FILE, LINK_FILE):
+            self.config.with_name(name).unlink(missing_ok=True)
         os.ftruncate(self._lock, 0)
         os.close(self._lock)
         self._lock = -1

@@ -8,7 +8,9 @@
    after at most a minute.
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
-5. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
+5. One of two appliances (docs/standby.md) is passive until the lease is held. When the lease ends, all processes that
+   serve the robot are killed and start again, passive: no state in memory is older than the next takeover.
+6. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
 import asyncio
@@ -33,6 +35,7 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
+from appliance.supervisor.lease_watch import LeaseWatch
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
@@ -72,6 +75,8 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.TunnelsWanted,
     messages.CompilerWanted,
 )
+_FROM_LEASE: tuple[type[messages.Message], ...] = (messages.LeaseHeld, messages.LeaseEnded)
+_FROM_ROLE = {"control": _FROM_CONTROL, "lease": _FROM_LEASE}
 
 log = structlog.get_logger()
 
@@ -103,9 +108,11 @@ class Supervisor:
         listeners: Mapping[str, socket.socket] | None = None,
         rings: RecorderRings | None = None,
         memory: MonitorMemory | None = None,
+        stands_by: Callable[[], None] | None = None,
     ) -> None:
         """Prepare the slots. `ready` is called once when nodes may connect; it may raise `StartError`.
 
+        `stands_by` is given on one of two appliances; it is called once when this appliance could take over.
         Control gets `admin`. `listeners` are the sockets of roles that listen; they stay open while a process restarts,
         so connections wait. `rings` is the memory of the flight recorder; None: nothing is recorded. `memory` keeps
         the state of monitors; None: the state is lost when relays die.
@@ -121,6 +128,11 @@ class Supervisor:
         self._memory = memory
         self._ready = ready
         self.is_ready = False
+        self._stands_by = stands_by
+        self._parked = False
+        self._lease = LeaseWatch(
+            member=stands_by is not None, activate=self._activate, passivate=self._passivate
+        )
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self._reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
@@ -203,7 +215,7 @@ class Supervisor:
             late = [slot for slot in self.slots if slot.is_late]
             words = ", ".join(slot.role.name for slot in late) or "the firewall around control's ports"
             waited = round(time.monotonic() - began)
-            if self.is_ready or self.stopping.is_set():
+            if self.is_ready or self._parked or self.stopping.is_set():
                 return
             if not self._gets_on(began, late):
                 self.stop(
@@ -224,7 +236,7 @@ class Supervisor:
         """Start the process of a slot; after a failure try again with growing delays."""
         slot.due = None
         slot.wanted = False
-        if self.stopping.is_set():
+        if self.stopping.is_set() or not self._may_start(slot):
             return
         here, there = socket.socketpair()
         try:
@@ -256,7 +268,13 @@ class Supervisor:
         self._link(slot)
         self._tell_processes()
 
+    def _may_start(self, slot: ProcessSlot) -> bool:
+        """Whether a role may run now: while this appliance is passive, those that follow control do not."""
+        return self._lease.active or slot.role.after is None
+
     def _equip_control(self, process: ProcessHandle) -> None:
+        if self._lease.member and self._lease.epoch is not None:
+            process.send(messages.Activated(self._lease.epoch))
         for name, descriptor in self.kept:
             process.send(messages.SocketRestored(name), (descriptor,))
         process.send(messages.SocketsRestored(len(self.kept), self.is_ready))
@@ -271,7 +289,7 @@ class Supervisor:
     # --- messages of children -----------------------------------------------------------------------------
 
     def _received(self, process: ProcessHandle, message: Any, descriptors: tuple[int, ...]) -> None:
-        allowed = _FROM_ANY + (_FROM_CONTROL if process.role == "control" else ())
+        allowed = _FROM_ANY + _FROM_ROLE.get(process.role, ())
         if not isinstance(message, allowed):
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -286,6 +304,10 @@ class Supervisor:
                 self._child_ready(process, detail)
             case messages.Failed(said, output):
                 self._cannot_serve(process, _printable(said), output)
+            case messages.LeaseHeld(until, epoch):
+                self._lease.held(until, epoch)
+            case messages.LeaseEnded():
+                self._lease.ended()
             case _:
                 self.control_said(process, message, descriptors)
 
@@ -371,6 +393,9 @@ class Supervisor:
             self._tell_processes()
         if process.role != "control":
             return
+        if detail.get("stands_by"):
+            self._note_parked()
+            return
         try:
             said = msgspec.convert(detail, ControlReady)
         except msgspec.ValidationError as error:
@@ -379,12 +404,40 @@ class Supervisor:
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
         self._spawn(self.control_ready(process, said))
 
+    # --- one of two appliances ----------------------------------------------------------------------------
+
+    def _note_parked(self) -> None:
+        """Announce once that this appliance could take over."""
+        if self._stands_by is not None and not self._parked:
+            self._parked = True
+            self._stands_by()
+
+    def _activate(self, epoch: int) -> None:
+        log.info("this appliance is active", epoch=epoch)
+        self._tell_control(messages.Activated(epoch))
+
+    def _passivate(self) -> None:
+        """End everything that serves the robot; each process starts again, passive."""
+        log.warning("this appliance is not active any more; its processes start again as a standby")
+        for name, _descriptor in self.kept:
+            if name != ADMIN:
+                self.kept.drop(name)
+        for slot in self.slots:
+            if slot.due is not None and not self._may_start(slot):
+                slot.due.cancel()
+                slot.due = None
+            if slot.process is not None and not slot.role.outlives_takeover:
+                slot.pardoned = True
+                slot.process.kill()
+
+    # --- readiness ----------------------------------------------------------------------------------------
+
     async def control_ready(self, process: ProcessHandle, said: ControlReady) -> None:
         """Close control's inner ports to other users, and announce that the appliance serves."""
         reason = await self._watchdog.control_ready(said.inner_port, said.own_port)
         if reason is not None and not self.is_ready:
             self.stop(reason)
-        if self.stopping.is_set() or not process.alive:
+        if self.stopping.is_set() or not process.alive or not self._lease.active:
             return
         for slot in self.slots:
             if slot.role.after == process.role and slot.is_free:
@@ -504,6 +557,11 @@ class Supervisor:
             return
         if slot.role.on_demand and code == 0:
             self._ended(slot)
+            return
+        if slot.pardoned:
+            slot.pardoned = False
+            if not slot.role.on_demand:
+                self.start(slot)
             return
         log.error(
             "process died", role=process.role, pid=process.pid, end=_end_of(code), lived=round(lived, 3)

@@ -20,6 +20,7 @@ NUMERIC_IDS = {
     "rosrv-rosout": 61018,
     "rosrv-recorder": 61019,
     "rosrv-compiler": 61020,
+    "rosrv-lease": 61021,
 }
 
 

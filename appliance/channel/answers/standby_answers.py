@@ -16,7 +16,9 @@ class OtherAppliance(msgspec.Struct, frozen=True):
     in_sync: Annotated[bool, doc("whether it has all acknowledged changes, so that it may take over")]
     behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
     behind_bytes: Annotated[int, doc("bytes of these changes that are kept in memory")]
-    waiting_seconds: Annotated[float | None, doc("age of the oldest answer that waits for it; null: none waits")]
+    waiting_seconds: Annotated[
+        float | None, doc("age of the oldest answer that waits for it; null: none waits")
+    ]
     reason: Annotated[str, doc("why the last replication ended; empty: it is open, or never began")]
 
 
@@ -45,6 +47,8 @@ class StandbyState(msgspec.Struct, frozen=True):
         Literal["standby", "none"],
         doc("whether an answer to a node waits until the other appliance has stored the change"),
     ]
-    answers_alone: Annotated[bool, doc("active: the other appliance is not in sync, so no answer waits for it")]
+    answers_alone: Annotated[
+        bool, doc("active: the other appliance is not in sync, so no answer waits for it")
+    ]
     other: OtherAppliance
     witness: WitnessSeen

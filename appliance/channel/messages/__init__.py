@@ -14,6 +14,7 @@ of operators: only the two ends of its link import that module.
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
 from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *
+from appliance.channel.messages.lease_link import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *
 from appliance.channel.messages.recorder_link import *

@@ -197,6 +197,26 @@ class StateGiven(Message):
     ended_at: int = 0
 
 
+class LeaseHeld(Message):
+    """The lease reports that this appliance is active until `until` (seconds of CLOCK_BOOTTIME), in this epoch.
+
+    If no later time follows, the supervisor ends all processes that serve the robot.
+    """
+
+    until: float
+    epoch: int
+
+
+class LeaseEnded(Message):
+    """The lease reports that this appliance is not active any more."""
+
+
+class Activated(Message):
+    """The supervisor tells control of one of two appliances that it is active, in this epoch of the lease."""
+
+    epoch: int
+
+
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
@@ -204,4 +224,5 @@ Lifeline = (
     | TunnelsWanted | TunnelsEnclosed
     | RingGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
+    | LeaseHeld | LeaseEnded | Activated
 )  # fmt: skip

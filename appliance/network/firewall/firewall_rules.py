@@ -226,6 +226,20 @@ class ForwarderAccess:
             raise ValueError(f"forwarder: {self.uid} is not a user id")
 
 
+@dataclass(frozen=True)
+class StandbyAccess:
+    """The other one of two appliances, the witness, and the port of both appliances (TCP and UDP)."""
+
+    other: str
+    witness: str
+    port: int
+
+    def __post_init__(self) -> None:
+        PortRange.one(self.port)
+        family_of(self.other)
+        family_of(self.witness)
+
+
 @dataclass(frozen=True, kw_only=True)
 class OwnNodeAccess:
     """Access to and from the appliance's own node (rosout).
@@ -273,6 +287,7 @@ class FirewallSettings:
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
     forwarder: ForwarderAccess | None = None
+    standby: StandbyAccess | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
     def __post_init__(self) -> None:
@@ -323,6 +338,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         *_rosmaster(settings),
         *_own_node(settings),
         *_forwarding(settings.forwarder),
+        *_standby(settings.standby),
         *_api(settings),
         *_rate_limits(settings),
         *_chosen_by_the_kernel(settings),
@@ -430,6 +446,23 @@ def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
             udp_ports=ports if forwarder.datagrams else None,
         ),
         sending("audit log's forwarder: no other user", PacketVerdict.DROP),
+    )
+
+
+def _standby(access: StandbyAccess | None) -> tuple[PacketRule, ...]:
+    """Let only the other appliance and the witness send to the port of replication (TCP) and lease (UDP)."""
+    if access is None:
+        return ()
+    port = PortRange.one(access.port)
+    datagrams = partial(PacketRule, chain=Chain.IN, arrives_on=OUTSIDE, udp_ports=port)
+    return (
+        _arriving(
+            "replication: the other appliance may", PacketVerdict.RETURN, source=access.other, tcp_ports=port
+        ),
+        _arriving("replication: no other host", PacketVerdict.RESET, tcp_ports=port),
+        datagrams("lease: the other appliance may", PacketVerdict.RETURN, source=access.other),
+        datagrams("lease: the witness may", PacketVerdict.RETURN, source=access.witness),
+        datagrams("lease: no other host", PacketVerdict.DROP),
     )
 
 

@@ -1,0 +1,230 @@
+"""Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
+
+The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
+the supervisor, which ends the processes that serve the robot when no further one arrives: so the appliance becomes
+passive also if this process hangs or dies. The greatest epoch is on the disk before it is used.
+"""
+
+import asyncio
+import contextlib
+import secrets
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.base.atomic_files import write_whole
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.standby.lease import (
+    SILENCE,
+    ApplianceLease,
+    LeaseError,
+    Outgoing,
+    WitnessAnswer,
+    WitnessRequest,
+)
+from appliance.standby.membership import Membership, load_membership
+from appliance.standby.peer_link import PeerChannel
+from appliance.standby.witness import HIGHEST
+from appliance.standby.witness_link import WitnessChannel
+
+_EPOCH = "epoch"
+_CONTROL_SECONDS = 1.0
+_LARGEST = 2048
+_BATCH = 64  # datagrams between two ticks
+
+_log = structlog.get_logger()
+
+
+def boot_time() -> float:
+    """Return the seconds since the boot; they also count while the machine sleeps."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def main(lifeline_fd: int, membership: Path) -> None:
+    """Keep the lease until the supervisor ends the process."""
+    found = load_membership(membership)
+    if found is None:
+        raise FileNotFoundError(f"{membership} is missing")
+    asyncio.run(LeaseProcess(found, lifeline_fd, Path.cwd() / _EPOCH).run())
+
+
+class LeaseProcess:
+    """The process; `epoch_file` has the greatest epoch of earlier processes."""
+
+    def __init__(self, membership: Membership, lifeline_fd: int, epoch_file: Path) -> None:
+        self._membership = membership
+        self._epoch_file = epoch_file
+        self._stored = _epoch_in(epoch_file)
+        session = secrets.token_hex(16)
+        own, other = membership.name, membership.other
+        self._lease = ApplianceLease(own, other, session, self._stored, boot_time())
+        self._witness = WitnessChannel(own, bytes.fromhex(membership.witness_key), session)
+        self._peer = PeerChannel(own, other, bytes.fromhex(membership.peer_key))
+        self._supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self._child = Child(
+            self._supervisor,
+            messages.LeaseLink,
+            said=self._control_said,
+            linked=self._control_linked,
+            lost=lambda _reason: self._control_linked(),
+        )
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._report = messages.ReplicationReported(0, False, None)
+        self._permission = 0
+        self._alone = False
+        self._held = 0.0
+        self._answer: WitnessAnswer | None = None
+        self._answered: float | None = None
+        self._told: messages.LeaseState | None = None
+        self._told_at = 0.0
+        self._wake = asyncio.Event()
+
+    async def run(self) -> None:
+        """Keep the lease. Raises `OSError` if the epoch cannot be stored: the appliance is then passive."""
+        self._socket.setblocking(False)
+        self._socket.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._socket.fileno(), self._readable)
+        self._child.attach(messages.Ready())
+        while not self._child.ended.is_set():
+            self._tick()
+            now = boot_time()
+            delay = max(0.005, min(self._lease.next_event(now) - now, _CONTROL_SECONDS))
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), delay)
+        loop.remove_reader(self._socket.fileno())
+        self._socket.close()
+
+    # --- the lease ---
+
+    def _tick(self) -> None:
+        lease, report, now = self._lease, self._report, boot_time()
+        current = report.permission == self._permission
+        waiting = report.waiting_since
+        if lease.answers_alone:
+            # Control waits for the standby again, but the standby is away again: no removal follows, so permit again.
+            overdue = current and waiting is not None and now - waiting > SILENCE
+            if overdue or not self._alone:
+                self._permission += 1
+                current = False
+        self._alone = lease.answers_alone
+        caught_up = current and report.caught_up
+        self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
+
+    def _after(self, due: Outgoing) -> None:
+        """Store the epoch, send what is due, and report the state."""
+        epoch = self._lease.epoch
+        if epoch > self._stored:
+            write_whole(self._epoch_file, f"{epoch}\n".encode(), 0o600)
+            self._stored = epoch
+        for message in due:
+            if isinstance(message, WitnessRequest):
+                self._send(
+                    self._witness.write(message), self._membership.witness, self._membership.witness_port
+                )
+            else:
+                self._send(self._peer.write(message), self._membership.other_address, self._membership.port)
+        self._tell_supervisor()
+        self._tell_control()
+
+    def _send(self, datagram: bytes, address: str, port: int) -> None:
+        with contextlib.suppress(OSError):  # no route at present; the lease asks again
+            self._socket.sendto(datagram, (address, port))
+
+    def _readable(self) -> None:
+        for _ in range(_BATCH):
+            try:
+                datagram, (address, _port) = self._socket.recvfrom(_LARGEST)
+            except BlockingIOError:
+                break
+            except OSError:
+                continue  # an earlier datagram was not delivered
+            self._received(datagram, address)
+        self._wake.set()
+
+    def _received(self, datagram: bytes, address: str) -> None:
+        if address == self._membership.witness:
+            found = self._witness.read(datagram)
+            if found is not None:
+                self._answered, self._answer = boot_time(), found[1]
+                self._after(self._lease.answered(*found))
+        elif address == self._membership.other_address:
+            message = self._peer.read(datagram)
+            if message is not None:
+                self._after(self._lease.received(boot_time(), message))
+
+    # --- supervisor and control ---
+
+    def _tell_supervisor(self) -> None:
+        lease, now = self._lease, boot_time()
+        until = lease.valid_until if lease.is_active(now) else 0.0
+        if until == self._held:
+            return
+        self._held = until
+        if lease.held is not None and until:
+            self._supervisor.send(messages.LeaseHeld(until, lease.held))
+        else:
+            self._supervisor.send(messages.LeaseEnded())
+
+    def _tell_control(self) -> None:
+        lease, now = self._lease, boot_time()
+        active = lease.is_active(now)
+        answer = self._answer
+        state = messages.LeaseState(
+            until=lease.valid_until if active else 0.0,
+            epoch=lease.epoch,
+            alone=active and self._alone,
+            permission=self._permission,
+            in_sync=answer is not None and self._membership.other in answer.in_sync,
+            holder=answer.holder if answer is not None else "",
+            refusal=lease.refusal,
+            answered=self._answered,
+            heard=lease.heard,
+        )
+        if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
+            self._told, self._told_at = state, now
+            self._child.tell(state)
+
+    def _control_linked(self) -> None:
+        """A new control waits for the standby until it gets a new permission."""
+        self._report = messages.ReplicationReported(self._permission, False, None)
+        self._told = None
+        self._wake.set()
+
+    def _control_said(self, message: Any) -> None:
+        match message:
+            case messages.ReplicationReported():
+                self._report = message
+            case messages.EpochSeen(epoch) if epoch <= HIGHEST:
+                self._lease.follow(epoch)
+            case messages.HandOverWanted():
+                self._hand_over()
+            case _:
+                _log.error("control sent a message that is not for the lease", message=type(message).__name__)
+        self._wake.set()
+
+    def _hand_over(self) -> None:
+        reason = ""
+        try:
+            due = self._lease.switch_over(boot_time())
+        except LeaseError as error:
+            reason, due = str(error), ()
+        self._child.tell(messages.HandOverAnswered(reason))
+        self._after(due)
+
+
+def _epoch_in(path: Path) -> int:
+    """Return the stored epoch; 0 if there is no file. Raises `ValueError` if it is damaged: then nothing is safe."""
+    try:
+        text = path.read_text("ascii").strip()
+    except FileNotFoundError:
+        return 0
+    if not text.isdecimal() or int(text) > HIGHEST:
+        raise ValueError(f"{path} does not contain an epoch; restore it from a backup, or join again")
+    return int(text)
