@@ -113,8 +113,9 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         ),
         partial(_announce, as_json=as_json),
         node_ports=node_ports,
-        standby=membership
-        and StandbyStart(membership, partial(_announce_standby, membership, as_json=as_json)),
+        standby=None
+        if membership is None
+        else StandbyStart(membership, partial(_announce_standby, membership, as_json=as_json)),
     )
 
 

@@ -4,24 +4,31 @@ import asyncio
 import contextlib
 import select
 import socket
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import structlog
 
 from appliance.base.withdrawal import awaited
 from appliance.channel import admin
-from appliance.control.administration import Administration
+from appliance.channel.admin import A
 
 _log = structlog.get_logger()
 _LINE_LIMIT = 16 << 20
 _OPERATOR = "operator"
 
 
+class RequestHandler(Protocol):
+    """The part of control that carries out requests."""
+
+    async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
+        """Carry out a request of `who`, and return the answer."""
+
+
 class AdminServer:
     """The server of the admin socket."""
 
-    def __init__(self, administration: Administration) -> None:
+    def __init__(self, administration: RequestHandler) -> None:
         self._administration = administration
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
 

@@ -201,5 +201,6 @@ def _make_calls(
         offload=offload,
         bulk=bulk_turns(base.quota_class),
         processor=base.listener_limits.time,
+        stored=base.replication.stored if base.replication is not None else None,
     )
     return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

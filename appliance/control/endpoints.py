@@ -106,6 +106,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
             base.lifeline.route_to if settings.isolation == "netns" else None,
             base.sockets[RVMASTER].getsockname()[0],
+            fixed=base.pair.membership.fixed if base.pair is not None else None,
+            tunnels=settings.ipsec.pool,
         ),
         recordings=recordings,
         relay=relay,

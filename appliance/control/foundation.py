@@ -4,7 +4,7 @@ import asyncio
 import socket
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import structlog
 
@@ -14,9 +14,11 @@ from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
 from appliance.configuration.settings import Settings
 from appliance.control.host_blocks import BlockTable
+from appliance.control.lease_client import LeaseClient
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.policies import Policies
 from appliance.control.quota_class import HostQuotaClass, charged_to
+from appliance.control.replication import Replication
 from appliance.control.robot import robot_addresses
 from appliance.control.signer_requests import SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
@@ -31,6 +33,7 @@ from appliance.quotas.table import AUDIT_RESERVE
 from appliance.recorder.recording_plan import RecordingPlan
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.standby.membership import Membership
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -62,11 +65,20 @@ class Current(Generic[T]):
         return self._values[0]
 
 
+class Pair(NamedTuple):
+    """On one of two appliances: the other one, the lease, and the epoch in which this one is active."""
+
+    membership: Membership
+    lease: LeaseClient
+    epoch: int
+
+
 @dataclass(frozen=True, slots=True)
 class Foundation:
     """The durable state, the policy and the listeners.
 
     `enforcement` gets its value later. `parameters_dirty` is set whenever the mirror of the parameters changes.
+    `pair` and `replication` exist on one of two appliances.
     """
 
     settings: Settings
@@ -88,6 +100,8 @@ class Foundation:
     sockets: Mapping[str, socket.socket]
     enforcement: Current[Enforcement]
     parameters_dirty: asyncio.Event
+    pair: Pair | None
+    replication: Replication | None
 
     def port(self, name: str) -> int:
         """Return the port of a listener."""
@@ -99,6 +113,7 @@ async def make_foundation(
     lifeline: ControlLifeline,
     compiler: SpecificationCompiler,
     tunnels: Current[Tunnels],
+    pair: Pair | None,
     *,
     restarted: bool,
 ) -> Foundation:
@@ -122,6 +137,7 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
+    replication = _make_replication(settings, pair, store)
     blocks = BlockTable.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
@@ -132,14 +148,14 @@ async def make_foundation(
         settings.policy,
         store,
         trail,
-        robot=robot_addresses(settings),
+        robot=robot_addresses(settings, pair.membership.witness if pair is not None else None),
         hosts=lambda: tunnels().addresses,
         blocks=lambda: blocks.reasons,
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,
     )
-    policies.start(restarted=restarted)
+    policies.start(restarted=restarted or pair is not None)
     registry = Registry()
     quota_class.set(HostQuotaClass(lambda: policies.current, registry.registrations_of))
     return Foundation(
@@ -162,6 +178,23 @@ async def make_foundation(
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
         parameters_dirty=asyncio.Event(),
+        pair=pair,
+        replication=replication,
+    )
+
+
+def _make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> Replication | None:
+    """Return the replication of one of two appliances, before the first change."""
+    if pair is None:
+        return None
+    store.note_whole_parameters()
+    return Replication(
+        pair.membership,
+        pair.lease,
+        store.database,
+        pair.epoch,
+        wait=settings.availability.wait,
+        folder=settings.state / "control",
     )
 
 

@@ -103,7 +103,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             blocks=blocks,
             evidence=EvidenceOrders(base.audit, trail),
         ),
-        durable=trail.durable,
+        durable=partial(_durable, base),
         require_room=base.store.database.require_room,
     )
     rest.set(
@@ -126,6 +126,13 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         administration=administration,
         rest=rest(),
     )
+
+
+async def _durable(base: Foundation) -> None:
+    """Wait until the records of an order are in the log, and on one of two appliances until its changes are stored."""
+    await base.trail.durable()
+    if base.replication is not None:
+        await base.replication.stored()
 
 
 def _audit_state(base: Foundation, forwarded: ForwarderLink) -> AuditState:

@@ -1,5 +1,7 @@
 """Run the control process: start its parts, serve until the supervisor stops the process, end the parts.
 
+On one of two appliances, control first stands by until the supervisor activates it (`passive.py`).
+
 The order of the start:
 
 1. Receive the listening sockets of an earlier control process.
@@ -24,8 +26,10 @@ from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
-from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, Pair, make_foundation
+from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
+from appliance.control.passive import stand_by
 from appliance.control.policies import PolicyRefusedError
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import SpareMemory
@@ -37,6 +41,7 @@ from appliance.master.graph.registry import Life
 from appliance.master.reconcile.enactor import restore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.standby.membership import LINK_FILE, MembershipError, load_membership
 from appliance.store.writer_thread import StoreError
 from roswire.uris import node_uri
 
@@ -56,20 +61,30 @@ def main(lifeline_fd: int, config_path: Path) -> None:
     # Limit how long the event loop waits for a thread (audit log, store, large values) that runs Python code.
     sys.setswitchinterval(_SWITCH_SECONDS)
     gc.set_threshold(_GARBAGE)
-    uvloop.run(_run(settings, lifeline_fd))
+    uvloop.run(_run(settings, lifeline_fd, config_path))
 
 
-async def _run(settings: Settings, lifeline_fd: int) -> None:
+async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     """Serve until stopped; report a failed start to the supervisor."""
-    stopping, tunnels = asyncio.Event(), Current[Tunnels]()
+    stopping, tunnels, lease = asyncio.Event(), Current[Tunnels](), LeaseClient()
     compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
     lifeline = ControlLifeline(
-        lifeline_fd, stopping, lambda answer: tunnels().answered(answer), compiler.attach
+        lifeline_fd, stopping, lambda answer: tunnels().answered(answer), compiler.attach, lease.attach
     )
     lifeline.attach()
     try:
-        control = await _start(settings, lifeline, compiler, tunnels)
-    except (PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, OSError) as error:
+        await lifeline.restored.wait()
+        membership = load_membership(config.with_name(LINK_FILE))
+        pair = None
+        if membership is not None:
+            epoch = await stand_by(settings, membership, lifeline, lease, stopping)
+            if epoch is None:
+                return
+            pair = Pair(membership, lease, epoch)
+        control = await _start(settings, lifeline, compiler, tunnels, pair)
+    except (
+        PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, MembershipError, OSError
+    ) as error:  # fmt: skip
         lifeline.say(messages.Failed(str(error)))
         await stopping.wait()
         return
@@ -78,15 +93,18 @@ async def _run(settings: Settings, lifeline_fd: int) -> None:
 
 
 async def _start(
-    settings: Settings, lifeline: ControlLifeline, compiler: SpecificationCompiler, tunnels: Current[Tunnels]
+    settings: Settings,
+    lifeline: ControlLifeline,
+    compiler: SpecificationCompiler,
+    tunnels: Current[Tunnels],
+    pair: Pair | None,
 ) -> "_Control":
-    await lifeline.restored.wait()
     if settings.monitors is not None:
         compiler.call()  # the compiler starts while the policy is read
     restarted = RVMASTER in lifeline.sockets
-    base = await make_foundation(settings, lifeline, compiler, tunnels, restarted=restarted)
+    base = await make_foundation(settings, lifeline, compiler, tunnels, pair, restarted=restarted)
     parts = assemble(base)
-    await parts.monitors.start(restarted=restarted)
+    await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
     control = _Control(base, parts, make_operators(base, parts))
     await _restore(base, parts)
     await control.serve()
@@ -134,6 +152,8 @@ class _Control:
             base.tunnels.run(operators.certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),
         ]
+        if base.replication is not None:
+            work.append(base.replication.run())
         self._tasks += map(asyncio.get_running_loop().create_task, work)
 
     async def announce(self, *, restarted: bool) -> None:

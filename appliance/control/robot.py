@@ -11,10 +11,15 @@ from appliance.policy.model import Address
 _ROUTES = Path("/proc/net/route")
 
 
-def robot_addresses(settings: Settings) -> list[Address]:
-    """Return loopback with `isolation: none`, otherwise the gateway of the default route."""
+def robot_addresses(settings: Settings, witness: str | None = None) -> list[Address]:
+    """Return loopback with `isolation: none`, otherwise the gateway of the default route.
+
+    One of two appliances has the address of the witness, which runs on the robot, instead of the gateway's.
+    """
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
+    if witness is not None:
+        return [ipaddress.ip_address(witness)]
     gateway = _default_gateway()
     return [gateway] if gateway is not None else []
 

@@ -38,8 +38,9 @@ class ControlLifeline:
     """Control's end of the lifeline.
 
     `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
-    opened or closed tunnels. `compiler(channel)` is called at once for each new link to the compiler, because the start
-    of control may wait for this link. Other messages are queued until `hear` is called, and passed on in order.
+    opened or closed tunnels. `compiler(channel)` and `lease(channel)` are called at once for each new link to these
+    processes, because the start of control may wait for them. Other messages are queued until `hear` is called, and
+    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`.
     """
 
     def __init__(
@@ -48,10 +49,14 @@ class ControlLifeline:
         stopping: asyncio.Event,
         enclosed: Callable[[messages.TunnelsEnclosed], None],
         compiler: Callable[[Channel], None],
+        lease: Callable[[Channel], None],
     ) -> None:
         self._stopping = stopping
         self._enclosed = enclosed
         self._compiler = compiler
+        self._lease = lease
+        self.activated = asyncio.Event()
+        self.epoch: int | None = None
         self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
@@ -142,6 +147,11 @@ class ControlLifeline:
                 self.restored.set()
             case messages.LinkOpened(role="compiler"):
                 self._compiler(Channel(socket.socket(fileno=descriptors[0]), messages.CompilerLink))
+            case messages.LinkOpened(role="lease"):
+                self._lease(Channel(socket.socket(fileno=descriptors[0]), messages.LeaseLink))
+            case messages.Activated(epoch):
+                self.epoch = epoch
+                self.activated.set()
             case messages.FirewallReported():
                 self.surroundings.firewall = message
             case messages.TunnelsEnclosed() | messages.EndpointFound() | messages.RouteFound():

@@ -153,16 +153,17 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
     # --- start ---
 
-    async def start(self, *, restarted: bool) -> None:
+    async def start(self, *, restarted: bool, taken_over: bool = False) -> None:
         """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
 
         As with the policy, after a crash of control, use the specifications that were in force. At the start of the
-        appliance, use the folder's, unless an operator's own revision was in force when the appliance stopped.
+        appliance, use the folder's, unless an operator's own revision was in force when the appliance stopped. One of
+        two appliances (`taken_over`) uses those that were in force on the active one.
         """
         settings = self.store.settings()
         self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
-        if self._find_last(restarted=restarted):
+        if self._find_last(restarted=restarted or taken_over):
             last = self.in_force
             self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys))
             self._resume()

@@ -14,6 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from appliance.base.atomic_files import write_whole
+from appliance.standby.membership import Membership
 
 CERTIFICATE = "standby.pem"
 KEY = "standby-key.pem"
@@ -61,3 +62,13 @@ def link_context(home: Path, peer: str, *, server: bool) -> ssl.SSLContext:
     context.load_verify_locations(cadata=peer)
     context.load_cert_chain(home / CERTIFICATE, home / KEY)
     return context
+
+
+def replication_context(membership: Membership, folder: Path, *, server: bool) -> ssl.SSLContext:
+    """Return the TLS context of the replication; key and certificate are written to `folder`.
+
+    Raises `OSError`, and `ssl.SSLError` if a certificate or key is damaged.
+    """
+    write_whole(folder / KEY, membership.key.encode("ascii"), 0o600)
+    write_whole(folder / CERTIFICATE, membership.certificate.encode("ascii"), 0o600)
+    return link_context(folder, membership.other_certificate, server=server)

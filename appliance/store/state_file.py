@@ -125,6 +125,7 @@ class StateStore:
         self.database = Database(directory / "state.db", SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
         self._parameter_changes = 0  # the number of the last change
+        self._largest_change: int | None = LARGEST_CHANGE
 
     async def settled(self) -> None:
         """Wait until everything saved so far is on the disk. Raises `StoreError` if it cannot be written."""
@@ -194,13 +195,17 @@ class StateStore:
         # After a crash, changes that the tree contains may remain: repeated in order, they give the same tree.
         self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
 
+    def note_whole_parameters(self) -> None:
+        """Store also large values at once: a standby must have each value before it is answered."""
+        self._largest_change = None
+
     def note_parameter(self, key: str, value: Any) -> None:
         """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
 
         The change then survives the process. A value larger than `LARGEST_CHANGE` is stored only with the tree.
         """
         data = None if value is None else msgspec.msgpack.encode(value)
-        if data is not None and len(data) > LARGEST_CHANGE:
+        if data is not None and self._largest_change is not None and len(data) > self._largest_change:
             return
         self._parameter_changes += 1
         self.database.put("parameter_change", self._parameter_changes, key, data)

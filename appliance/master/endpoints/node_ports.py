@@ -208,7 +208,8 @@ class AdvertisedAddresses:
     address at which it reached the appliance; behind address translation, this is the machine's address.
 
     `advertised` are (network, address) pairs. `route_to(host)` finds the machine's address that `host` used (None: no
-    translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen on.
+    translation). `listen` is the address that RVMaster, the proxy endpoints and the relay listen on. `fixed` is the
+    address of the active one of two appliances, for all hosts outside the network `tunnels`.
     """
 
     def __init__(
@@ -216,10 +217,15 @@ class AdvertisedAddresses:
         advertised: Sequence[tuple[Network, Address]],
         route_to: Callable[[str], Awaitable[str | None]] | None,
         listen: str,
+        *,
+        fixed: str | None = None,
+        tunnels: Network | None = None,
     ) -> None:
         address = plain_address(listen)
         self.listen = None if address.is_unspecified else str(address)
         self._advertised = advertised
+        self._fixed = fixed
+        self._tunnels = tunnels
         self._route_to = route_to
         self._routes: dict[Address, str | None] = {}
 
@@ -228,12 +234,15 @@ class AdvertisedAddresses:
         for network, address in self._advertised:
             if peer.host in network:
                 return str(address)
+        if self._fixed is not None and not peer.host.is_loopback:
+            inside = self._tunnels is not None and peer.host in self._tunnels
+            return peer.local if inside else self._fixed
         # The appliance's own nodes use a separate loopback listener. Proxy endpoints may not listen there.
         return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
         """Find out once at which address this peer reaches the appliance. Call this before `address_for`."""
-        if self._route_to is None or peer.host in self._routes:
+        if self._route_to is None or self._fixed is not None or peer.host in self._routes:
             return
         if len(self._routes) > 10_000:
             self._routes.clear()

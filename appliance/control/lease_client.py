@@ -1,0 +1,74 @@
+"""Control's end of the link to the lease, on one of two appliances."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
+from appliance.standby.process import boot_time
+
+_HAND_OVER_SECONDS = 5.0
+
+
+class HandOverError(Exception):
+    """The other appliance cannot take over now; the text has the reason."""
+
+
+class LeaseClient:
+    """The last report of the lease. `changed` is called after each report."""
+
+    def __init__(self) -> None:
+        self.state: messages.LeaseState | None = None
+        self.changed: Callable[[messages.LeaseState], None] = lambda _state: None
+        self._link = Link(self._heard, self._lost)
+        self._news = asyncio.Event()
+        self._handing_over: asyncio.Future[str] | None = None
+
+    def attach(self, channel: Channel) -> None:
+        """Use a new link."""
+        self._link.attach(channel)
+
+    def send(self, message: messages.Message) -> None:
+        """Send a message; without a link it is lost, and the next link begins with a new report."""
+        self._link.send(message)
+
+    def active(self) -> bool:
+        """Whether this appliance may answer now."""
+        return self.state is not None and boot_time() < self.state.until
+
+    async def until_active(self) -> None:
+        """Wait until this appliance may answer. If the lease has ended, the supervisor ends this process."""
+        while not self.active():
+            self._news.clear()
+            await self._news.wait()
+
+    async def hand_over(self) -> None:
+        """Become passive and let the other appliance take over. Raises `HandOverError` if that is not possible now."""
+        if self._handing_over is not None:
+            raise HandOverError("a switchover has already begun")
+        self._handing_over = asyncio.get_running_loop().create_future()
+        try:
+            self.send(messages.HandOverWanted())
+            async with asyncio.timeout(_HAND_OVER_SECONDS):
+                reason = await self._handing_over
+        except TimeoutError:
+            raise HandOverError("the process `lease` does not answer; check the log, and try again") from None
+        finally:
+            self._handing_over = None
+        if reason:
+            raise HandOverError(reason)
+
+    def _heard(self, message: Any) -> None:
+        match message:
+            case messages.LeaseState():
+                self.state = message
+                self._news.set()
+                self.changed(message)
+            case messages.HandOverAnswered(reason):
+                if self._handing_over is not None and not self._handing_over.done():
+                    self._handing_over.set_result(reason)
+
+    def _lost(self, _reason: str) -> None:
+        """Keep the last report: its `until` ends the right to answer."""

@@ -1,0 +1,146 @@
+"""Stand by: follow the changes of the active appliance until this one is activated.
+
+Of the state, only the file of the replica is written. The admin socket answers requests about the standby; an operator
+gives all other orders to the active appliance.
+"""
+
+import asyncio
+import time
+
+import structlog
+
+from appliance.channel import admin, messages
+from appliance.channel.admin import A
+from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
+from appliance.configuration.settings import Settings
+from appliance.control.admin_socket import AdminServer
+from appliance.control.lease_client import LeaseClient
+from appliance.control.replication import state_of
+from appliance.control.supervisor_link import ControlLifeline
+from appliance.standby.link_certificates import replication_context
+from appliance.standby.membership import Membership
+from appliance.standby.replica import Replica
+from appliance.standby.replication_frames import ReplicationError
+from appliance.standby.replication_receiver import ReplicationReceiver
+from appliance.standby.replication_transport import follow_at
+from appliance.store.state_file import SCHEMA
+from appliance.store.writer_thread import StoreError
+
+_AGAIN_SECONDS = 0.3
+_ADMIN = "admin"
+
+_log = structlog.get_logger()
+
+
+class PassiveControl:
+    """Control of a standby. `folder` is closed to other users: it gets the certificate and the key of the link."""
+
+    def __init__(
+        self, settings: Settings, membership: Membership, lifeline: ControlLifeline, lease: LeaseClient
+    ) -> None:
+        """Open the replica. Raises `StoreError`."""
+        self._settings = settings
+        self._membership = membership
+        self._lifeline = lifeline
+        self._lease = lease
+        self._folder = settings.state / "control"
+        self._since = time.time()
+        self._replica = Replica(
+            self._folder / "state.db",
+            SCHEMA,
+            failed=lambda reason: _log.error("state is not written", reason=reason),
+        )
+        self._receiver = ReplicationReceiver(self._replica, self._accepts)
+        self._epoch = 0
+        self._connected = False
+        self._reason = ""
+
+    async def run(self, until: asyncio.Event) -> None:
+        """Stand by until the event is set. Then the state file is closed and consistent."""
+        loop = asyncio.get_running_loop()
+        following = loop.create_task(self._follow())
+        server = await AdminServer(self).start(self._lifeline.sockets[_ADMIN].dup())
+        self._lifeline.say(messages.Ready({"stands_by": True}))
+        try:
+            await until.wait()
+        finally:
+            server.close()
+            following.cancel()
+            await asyncio.wait([following])
+            await asyncio.to_thread(self._replica.close)
+
+    def state(self) -> StandbyState:
+        """Return the state of both appliances, as this one sees it."""
+        lease = self._lease.state
+        other = OtherAppliance(
+            name=self._membership.other,
+            address=self._membership.other_address,
+            connected=self._connected,
+            in_sync=lease is not None and lease.in_sync,
+            behind_changes=0,
+            behind_bytes=0,
+            waiting_seconds=None,
+            reason="" if self._connected else self._reason,
+        )
+        wait = self._settings.availability.wait
+        return state_of(self._membership, lease, role="standby", since=self._since, wait=wait, other=other)
+
+    async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:  # noqa: ARG002
+        """Answer a request of an operator on the admin socket."""
+        return admin.AdminAnswer(False, error=self._elsewhere(), trouble="failed")
+
+    def _elsewhere(self) -> str:
+        return (
+            f"this appliance ({self._membership.name}) is the standby of {self._membership.other}"
+            f" ({self._membership.other_address}); give the command there"
+        )
+
+    async def _follow(self) -> None:
+        context = replication_context(self._membership, self._folder, server=False)
+        while True:
+            try:
+                await follow_at(
+                    self._membership.other_address, self._membership.port, context, self._receiver
+                )
+            except (ReplicationError, StoreError) as error:
+                if self._reason != str(error):
+                    self._reason = str(error)
+                    _log.info("the active appliance is not followed", reason=self._reason)
+            finally:
+                self._connected = False
+            await asyncio.sleep(_AGAIN_SECONDS)
+
+    def _accepts(self, epoch: int) -> bool:
+        """Whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
+        lease = self._lease.state
+        if lease is None or epoch < max(self._epoch, lease.epoch):
+            return False
+        if epoch > self._epoch:
+            self._epoch = epoch
+            self._lease.send(messages.EpochSeen(epoch))
+        self._connected = True
+        return True
+
+
+async def stand_by(
+    settings: Settings,
+    membership: Membership,
+    lifeline: ControlLifeline,
+    lease: LeaseClient,
+    stopping: asyncio.Event,
+) -> int | None:
+    """Stand by until this appliance is activated; return the epoch, or None if it is stopped."""
+    if lifeline.activated.is_set() or stopping.is_set():
+        return lifeline.epoch
+    passive = PassiveControl(settings, membership, lifeline, lease)
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    waits = [loop.create_task(event.wait()) for event in (lifeline.activated, stopping)]
+    for wait in waits:
+        wait.add_done_callback(lambda _task: ended.set())
+    try:
+        await passive.run(ended)
+    finally:
+        for wait in waits:
+            wait.cancel()
+    return lifeline.epoch

@@ -1,0 +1,186 @@
+"""Replicate the state of the active one of two appliances, and hold answers back until the standby has stored it.
+
+1. With `availability.wait: standby`, an answer waits until the standby has stored all changes made before it, or until
+   the witness has removed the standby from the in-sync set.
+2. Without a valid lease nothing is answered.
+3. A planned switchover begins only while the standby is in sync, and the lease is given up only after the standby has
+   stored every change.
+"""
+
+import asyncio
+import socket
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Literal
+
+import structlog
+
+from appliance.channel import messages
+from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.control.lease_client import HandOverError, LeaseClient
+from appliance.standby.link_certificates import replication_context
+from appliance.standby.membership import Membership
+from appliance.standby.process import boot_time
+from appliance.standby.replication_frames import ReplicationError
+from appliance.standby.replication_sender import ReplicationSender
+from appliance.standby.replication_transport import ReplicationListener
+from appliance.store.writer_thread import Database
+
+_REPORT_SECONDS = 0.1
+_BACKLOG = 8
+_SETTLE_SECONDS = 2.0
+
+_log = structlog.get_logger()
+
+
+def state_of(
+    membership: Membership,
+    lease: messages.LeaseState | None,
+    *,
+    role: Literal["active", "standby"],
+    since: float,
+    wait: Literal["standby", "none"],
+    other: OtherAppliance,
+) -> StandbyState:
+    """Return the state of this appliance for operators."""
+    now = boot_time()
+    return StandbyState(
+        name=membership.name,
+        address=membership.address,
+        role=role,
+        epoch=lease.epoch if lease is not None else 0,
+        since=since,
+        fixed=membership.fixed,
+        wait=wait,
+        answers_alone=lease is not None and lease.alone,
+        other=other,
+        witness=WitnessSeen(
+            address=membership.witness,
+            answered_seconds=None
+            if lease is None or lease.answered is None
+            else round(now - lease.answered, 3),
+            holder=lease.holder if lease is not None else "",
+            refusal=lease.refusal if lease is not None else "the process `lease` has not reported yet",
+        ),
+    )
+
+
+class Replication:
+    """The replication of an active appliance. Create it before the first change that the standby needs."""
+
+    def __init__(
+        self,
+        membership: Membership,
+        lease: LeaseClient,
+        database: Database,
+        epoch: int,
+        *,
+        wait: Literal["standby", "none"],
+        folder: Path,
+    ) -> None:
+        """`folder` is closed to other users: it gets the certificate and the key of the link."""
+        self._membership = membership
+        self._lease = lease
+        self._database = database
+        self._wait = wait
+        self._since = time.time()
+        self._sender = ReplicationSender(database, lambda: epoch)
+        self._listener = ReplicationListener(
+            self._sender, replication_context(membership, folder, server=True)
+        )
+        self._permission = 0
+        self._reported: messages.ReplicationReported | None = None
+        self._leaving: Callable[[], Awaitable[None]] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        lease.changed = self._lease_changed
+        if lease.state is not None:
+            self._lease_changed(lease.state)
+
+    async def run(self) -> None:
+        """Serve the standby until cancelled. Raises `OSError` if the port is in use."""
+        with socket.create_server(("", self._membership.port), backlog=_BACKLOG) as listening:
+            reports = asyncio.get_running_loop().create_task(self._report_always())
+            try:
+                await self._listener.run(listening)
+            finally:
+                reports.cancel()
+                self._sender.close()
+
+    async def stored(self) -> None:
+        """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
+        if self._wait == "standby":
+            number = self._database.number
+            try:
+                await self._sender.acknowledged(number)
+            except ReplicationError as error:
+                _log.warning("a change is not answered", reason=str(error))
+                await asyncio.get_running_loop().create_future()  # the supervisor ends this process
+        await self._lease.until_active()
+
+    def state(self) -> StandbyState:
+        """Return the state of both appliances."""
+        lag, lease = self._sender.lag(), self._lease.state
+        waiting = lag.waiting_since
+        other = OtherAppliance(
+            name=self._membership.other,
+            address=self._membership.other_address,
+            connected=lag.connected,
+            in_sync=lease is not None and lease.in_sync and not lease.alone,
+            behind_changes=lag.changes,
+            behind_bytes=lag.bytes,
+            waiting_seconds=None
+            if waiting is None
+            else round(asyncio.get_running_loop().time() - waiting, 3),
+            reason="" if lag.connected else lag.reason,
+        )
+        return state_of(
+            self._membership, lease, role="active", since=self._since, wait=self._wait, other=other
+        )
+
+    async def hand_over(self, leaving: Callable[[], Awaitable[None]]) -> None:
+        """Let the standby take over: a planned switchover. `leaving()` makes the last changes and records.
+
+        Raises `HandOverError` with the reason if that is not possible now; this appliance then stays active.
+        """
+        lease = self._lease.state
+        if lease is None or not lease.in_sync or lease.alone or not self._sender.lag().connected:
+            raise HandOverError(
+                f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
+                " in sync"
+            )
+        await leaving()
+        try:
+            async with asyncio.timeout(_SETTLE_SECONDS):
+                await self._sender.acknowledged(self._database.number)
+        except (TimeoutError, ReplicationError) as error:
+            raise HandOverError(
+                f"{self._membership.other} does not store the last changes: {error}"
+            ) from error
+        await self._lease.hand_over()
+
+    def _lease_changed(self, state: messages.LeaseState) -> None:
+        if state.alone and state.permission > self._permission:
+            self._permission = state.permission
+            self._sender.answer_alone()
+            self._report()
+
+    async def _report_always(self) -> None:
+        while True:
+            self._report()
+            await asyncio.sleep(_REPORT_SECONDS)
+
+    def _report(self) -> None:
+        """Report the replication to the lease, if it has changed."""
+        lag = self._sender.lag()
+        waiting = lag.waiting_since
+        if waiting is not None:
+            waiting = boot_time() - (asyncio.get_running_loop().time() - waiting)
+        report = messages.ReplicationReported(
+            permission=self._permission,
+            caught_up=lag.caught_up and not self._sender.alone,
+            waiting_since=waiting,
+        )
+        if report != self._reported:
+            self._reported = report
+            self._lease.send(report)
