@@ -1,0 +1,169 @@
+"""Two appliances, and a robot with the witness, on one Ethernet.
+
+`active` and `passive` are the appliances by their role. `cut` ends all processes of an appliance at once and takes its
+link down, as a power cut does.
+"""
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+from appliance.network import interfaces
+from appliance.standby import witness
+from appliance.standby.link_certificates import make_link_certificate
+from appliance.standby.membership import Membership, path_of, save_membership
+from appliance.standby.witness import LeaseRecord
+from examples.landshark.lab import INTERFACE, Host, Lab
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import RosSession
+from tests.support.processes import LIMIT, Process
+from tests.support.waiting import eventually
+
+ROBOT, FIXED, OCU = "10.79.0.10", "10.79.0.100", "10.79.0.20"
+ADDRESSES = {"a": "10.79.0.2", "b": "10.79.0.3"}
+WITNESS_PORT = 7411
+MASTER = f"http://{FIXED}:11311"
+PORTS = ["11311", "19001-26000"]
+
+
+def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any]]:
+    """Return the memberships of both appliances, and the settings of the witness."""
+    keys = {name: secrets.token_hex(32) for name in ADDRESSES}
+    peer = secrets.token_hex(32)
+    certificates = {}
+    for name in ADDRESSES:
+        (folder / name).mkdir()
+        certificates[name] = make_link_certificate(folder / name)
+    made = {
+        name: Membership(
+            name=name,
+            other=other,
+            address=ADDRESSES[name],
+            other_address=ADDRESSES[other],
+            fixed=FIXED,
+            witness=ROBOT,
+            witness_port=WITNESS_PORT,
+            witness_key=keys[name],
+            peer_key=peer,
+            certificate=certificates[name],
+            key=(folder / name / "standby-key.pem").read_text(),
+            other_certificate=certificates[other],
+        )
+        for name, other in (("a", "b"), ("b", "a"))
+    }
+    settings = {
+        "listen": f"{ROBOT}:{WITNESS_PORT}",
+        "fixed": FIXED,
+        "ports": PORTS,
+        "appliances": {name: {"address": ADDRESSES[name], "key": keys[name]} for name in ADDRESSES},
+        "state": str(folder / "lease"),
+    }
+    return made, settings
+
+
+class StandbySite:
+    """The site; a context manager. `a` is in sync at first."""
+
+    def __init__(
+        self, lab: Lab, home: Path, *, policy: str = OPEN_POLICY, options: tuple[str, ...] = (), **more: Any
+    ) -> None:
+        self.lab, self.home = lab, home
+        self.robot = lab.host("robot", f"{ROBOT}/24")
+        members, settings = memberships(home)
+        self.settings = home / "witness.json"
+        self.settings.write_text(json.dumps(settings))
+        self.settings.chmod(0o600)
+        shutil.copy(str(witness.__file__), home / "witness.py")
+        self.lease = witness.LeaseFile(str(home / "lease"), ("a", "b"))
+        self.witness: Process | None = None
+        self.appliances: dict[str, Appliance] = {}
+        for name, address in ADDRESSES.items():
+            one = Appliance(
+                lab.host(name, f"{address}/24"),
+                policy=policy,
+                options=("--listen", "0.0.0.0:11311", *options),
+                **more,
+            )
+            one.state.mkdir(mode=0o711)
+            save_membership(path_of(one.state), members[name])
+            self.appliances[name] = one
+
+    def command(self, *words: str) -> list[str]:
+        """Return a command of the witness, as on a robot without the product."""
+        return [
+            sys.executable,
+            "-I",
+            "-S",
+            str(self.home / "witness.py"),
+            *words,
+            "--settings",
+            str(self.settings),
+        ]
+
+    def start_witness(self) -> None:
+        """Start the witness; at the first start with a lease of which `a` is in sync."""
+        if not (self.home / "lease").exists():
+            self.lease.write(LeaseRecord(1, "", ("a",), ""))
+        self.witness = Process(self.robot, self.command("serve"), env=dict(os.environ), label="witness")
+
+    def start(self, name: str) -> Process:
+        """Start an appliance; return when it is ready to be active, and its process."""
+        one = self.appliances[name]
+        one.process = Process(one.host, self._up(one), env=dict(os.environ), label=f"rosrv up {name}")
+        one.process.wait_for(event="standby", timeout=2 * LIMIT)
+        return one.process
+
+    def _up(self, one: Appliance) -> list[str]:
+        from tests.support.command import ROSRV  # noqa: PLC0415
+
+        return [
+            ROSRV, "up", "--json", "--isolation", "container", "--state", str(one.state), "--policy",
+            str(one.policy_file), *one.options,
+        ]  # fmt: skip
+
+    def holder(self) -> str:
+        """Return the holder of the lease; empty if there is none yet."""
+        return self.lease.read().holder
+
+    def in_sync(self) -> set[str]:
+        """Return the appliances in sync."""
+        return set(self.lease.read().in_sync)
+
+    def until_both_in_sync(self) -> None:
+        """Wait until both appliances are in sync."""
+        eventually(lambda: self.in_sync() == {"a", "b"}, self.story)
+
+    def cut(self, name: str) -> None:
+        """Cut the power of an appliance."""
+        one = self.appliances[name]
+        interfaces.set_link(one.host.namespace, INTERFACE, up=False)  # type: ignore[union-attr]
+        assert one.process is not None
+        for pid in one.host.namespace.processes():  # type: ignore[union-attr]
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def story(self) -> str:
+        """Return the output of all."""
+        witness_said = "\n".join(self.witness.errors) if self.witness is not None else ""
+        return "\n".join([witness_said, *(one.story() for one in self.appliances.values())])
+
+    def ros(self) -> RosSession:
+        """Return nodes on the robot, which use the fixed address."""
+        return RosSession(MASTER, self.home, self.robot)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for one in self.appliances.values():
+            one.close()
+        if self.witness is not None:
+            self.witness.stop()
