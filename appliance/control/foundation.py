@@ -12,6 +12,7 @@ from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
+from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.host_blocks import BlockTable
 from appliance.control.lease_client import LeaseClient
@@ -66,11 +67,15 @@ class Current(Generic[T]):
 
 
 class Pair(NamedTuple):
-    """On one of two appliances: the other one, the lease, and the epoch in which this one is active."""
+    """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
+
+    `api` is the link to the api, if it was opened while this appliance stood by.
+    """
 
     membership: Membership
     lease: LeaseClient
     epoch: int
+    api: Channel | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,11 @@ import structlog
 from appliance.channel import admin, messages
 from appliance.channel.admin import A
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
+from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.admin_socket import AdminServer
 from appliance.control.lease_client import LeaseClient
+from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.control.replication import state_of
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.standby.link_certificates import replication_context
@@ -54,19 +56,26 @@ class PassiveControl:
         self._epoch = 0
         self._connected = False
         self._reason = ""
+        self.api: Channel | None = None  # the link to the api, after `run`
 
     async def run(self, until: asyncio.Event) -> None:
         """Stand by until the event is set. Then the state file is closed and consistent."""
         loop = asyncio.get_running_loop()
         following = loop.create_task(self._follow())
         server = await AdminServer(self).start(self._lifeline.sockets[_ADMIN].dup())
+        rest = PassiveRest(self, ReplicatedTokens(self._folder / "state.db"))
+        stating = loop.create_task(rest.run())
+        self._lifeline.passive_api = rest.attach
         self._lifeline.say(messages.Ready({"stands_by": True}))
         try:
             await until.wait()
         finally:
             server.close()
-            following.cancel()
-            await asyncio.wait([following])
+            self._lifeline.passive_api = None
+            self.api = rest.release()
+            for task in (following, stating):
+                task.cancel()
+            await asyncio.wait([following, stating])
             await asyncio.to_thread(self._replica.close)
 
     def state(self) -> StandbyState:
@@ -128,10 +137,10 @@ async def stand_by(
     lifeline: ControlLifeline,
     lease: LeaseClient,
     stopping: asyncio.Event,
-) -> int | None:
-    """Stand by until this appliance is activated; return the epoch, or None if it is stopped."""
+) -> Channel | None:
+    """Stand by until this appliance is activated (`lifeline.epoch`) or stopped; return the link to the api."""
     if lifeline.activated.is_set() or stopping.is_set():
-        return lifeline.epoch
+        return None
     passive = PassiveControl(settings, membership, lifeline, lease)
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -143,4 +152,4 @@ async def stand_by(
     finally:
         for wait in waits:
             wait.cancel()
-    return lifeline.epoch
+    return passive.api

@@ -77,10 +77,10 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
         membership = load_membership(config.with_name(LINK_FILE))
         pair = None
         if membership is not None:
-            epoch = await stand_by(settings, membership, lifeline, lease, stopping)
-            if epoch is None:
+            api = await stand_by(settings, membership, lifeline, lease, stopping)
+            if lifeline.epoch is None:
                 return
-            pair = Pair(membership, lease, epoch)
+            pair = Pair(membership, lease, lifeline.epoch, api)
         control = await _start(settings, lifeline, compiler, tunnels, pair)
     except (
         PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, MembershipError, OSError
@@ -139,6 +139,8 @@ class _Control:
         if _ADMIN in sockets:
             # Keep a reference, otherwise the garbage collector closes the server.
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
+        if base.pair is not None and base.pair.api is not None:
+            operators.rest.attach(base.pair.api)
         base.lifeline.hear(self._messages.heard)
         work: list[Coroutine[Any, Any, None]] = [
             parts.reconciler.run(),

@@ -17,6 +17,7 @@ Browsers and scripts connect to the api process, so it may be compromised. Invar
 import asyncio
 import hashlib
 import time
+from typing import Protocol
 
 import msgspec
 
@@ -26,7 +27,6 @@ from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
 from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
-from appliance.control.token_orders import TokenOrders
 from appliance.signing.request_signing import (
     HEADER,
     BadProofError,
@@ -51,10 +51,17 @@ class UnprovenError(Exception):
         self.severity = severity
 
 
+class UsableTokens(Protocol):
+    """The tokens of this appliance."""
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """Return the token with this id, if it is usable now."""
+
+
 class RequestAuthenticator:
     """Authenticate requests by their tokens. `require_proof`: a bare token is not enough for changes."""
 
-    def __init__(self, tokens: TokenOrders, *, require_proof: bool) -> None:
+    def __init__(self, tokens: UsableTokens, *, require_proof: bool) -> None:
         self._tokens = tokens
         self._require_proof = require_proof
         self._challenges = Challenges()

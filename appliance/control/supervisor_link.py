@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import socket
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import structlog
 from appliance.channel import messages
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages.api import ApiLink
 
 ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, and the supervisor limits them
 
@@ -40,7 +42,8 @@ class ControlLifeline:
     `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
     opened or closed tunnels. `compiler(channel)` and `lease(channel)` are called at once for each new link to these
     processes, because the start of control may wait for them. Other messages are queued until `hear` is called, and
-    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`.
+    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`;
+    until then `passive_api(channel)` is called for each new link to the api.
     """
 
     def __init__(
@@ -55,6 +58,7 @@ class ControlLifeline:
         self._enclosed = enclosed
         self._compiler = compiler
         self._lease = lease
+        self.passive_api: Callable[[Channel], None] | None = None
         self.activated = asyncio.Event()
         self.epoch: int | None = None
         self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
@@ -66,8 +70,8 @@ class ControlLifeline:
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # unanswered queries
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
-        self._early: list[tuple[Any, tuple[int, ...]]] = []
-        self._heard: Heard = lambda *said: self._early.append(said)
+        self._early: dict[tuple[object, ...], tuple[Any, tuple[int, ...]]] = {}
+        self._heard: Heard = self._queue
 
     def attach(self) -> None:
         """Begin to receive messages. `restored` is set when all kept sockets have arrived."""
@@ -75,9 +79,23 @@ class ControlLifeline:
 
     def hear(self, heard: Heard) -> None:
         """Pass all earlier and all later messages to `heard`."""
-        early, self._early, self._heard = self._early, [], heard
-        for said in early:
+        early, self._early, self._heard = self._early, {}, heard
+        for said in early.values():
             heard(*said)
+
+    def _queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        """Queue a message; it replaces an earlier one of its kind, because a standby may wait for months."""
+        key: tuple[object, ...] = (type(message),)
+        if isinstance(message, messages.LinkOpened):
+            key = (*key, message.role, message.index)
+        _message, replaced = self._early.pop(key, (None, ()))
+        for descriptor in replaced:
+            os.close(descriptor)
+        self._early[key] = (message, descriptors)
+
+    def api_channel(self, descriptor: int) -> Channel:
+        """Return the channel of a link to the api."""
+        return Channel(socket.socket(fileno=descriptor), ApiLink, limit=16 << 20, longest=8 << 20)
 
     def say(self, message: messages.Message) -> None:
         """Send the supervisor a message."""
@@ -147,6 +165,8 @@ class ControlLifeline:
                 self.restored.set()
             case messages.LinkOpened(role="compiler"):
                 self._compiler(Channel(socket.socket(fileno=descriptors[0]), messages.CompilerLink))
+            case messages.LinkOpened(role="api") if self.passive_api is not None:
+                self.passive_api(self.api_channel(descriptors[0]))
             case messages.LinkOpened(role="lease"):
                 self._lease(Channel(socket.socket(fileno=descriptors[0]), messages.LeaseLink))
             case messages.Activated(epoch):

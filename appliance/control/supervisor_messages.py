@@ -11,7 +11,6 @@ from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.channel import Channel
-from appliance.channel.messages.api import ApiLink
 from appliance.control.assembly import Parts
 from appliance.control.foundation import Foundation
 from appliance.control.operators import Operators
@@ -80,7 +79,7 @@ class SupervisorMessages:
             case "signer":
                 self._base.signing.attach(Channel(sock, messages.SignerLink))
             case "api":
-                self._operators.rest.attach(Channel(sock, ApiLink, limit=16 << 20, longest=8 << 20))
+                self._operators.rest.attach(self._base.lifeline.api_channel(sock.detach()))
             case "charon":
                 self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
             case "syslog":

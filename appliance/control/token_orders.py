@@ -54,19 +54,7 @@ class TokenOrders:
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens. The api checks `expires`."""
         now = time.time()
-        return [
-            TokenKept(
-                row.id,
-                row.name,
-                row.role,
-                row.salt,
-                row.hash,
-                row.expires,
-                row.keys.reading if row.keys is not None else b"",
-            )
-            for row in self._rows.values()
-            if row.usable(now)
-        ]
+        return [kept_by_api(row) for row in self._rows.values() if row.usable(now)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
@@ -231,3 +219,9 @@ def _require_lifetime(seconds: float) -> None:
 
 def _fields(row: TokenRow) -> tuple[str, str, answers.TokenRole, float, float, float | None]:
     return row.name, row.id, cast(answers.TokenRole, row.role), row.created, row.expires, row.revoked
+
+
+def kept_by_api(row: TokenRow) -> TokenKept:
+    """Return the data by which the api recognises a token."""
+    reading = row.keys.reading if row.keys is not None else b""
+    return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, reading)

@@ -60,9 +60,10 @@ class Role:
     """One row of the table.
 
     Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
-    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `listens`: each process
-    of the role gets the listening socket that the supervisor keeps for it. `on_demand`: the role starts when control
-    requests it, and does not restart after exit status 0.
+    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `stands_by`: a role with
+    `after` also runs while this appliance is passive. `listens`: each process of the role gets the listening socket
+    that the supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
+    exit status 0.
 
     Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
     `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
@@ -90,6 +91,7 @@ class Role:
     after: str | None = None
     outlives_control: bool = False
     outlives_takeover: bool = False
+    stands_by: bool = False
     files: int = 1024
     readable_by: str | None = None
     listens: bool = False
@@ -185,7 +187,7 @@ ROLES = (
     ),
     _ours(
         "api", "rosrv-api", "api", "appliance.api.process:main",
-        ended_early=800, files=4096, after="control", listens=True, dispensable=True,
+        ended_early=800, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
         ),

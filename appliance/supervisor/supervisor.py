@@ -269,8 +269,8 @@ class Supervisor:
         self._tell_processes()
 
     def _may_start(self, slot: ProcessSlot) -> bool:
-        """Whether a role may run now: while this appliance is passive, those that follow control do not."""
-        return self._lease.active or slot.role.after is None
+        """Whether a role may run now: while this appliance is passive, most that follow control do not."""
+        return self._lease.active or slot.role.after is None or slot.role.stands_by
 
     def _equip_control(self, process: ProcessHandle) -> None:
         if self._lease.member and self._lease.epoch is not None:
@@ -407,7 +407,10 @@ class Supervisor:
     # --- one of two appliances ----------------------------------------------------------------------------
 
     def _note_parked(self) -> None:
-        """Announce once that this appliance could take over."""
+        """Start what a standby has, and announce once that this appliance could take over."""
+        for slot in self.slots:
+            if slot.role.stands_by and slot.is_free:
+                self.start(slot)
         if self._stands_by is not None and not self._parked:
             self._parked = True
             self._stands_by()

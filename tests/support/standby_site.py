@@ -10,9 +10,7 @@ import os
 import secrets
 import shutil
 import signal
-import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,7 +19,7 @@ from appliance.standby import witness
 from appliance.standby.link_certificates import make_link_certificate
 from appliance.standby.membership import Membership, path_of, save_membership
 from appliance.standby.witness import LeaseRecord
-from examples.landshark.lab import INTERFACE, Host, Lab
+from examples.landshark.lab import INTERFACE, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Process

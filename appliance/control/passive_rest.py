@@ -1,0 +1,116 @@
+"""Serve the api of a standby: it knows the replicated tokens, and gets the same answers as the admin socket."""
+
+import asyncio
+import sqlite3
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.channel.admin import AdminAnswer, encode
+from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.link import Link
+from appliance.channel.messages.api import RequestAnswered, RequestMade, TokenKept, TokensStated
+from appliance.control.admin_socket import RequestHandler
+from appliance.control.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.control.token_orders import kept_by_api
+from appliance.signing.request_signing import TokenKeys
+from appliance.store.access_tokens import TokenRow
+
+_MOST_WAITING = 64
+_READ_SECONDS = 2.0
+
+_log = structlog.get_logger()
+
+
+class ReplicatedTokens:
+    """The tokens in the state file of a standby, read again from time to time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._rows: dict[str, TokenRow] = {}
+
+    def read(self) -> bool:
+        """Read the tokens again; return whether they have changed."""
+        with suppress(sqlite3.Error):  # no state yet
+            with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
+                keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
+                found = connection.execute("SELECT * FROM token").fetchall()
+            rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
+            changed, self._rows = rows != self._rows, rows
+            return changed
+        return False
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """Return the token with this id, if it is usable now."""
+        row = self._rows.get(token_id)
+        return row if row is not None and row.usable(time.time()) else None
+
+    def usable(self) -> list[TokenKept]:
+        """Return the data by which the api recognises tokens."""
+        now = time.time()
+        return [kept_by_api(row) for row in self._rows.values() if row.usable(now)]
+
+
+class PassiveRest:
+    """The link to the api of a standby."""
+
+    def __init__(self, administration: RequestHandler, tokens: ReplicatedTokens) -> None:
+        self._administration = administration
+        self._tokens = tokens
+        self._askers = RequestAuthenticator(tokens, require_proof=False)
+        self._link = Link(self._received)
+        self._serving: set[asyncio.Task[None]] = set()
+
+    def attach(self, channel: Channel) -> None:
+        """Serve a new api process."""
+        self._link.attach(channel)
+        self._state_tokens()
+
+    def release(self) -> Channel | None:
+        """Stop serving; return the channel to the api for the active control."""
+        for task in self._serving:
+            task.cancel()
+        channel, self._link.channel = self._link.channel, None
+        return channel
+
+    async def run(self) -> None:
+        """Send the api the tokens whenever they change, until cancelled."""
+        while True:
+            if await asyncio.to_thread(self._tokens.read):
+                self._state_tokens()
+            await asyncio.sleep(_READ_SECONDS)
+
+    def _received(self, message: Any) -> None:
+        if not isinstance(message, RequestMade):
+            return  # the standby records no calls: the active appliance records its own
+        if len(self._serving) >= _MOST_WAITING:
+            text = "too many requests wait for the appliance: try again"
+            self._answer(message.number, AdminAnswer(False, error=text, trouble="busy"))
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(message))
+        self._serving.add(task)
+        task.add_done_callback(self._serving.discard)
+
+    async def _serve(self, made: RequestMade) -> None:
+        try:
+            who = await self._askers.asker(made)
+        except UnprovenError as error:
+            self._answer(made.number, AdminAnswer(False, error=str(error), trouble="forbidden"))
+            return
+        self._answer(made.number, await self._administration.carry_out(made.request, who=who))
+
+    def _answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+        self._send(RequestAnswered(number, encode(answer)))
+
+    def _state_tokens(self) -> None:
+        self._send(TokensStated(self._tokens.usable()))
+
+    def _send(self, message: Any) -> None:
+        try:
+            self._link.send(message)
+        except ChannelFullError:
+            self._link.close()
+            _log.error("the api does not read its answers: its link is closed")
