@@ -2,24 +2,21 @@
 
 import asyncio
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import structlog
 
-from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
-from appliance.audit.retention import Retention
-from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.host_blocks import BlockTable
-from appliance.control.lease_client import LeaseClient
 from appliance.control.listener_limits import ListenerLimits
+from appliance.control.open_audit import open_audit
 from appliance.control.policies import Policies
 from appliance.control.quota_class import HostQuotaClass, charged_to
-from appliance.control.replication import Replication
+from appliance.control.replication import Pair, Replication, make_replication
 from appliance.control.robot import robot_addresses
 from appliance.control.signer_requests import SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
@@ -30,11 +27,9 @@ from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enforcement
 from appliance.quotas.pool import QuotaClass
-from appliance.quotas.table import AUDIT_RESERVE
 from appliance.recorder.recording_plan import RecordingPlan
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
-from appliance.standby.membership import Membership
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -43,7 +38,6 @@ RVMASTER, INNER, OWN = "rvmaster", "inner", "own"
 """The names of the listeners for nodes, for the ROS master, and for the appliance's own nodes."""
 
 _log = structlog.get_logger()
-_HOSTS_IN_RESERVE = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host
 
 
 class Current(Generic[T]):
@@ -64,18 +58,6 @@ class Current(Generic[T]):
         if not self._values:
             raise RuntimeError("this part of control is used before it is created")
         return self._values[0]
-
-
-class Pair(NamedTuple):
-    """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
-
-    `api` is the link to the api, if it was opened while this appliance stood by.
-    """
-
-    membership: Membership
-    lease: LeaseClient
-    epoch: int
-    api: Channel | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +113,7 @@ async def make_foundation(
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
     authority = Authority(signing.link)
-    audit.set(_open_audit(settings, signing, lifeline.log_held(), quota_class))
+    audit.set(open_audit(settings, signing, lifeline.log_held(), lambda host: _class_of(quota_class, host)))
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
         audit(),
@@ -142,7 +124,7 @@ async def make_foundation(
     store = StateStore(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
-    replication = _make_replication(settings, pair, store)
+    replication = make_replication(settings, pair, store)
     blocks = BlockTable.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
@@ -188,21 +170,6 @@ async def make_foundation(
     )
 
 
-def _make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> Replication | None:
-    """Return the replication of one of two appliances, before the first change."""
-    if pair is None:
-        return None
-    store.note_whole_parameters()
-    return Replication(
-        pair.membership,
-        pair.lease,
-        store.database,
-        pair.epoch,
-        wait=settings.availability.wait,
-        folder=settings.state / "control",
-    )
-
-
 def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:
     """Return the listeners by name. Listeners that the supervisor did not keep are opened."""
     host, port = settings.listen_address
@@ -220,33 +187,6 @@ def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, 
     return sockets
 
 
-def _open_audit(
-    settings: Settings,
-    signing: SignerRequests,
-    held_by: Callable[[list[int]], None],
-    quota_class: Current[HostQuotaClass],
-) -> AuditLog:
-    audit = settings.audit
-    reserve = AUDIT_RESERVE.bounds.sized(
-        int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE
-    )
-
-    def class_of_text(host: str) -> QuotaClass:
-        # Before the policy is read, all hosts count as named.
-        return quota_class().of_text(host) if quota_class else QuotaClass.NAMED
-
-    return AuditLog(
-        settings.state / "control" / "audit.db",
-        durability=audit.durability,
-        checkpoint_every=audit.checkpoint_records,
-        checkpoint_seconds=audit.checkpoint_seconds,
-        signer=signing.want,
-        removals=signing.want_removal,
-        held_by=held_by,
-        budget=Budget(class_of_text, reserve=reserve),
-        reserve=reserve.whole,
-        retention=Retention(
-            days=audit.retention_days,
-            size=None if audit.retention_bytes is None else int(audit.retention_bytes),
-        ),
-    )
+def _class_of(quota_class: Current[HostQuotaClass], host: str) -> QuotaClass:
+    # Before the policy is read, all hosts count as named.
+    return quota_class().of_text(host) if quota_class else QuotaClass.NAMED

@@ -17,11 +17,11 @@ class HandOverError(Exception):
 
 
 class LeaseClient:
-    """The last report of the lease. `changed` is called after each report."""
+    """The last report of the lease."""
 
     def __init__(self) -> None:
         self.state: messages.LeaseState | None = None
-        self.changed: Callable[[messages.LeaseState], None] = lambda _state: None
+        self._listeners: list[Callable[[messages.LeaseState], None]] = []
         self._link = Link(self._heard, self._lost)
         self._news = asyncio.Event()
         self._handing_over: asyncio.Future[str] | None = None
@@ -29,6 +29,12 @@ class LeaseClient:
     def attach(self, channel: Channel) -> None:
         """Use a new link."""
         self._link.attach(channel)
+
+    def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
+        """Call `changed` with the last report, if there is one, and with each later report."""
+        self._listeners.append(changed)
+        if self.state is not None:
+            changed(self.state)
 
     def send(self, message: messages.Message) -> None:
         """Send a message; without a link it is lost, and the next link begins with a new report."""
@@ -65,7 +71,8 @@ class LeaseClient:
             case messages.LeaseState():
                 self.state = message
                 self._news.set()
-                self.changed(message)
+                for changed in self._listeners:
+                    changed(message)
             case messages.HandOverAnswered(reason):
                 if self._handing_over is not None and not self._handing_over.done():
                     self._handing_over.set_result(reason)

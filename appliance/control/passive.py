@@ -1,11 +1,12 @@
 """Stand by: follow the changes of the active appliance until this one is activated.
 
-Of the state, only the file of the replica is written. The admin socket answers requests about the standby; an operator
+The only state that changes is the file of the replica. The admin socket answers requests about the standby; an operator
 gives all other orders to the active appliance.
 """
 
 import asyncio
 import time
+from typing import Any
 
 import structlog
 
@@ -56,6 +57,7 @@ class PassiveControl:
         self._epoch = 0
         self._connected = False
         self._reason = ""
+        self._rest = PassiveRest(self, ReplicatedTokens(self._folder / "state.db"))
         self.api: Channel | None = None  # the link to the api, after `run`
 
     async def run(self, until: asyncio.Event) -> None:
@@ -63,16 +65,15 @@ class PassiveControl:
         loop = asyncio.get_running_loop()
         following = loop.create_task(self._follow())
         server = await AdminServer(self).start(self._lifeline.sockets[_ADMIN].dup())
-        rest = PassiveRest(self, ReplicatedTokens(self._folder / "state.db"))
-        stating = loop.create_task(rest.run())
-        self._lifeline.passive_api = rest.attach
+        stating = loop.create_task(self._rest.run())
+        self._lifeline.hear(self._heard)
         self._lifeline.say(messages.Ready({"stands_by": True}))
         try:
             await until.wait()
         finally:
             server.close()
-            self._lifeline.passive_api = None
-            self.api = rest.release()
+            self._lifeline.pause()
+            self.api = self._rest.release()
             for task in (following, stating):
                 task.cancel()
             await asyncio.wait([following, stating])
@@ -103,6 +104,13 @@ class PassiveControl:
             f"this appliance ({self._membership.name}) is the standby of {self._membership.other}"
             f" ({self._membership.other_address}); give the command there"
         )
+
+    def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        """Serve the api; leave the other messages of the supervisor to the active control."""
+        if isinstance(message, messages.LinkOpened) and message.role == "api":
+            self._rest.attach(self._lifeline.api_channel(descriptors[0]))
+        else:
+            self._lifeline.queue(message, descriptors)
 
     async def _follow(self) -> None:
         context = replication_context(self._membership, self._folder, server=False)

@@ -26,11 +26,12 @@ from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
-from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, Pair, make_foundation
+from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import stand_by
 from appliance.control.policies import PolicyRefusedError
+from appliance.control.replication import Pair
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import SpareMemory
 from appliance.control.supervisor_link import ControlLifeline

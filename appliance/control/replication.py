@@ -12,12 +12,14 @@ import socket
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import structlog
 
 from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.channel.channel import Channel
+from appliance.configuration.settings import Settings
 from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership
@@ -25,6 +27,7 @@ from appliance.standby.process import boot_time
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_sender import ReplicationSender
 from appliance.standby.replication_transport import ReplicationListener
+from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database
 
 _REPORT_SECONDS = 0.1
@@ -32,6 +35,33 @@ _BACKLOG = 8
 _SETTLE_SECONDS = 2.0
 
 _log = structlog.get_logger()
+
+
+class Pair(NamedTuple):
+    """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
+
+    `api` is the link to the api, if it was opened while this appliance stood by.
+    """
+
+    membership: Membership
+    lease: LeaseClient
+    epoch: int
+    api: Channel | None
+
+
+def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
+    """Return the replication of one of two appliances; make it before the first change."""
+    if pair is None:
+        return None
+    store.note_whole_parameters()
+    return Replication(
+        pair.membership,
+        pair.lease,
+        store.database,
+        pair.epoch,
+        wait=settings.availability.wait,
+        folder=settings.state / "control",
+    )
 
 
 def state_of(
@@ -93,9 +123,7 @@ class Replication:
         self._reported: messages.ReplicationReported | None = None
         self._leaving: Callable[[], Awaitable[None]] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        lease.changed = self._lease_changed
-        if lease.state is not None:
-            self._lease_changed(lease.state)
+        lease.listen(self._lease_changed)
 
     async def run(self) -> None:
         """Serve the standby until cancelled. Raises `OSError` if the port is in use."""

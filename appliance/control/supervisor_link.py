@@ -42,8 +42,7 @@ class ControlLifeline:
     `stopping` is set when the supervisor stops control or is gone. `enclosed(answer)` is called when the supervisor has
     opened or closed tunnels. `compiler(channel)` and `lease(channel)` are called at once for each new link to these
     processes, because the start of control may wait for them. Other messages are queued until `hear` is called, and
-    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`;
-    until then `passive_api(channel)` is called for each new link to the api.
+    passed on in order. On one of two appliances, `activated` is set once this one may serve, in the epoch `epoch`.
     """
 
     def __init__(
@@ -58,7 +57,6 @@ class ControlLifeline:
         self._enclosed = enclosed
         self._compiler = compiler
         self._lease = lease
-        self.passive_api: Callable[[Channel], None] | None = None
         self.activated = asyncio.Event()
         self.epoch: int | None = None
         self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
@@ -71,7 +69,7 @@ class ControlLifeline:
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []
         self._early: dict[tuple[object, ...], tuple[Any, tuple[int, ...]]] = {}
-        self._heard: Heard = self._queue
+        self._heard: Heard = self.queue
 
     def attach(self) -> None:
         """Begin to receive messages. `restored` is set when all kept sockets have arrived."""
@@ -83,7 +81,11 @@ class ControlLifeline:
         for said in early.values():
             heard(*said)
 
-    def _queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
+    def pause(self) -> None:
+        """Queue messages again until `hear` is called."""
+        self._heard = self.queue
+
+    def queue(self, message: Any, descriptors: tuple[int, ...]) -> None:
         """Queue a message; it replaces an earlier one of its kind, because a standby may wait for months."""
         key: tuple[object, ...] = (type(message),)
         if isinstance(message, messages.LinkOpened):
@@ -165,8 +167,6 @@ class ControlLifeline:
                 self.restored.set()
             case messages.LinkOpened(role="compiler"):
                 self._compiler(Channel(socket.socket(fileno=descriptors[0]), messages.CompilerLink))
-            case messages.LinkOpened(role="api") if self.passive_api is not None:
-                self.passive_api(self.api_channel(descriptors[0]))
             case messages.LinkOpened(role="lease"):
                 self._lease(Channel(socket.socket(fileno=descriptors[0]), messages.LeaseLink))
             case messages.Activated(epoch):

@@ -70,7 +70,7 @@ def answers() -> list[TunnelsEnclosed]:
 async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLifeline, Supervisor]]:
     """Yield both ends of a lifeline."""
     ours, theirs = socket.socketpair()
-    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, print)
+    lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, print, print)
     supervisor = Supervisor(ours)
     lifeline.attach()
     yield lifeline, supervisor
