@@ -27,6 +27,7 @@ from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
 from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.inheritance import inherited_state
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import stand_by
@@ -106,6 +107,8 @@ async def _start(
     base = await make_foundation(settings, lifeline, compiler, tunnels, pair, restarted=restarted)
     parts = assemble(base)
     await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
+    if pair is not None:
+        parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
     control = _Control(base, parts, make_operators(base, parts))
     await _restore(base, parts)
     await control.serve()

@@ -13,6 +13,7 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
+from appliance.channel.messages.relay_link import ForMonitors
 from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
@@ -115,12 +116,8 @@ class DataPlane:
             self._state(message, descriptors)
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
-        elif isinstance(message, messages.SpecificationsStated):
-            self.interceptor.state(message)
-        elif isinstance(message, messages.MonitorSwitched):
-            self.interceptor.switch(message.name, message.enabled)
-        elif isinstance(message, messages.MonitorResumed):
-            self._ask_for_latched(self.interceptor.resume(message.name))
+        elif isinstance(message, ForMonitors):
+            self._to_monitors(message)
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._tap(message)
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
@@ -132,6 +129,17 @@ class DataPlane:
         else:
             self._table.withdraw(message)
             self._withdrawn(message)
+
+    def _to_monitors(self, message: ForMonitors) -> None:
+        match message:
+            case messages.SpecificationsStated():
+                self.interceptor.state(message)
+            case messages.StateWanted():
+                self._reporter.send(messages.StateLeft(self.interceptor.leave()))
+            case messages.MonitorSwitched(name, enabled):
+                self.interceptor.switch(name, enabled)
+            case messages.MonitorResumed(name):
+                self._ask_for_latched(self.interceptor.resume(name))
 
     def close(self) -> None:
         """Close all connections."""

@@ -65,6 +65,14 @@ class Revision:
     """The monitors in shadow mode."""
 
 
+@dataclass(frozen=True, slots=True)
+class InheritedState:
+    """After a takeover: the states that the other appliance's relays `left`, or the reason why they are `lost`."""
+
+    lost: str = ""
+    left: tuple[bytes, ...] = ()
+
+
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
 """Returns the parts of a compiled set for the named monitors. Raises `SpecificationsRefusedError`."""
 
@@ -100,6 +108,9 @@ class Rollout:
     _refusals: dict[int, list[str]] = field(default_factory=dict)
     _began: set[str] = field(default_factory=set)  # monitors that began again by the present change
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
+    _inherited: InheritedState = field(default_factory=InheritedState)
+    _heirs: set[int] = field(default_factory=set)  # relays that have not taken the inherited state yet
+    _inheritance_taken: Callable[[], None] = lambda: None
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
     @property
@@ -129,6 +140,11 @@ class Rollout:
         # control may have died during a change after storing its allocation: adapt the allocation as little as possible
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
         await self._make(now, self.allocation.of_file)
+
+    def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
+        """Give each relay the state of the other appliance's monitors; call `taken` once all relays have it."""
+        self._inherited, self._heirs = state, set(range(self.allocation.relays))
+        self._inheritance_taken = taken
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
         """Return a relay's first message; a restarted relay must hold topics as its monitors require."""
@@ -314,6 +330,7 @@ class Rollout:
         ahead: bool = False,
     ) -> messages.SpecificationsStated:
         states, files = self.states(revision.checked), revision.checked.monitors
+        inherited = self._inherited if relay in self._heirs else InheritedState()
         names = _names(revision, relay, of_file)
         return messages.SpecificationsStated(
             revision.number,
@@ -326,6 +343,8 @@ class Rollout:
             ahead,
             names.shadows,
             self.slices,
+            inherited.lost,
+            inherited.left,
         )
 
     # --- messages of the relays ---
@@ -348,6 +367,10 @@ class Rollout:
 
     def _taken(self, relay: int, taken: messages.SpecificationsTaken) -> None:
         statement, began, held = taken.statement, taken.began, taken.held
+        if relay in self._heirs:
+            self._heirs.discard(relay)
+            if not self._heirs:
+                self._inheritance_taken()
         self._refusals.pop(relay, None)
         self._say_held(relay, taken)
         self._held[relay] = {name: taken.because.get(name, "") for name in held}

@@ -47,6 +47,9 @@ CREATE TABLE IF NOT EXISTS token_keys (
     id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS monitor_state (
+    relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
+);
 CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 {host_tables.SCHEMA}"""
 
@@ -262,6 +265,21 @@ class StateStore:
         """Return the last `limit` revisions of the specifications (-1: all), the newest first."""
         rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT ?", (limit,))
         return [MonitorRevisionRow(*row) for row in rows]
+
+    # --- the state of monitors, between two appliances ---
+
+    def save_monitor_state(self, relay: int, epoch: int, content: bytes) -> None:
+        """Store the state that a relay left when its appliance, active in this epoch, handed over."""
+        self.database.put("monitor_state", relay, epoch, content)
+
+    def clear_monitor_states(self) -> None:
+        """Remove the states that relays left."""
+        self.database.delete("monitor_state", ("relay", ">", -1))
+
+    def monitor_states(self, epoch: int) -> list[bytes]:
+        """Return the states that relays left at the end of this epoch."""
+        query = "SELECT content FROM monitor_state WHERE epoch = ? ORDER BY relay"
+        return [content for (content,) in self.database.query(query, (epoch,))]
 
     # --- tokens ---
 

@@ -300,6 +300,9 @@ class SpecificationsStated(Message):
     `ahead`: the relay carries out later messages only after these specifications are in force or rejected, so no topic
     is placed before its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices`
     is the largest number of slices of a parametric specification.
+
+    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`). If they left
+    none, `lost` is the reason. In both cases the relay does not use its own memory.
     """
 
     revision: int
@@ -312,6 +315,18 @@ class SpecificationsStated(Message):
     ahead: bool = False
     shadows: tuple[str, ...] = ()
     slices: int = 100_000
+    lost: str = ""
+    left: tuple[bytes, ...] = ()
+
+
+class StateWanted(Message):
+    """Control of an appliance that hands over asks a relay to drop all messages from now on, and for `StateLeft`."""
+
+
+class StateLeft(Message):
+    """A relay passes no messages any more. `content` is the state of its monitors (empty: it has none)."""
+
+    content: bytes
 
 
 class MonitorSwitched(Message):
@@ -494,7 +509,11 @@ RelayLink = (
     | ServicePlaced | ServiceWithdrawn | GrantInstalled | GrantRevoked | ClientGranted | ClientRevoked
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | LatchRefused | ConnectionOpened
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
+    | StateWanted | StateLeft
     | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
 )  # fmt: skip
+
+ForMonitors = SpecificationsStated | StateWanted | MonitorSwitched | MonitorResumed
+"""The messages about a relay's monitors."""

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from appliance.channel.messages import StateGiven
-from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, read
+from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, StoredState, read
 
 if TYPE_CHECKING:
     from rosmop.run.engine import KeptGroup, MonitorSet
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
+_AHEAD = "the clock of the other appliance is ahead of this machine's"
 _STEP = 1_000_000_000  # nanoseconds; a larger difference means that the clock was set
 
 
@@ -73,6 +74,7 @@ class StateKeeper:
 
     def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
         self._given = given
+        self._own = own
         self._memory = StateMemory(own)
         self._left = [own] if _has_head(own) else [*earlier]
         self._entries: list[_Entry] = []
@@ -122,6 +124,11 @@ class StateKeeper:
         return ""
 
     # --- kept state ---
+
+    def content(self) -> bytes:
+        """Return the kept states for `received_states` of another appliance."""
+        kept = read(self._own)
+        return b"" if kept is None else _CONTENT.encode(kept)
 
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these monitors from now on."""
@@ -213,12 +220,35 @@ class StateKeeper:
         return msgspec.msgpack.encode(head)
 
 
+def received_states(contents: Sequence[bytes], now: int) -> RecoveredState:
+    """Return the states that the relays of another appliance left (`StateKeeper.content`).
+
+    `now` is this machine's time (ns). States that were written later are lost, because the clocks differ.
+    """
+    found = RecoveredState()
+    for content in filter(None, contents):
+        try:
+            kept = _CONTENTS.decode(content)
+            head = _HEADS.decode(kept.head)
+        except msgspec.MsgspecError as error:
+            found.lost[""] = f"{_UNREADABLE}: {error}"
+            continue
+        if head.lost or head.written > now + _STEP:
+            found.lost[""] = head.lost or _AHEAD
+            continue
+        for group, section in zip(head.groups, kept.sections, strict=False):
+            found.groups.append((group.monitors, bytes(group.cells), *section))
+    return found
+
+
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
     """Return the sections of a group: its state with the size of its cells, then the parts of its slices."""
     return [(entry.base, entry.group.size), *((data, 0) for data in entry.parts)]
 
 
 _NO_CELLS = msgspec.Raw(b"\xc0")
+_CONTENT = msgspec.msgpack.Encoder()
+_CONTENTS = msgspec.msgpack.Decoder(StoredState)
 _HEADS = msgspec.msgpack.Decoder(_Head)
 
 
