@@ -37,6 +37,10 @@ class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
     number: _Number
 
 
+class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switchover"):
+    """An operator of the standby wants it to take over."""
+
+
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
     """The sender of this message ends the link, for this reason."""
 
@@ -82,7 +86,7 @@ class SnapshotEnd(msgspec.Struct, frozen=True, array_like=True, tag="end"):
 
 
 FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused
-FromStandby = Stored | Refused
+FromStandby = Stored | Refused | SwitchoverWanted
 
 
 def reason_of(error: Exception) -> Refused:
@@ -97,23 +101,22 @@ class ReplicationLink(Generic[M]):
         self._reader = reader
         self._writer = writer
         self._encoder = msgspec.msgpack.Encoder()
+        self._sending = asyncio.Lock()
         self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(received)
 
     async def send(self, message: Any) -> None:
-        """Send a message, and wait until the connection can take more. Raises `ReplicationError`.
-
-        Only one task may send at a time.
-        """
+        """Send a message, and wait until the connection can take more. Raises `ReplicationError`."""
         body = self._encoder.encode(message)
         if len(body) > LARGEST_FRAME:
             raise ReplicationError(
                 f"a change has {len(body)} bytes, and the standby gets at most {LARGEST_FRAME}: make"
                 " limits.parameter_bytes smaller"
             )
-        await self._write(_LENGTH.pack(len(body)) + body[:_PIECE])
-        for begin in range(_PIECE, len(body), _PIECE):
-            await asyncio.sleep(0)  # encryption of all pieces at once would hold the loop
-            await self._write(body[begin : begin + _PIECE])
+        async with self._sending:
+            await self._write(_LENGTH.pack(len(body)) + body[:_PIECE])
+            for begin in range(_PIECE, len(body), _PIECE):
+                await asyncio.sleep(0)  # encryption of all pieces at once would hold the loop
+                await self._write(body[begin : begin + _PIECE])
 
     async def _write(self, data: bytes) -> None:
         self._writer.write(data)

@@ -11,6 +11,7 @@ from appliance.standby.replication_frames import (
     ReplicationError,
     ReplicationLink,
     SnapshotBegin,
+    SwitchoverWanted,
     reason_of,
 )
 from appliance.store.writer_thread import StoreError
@@ -24,12 +25,20 @@ class ReplicationReceiver:
     def __init__(self, replica: Replica, accepts: Callable[[int], bool]) -> None:
         self._replica = replica
         self._accepts = accepts
+        self._link: ReplicationLink[FromActive] | None = None
+
+    async def want_switchover(self) -> None:
+        """Ask the active appliance to hand over. Raises `ReplicationError` if it is not connected."""
+        if self._link is None:
+            raise ReplicationError("the active appliance is not connected")
+        await self._link.send(SwitchoverWanted())
 
     async def follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Take changes until the link ends. Raises `ReplicationError`, and `StoreError` if the disk is full."""
         link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
         try:
             await link.send(self._replica.position)
+            self._link = link
             while True:
                 message = await link.receive(_SILENCE_SECONDS)
                 if isinstance(message, Refused):
@@ -42,6 +51,7 @@ class ReplicationReceiver:
                     raise
                 await link.send(self._replica.position)
         finally:
+            self._link = None
             await link.close()
             await asyncio.to_thread(self._replica.abandon_snapshot)
 

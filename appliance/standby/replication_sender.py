@@ -32,6 +32,7 @@ from appliance.standby.replication_frames import (
     SnapshotEnd,
     SnapshotRows,
     Stored,
+    SwitchoverWanted,
     reason_of,
 )
 from appliance.store.changes import ROWS, Put
@@ -76,9 +77,18 @@ class ReplicationSender:
     Create it in the event loop, before the first change that the standby needs.
     """
 
-    def __init__(self, database: Database, epoch: Callable[[], int], *, room: int = _ROOM) -> None:
+    def __init__(
+        self,
+        database: Database,
+        epoch: Callable[[], int],
+        *,
+        room: int = _ROOM,
+        switchover_wanted: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`room`: bytes of changes that are kept. `switchover_wanted()` is called for an order of the standby."""
         self._database = database
         self._epoch = epoch
+        self._switchover_wanted = switchover_wanted
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
         self._feed = database.follow(self._notice, room)
@@ -169,8 +179,9 @@ class ReplicationSender:
 
     async def _serve(self, link: ReplicationLink[FromStandby]) -> None:
         begin = await link.receive(_SILENCE_SECONDS)
-        if isinstance(begin, Refused):
-            raise ReplicationError(f"the standby refuses: {begin.reason}")
+        if not isinstance(begin, Stored):
+            reason = begin.reason if isinstance(begin, Refused) else "it did not send its position first"
+            raise ReplicationError(f"the standby refuses: {reason}")
         if begin.epoch > self._epoch():
             error = ReplicationError(
                 f"the standby has seen epoch {begin.epoch}, and this appliance is active in {self._epoch()}"
@@ -207,6 +218,9 @@ class ReplicationSender:
             message = await link.receive(_SILENCE_SECONDS)
             if isinstance(message, Refused):
                 raise ReplicationError(f"the standby refuses: {message.reason}")
+            if isinstance(message, SwitchoverWanted):
+                self._switchover_wanted()
+                continue
             self._unanswered -= 1
             self._answered.set()
             if message.history == self._database.history:
