@@ -9,6 +9,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
+from appliance.channel.standby_summary import PATIENCE_SECONDS, standby_troubles
 from appliance.channel.status_summary import no_relay, probe_failed
 
 Severity = Literal["alarm", "warning", "notice"]
@@ -31,6 +32,9 @@ def open_alarms(status: Status) -> list[Alarm]:
     found = [*_system(status), *_policy(status), *_monitors(status)]
     found += [("warning", "ipsec", "hosts", line) for line in status.ipsec.troubles]
     found += _blocks(status.blocks)
+    if status.standby is not None:
+        troubles = standby_troubles(status.standby, PATIENCE_SECONDS)
+        found += [(one.severity, one.kind, "system", one.text) for one in troubles]
     alarms = (
         Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
     )

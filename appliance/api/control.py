@@ -45,7 +45,14 @@ _UNKNOWN = (
 
 
 class ControlAwayError(Exception):
-    """Report that control does not answer now; the text gives the client the reason."""
+    """Report that control does not answer now; the text gives the client the reason.
+
+    `active`: the address of the active appliance, if control only answers that this one is the standby.
+    """
+
+    def __init__(self, reason: str, active: str = "") -> None:
+        super().__init__(reason)
+        self.active = active
 
 
 def _made(

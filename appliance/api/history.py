@@ -42,12 +42,16 @@ class Sample(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LastSample(NamedTuple):
-    """Control's last status, or the reason why it is unknown."""
+    """Control's last status, or the reason why it is unknown.
+
+    `active`: the address of the active appliance, if this one is the standby.
+    """
 
     number: int
     status: Status | None
     sample: Sample | None
     away: str | None
+    active: str = ""
 
 
 class SampleHistory:
@@ -105,16 +109,16 @@ class SampleHistory:
                 await asyncio.wait_for(self._sooner.wait(), until - least)
 
     async def _look(self) -> None:
-        status, sample, away = None, None, None
+        status, sample, away, active = None, None, None, ""
         try:
             body = await self._measures()
             status, sample = body.status, sample_of(body, time.time())
         except ControlAwayError as error:
-            away = str(error)
+            away, active = str(error), error.active
         if sample is not None:
             self._keep(sample)
         async with self._news:
-            self.seen = LastSample(self.seen.number + 1, status, sample, away)
+            self.seen = LastSample(self.seen.number + 1, status, sample, away, active)
             self._news.notify_all()
 
     def _keep(self, sample: Sample) -> None:
@@ -129,7 +133,7 @@ async def measures_of(control: ControlLink) -> Measures:
     """Return control's answer to `MetricsWanted`. Raises `ControlAwayError`."""
     answer = await control.ask(MetricsWanted(), None)
     if not answer.ok:
-        raise ControlAwayError(answer.error)
+        raise ControlAwayError(answer.error, answer.active)
     return answer.given()
 
 

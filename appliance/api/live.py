@@ -19,7 +19,7 @@ from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, LastSample, Sample
 from appliance.api.moments import in_full
 from appliance.api.problems import ProblemError
-from appliance.api.route_roles import VIEWER, Viewer, ask
+from appliance.api.route_roles import VIEWER, Viewer, ask, only_standby
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import StreamResponse, Streams, peer_of
@@ -30,6 +30,7 @@ from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
+_PATIENCE_SECONDS = 1.0
 _SHARE = 20  # the pause between two graphs, as a multiple of the time to make one graph
 _TEXT = file("text/event-stream", "Events `now`, `graph`, `away`, `end`.")
 
@@ -80,8 +81,13 @@ def routes(services: Services) -> Routes:
         """Status, open alarms and a sample every two seconds (server-sent events).
 
         `now`: `{status, alarms, sample}`; `graph`: as `/v1/graph`; `away`: `{reason}` while RVMaster does not answer.
-        Ends when the token does.
+        Ends when the token does, and when this appliance becomes the standby.
         """
+        seen = services.history.seen
+        if seen.active:  # the state is at most `history.IDLE_SECONDS` old
+            seen = await services.history.again(_PATIENCE_SECONDS)
+        if seen.active:
+            raise only_standby(seen.away or "", seen.active)
         give_back = streams.take(bearer, peer_of(request), "clients follow")
         following = _follow(services, bearer, graph)
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
@@ -104,6 +110,8 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
             except TimeoutError:
                 continue  # control is slow; check whether the token is still valid
             number = seen.number
+            if seen.active:  # a new request gets the active appliance's address
+                return
             yield _state_event(seen)
             if graph and seen.away is None and time.monotonic() >= graph_due:
                 began = time.monotonic()

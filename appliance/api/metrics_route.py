@@ -1,5 +1,6 @@
 """Answer `/metrics` in Prometheus's format."""
 
+import math
 import os
 import time
 from collections import Counter
@@ -14,13 +15,16 @@ from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 from starlette.responses import Response
 
+from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Viewer, ask
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
-from appliance.channel.admin import MetricsWanted
+from appliance.channel.admin import MetricsWanted, StandbyWanted
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import ForwardingState, ProcessInfo
+from appliance.channel.standby_summary import both_active
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
 from appliance.telemetry.metrics import METRICS, Metric
 
@@ -35,8 +39,14 @@ def routes(services: Services) -> Routes:
 
     async def metrics(bearer: Viewer) -> Response:
         """Return the metrics in Prometheus's text format; docs/reference/metrics.md lists them."""
-        body = await ask(services.control, MetricsWanted(), bearer)
-        return Response(rendered(body, services.journal.calls), media_type=CONTENT_TYPE_LATEST)
+        calls = services.journal.calls
+        try:
+            page = rendered(await ask(services.control, MetricsWanted(), bearer), calls)
+        except ProblemError as problem:
+            if problem.kind != "standby":
+                raise
+            page = rendered_standby(await ask(services.control, StandbyWanted(), bearer), calls)
+        return Response(page, media_type=CONTENT_TYPE_LATEST)
 
     for prefix, name in (("", ""), ("/v1", "_v1")):
         router.add_api_route(
@@ -51,20 +61,29 @@ def routes(services: Services) -> Routes:
 
 def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
     """Return control's measures and the numbers of REST calls by method and status, in Prometheus's format."""
+    return _page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
+
+
+def rendered_standby(state: StandbyState, calls: Mapping[tuple[str, str], int]) -> bytes:
+    """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
+    samples = {**_standby(state), "rosrv_rest_calls_total": calls.items()}
+    return _page(samples, [metric for metric in METRICS if metric.name in samples])
+
+
+def _page(samples: Mapping[str, _Samples], metrics: Iterable[Metric]) -> bytes:
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(_Once(body, calls))
+    registry.register(_Once([_family(metric, samples[metric.name]) for metric in metrics]))
     return generate_latest(registry)
 
 
 class _Once(Collector):
     """A collector of the metrics of one answer."""
 
-    def __init__(self, body: Measures, calls: Mapping[tuple[str, str], int]) -> None:
-        self._samples = {**_samples(body), "rosrv_rest_calls_total": calls.items()}
+    def __init__(self, families: Sequence[Family]) -> None:
+        self._families = families
 
     def collect(self) -> Iterator[Family]:
-        for metric in METRICS:
-            yield _family(metric, self._samples[metric.name])
+        yield from self._families
 
 
 def _family(metric: Metric, samples: _Samples) -> Family:
@@ -147,6 +166,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
         "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
         "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
+        **_standby(status.standby),
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [
@@ -166,6 +186,23 @@ def _forwarding(forwarding: ForwardingState | None) -> dict[str, _Samples]:
         "rosrv_syslog_lag_records": [((), forwarding.behind)],
         "rosrv_syslog_lag_seconds": [((), forwarding.seconds)],
         "rosrv_syslog_missed_total": [((), forwarding.missed)],
+    }
+
+
+def _standby(state: StandbyState | None) -> dict[str, _Samples]:
+    """Return the samples of one of two appliances; none on a single appliance."""
+    if state is None:
+        return {metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")}
+    other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
+    return {
+        "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],
+        "rosrv_standby_connected": [((), other.connected)],
+        "rosrv_standby_in_sync": [((), other.in_sync)] if active else [],
+        "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
+        "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
+        "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
+        "rosrv_standby_both_active": [((), both_active(state))] if active else [],
+        "rosrv_standby_takeovers_total": [((), state.epoch)],
     }
 
 

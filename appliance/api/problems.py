@@ -42,6 +42,7 @@ class Problem(msgspec.Struct, frozen=True, omit_defaults=True):
     column: int | None = None
     findings: list[Finding] | None = None
     errors: list[BadInput] | None = None
+    active: Annotated[str | None, doc("address of the active appliance (problem `standby`)")] = None
 
 
 class ProblemError(Exception):
@@ -59,6 +60,7 @@ class ProblemError(Exception):
         errors: list[BadInput] | None = None,
         line: int | None = None,
         column: int | None = None,
+        active: str | None = None,
     ) -> None:
         super().__init__(detail)
         self.status = status
@@ -69,6 +71,7 @@ class ProblemError(Exception):
             self.headers["Retry-After"] = str(retry_after)
         self.findings = findings
         self.errors = errors
+        self.active = active
         self.line = findings[0].line if findings else line
         self.column = findings[0].column if findings else column
 
@@ -83,6 +86,7 @@ class ProblemError(Exception):
             column=self.column,
             findings=self.findings[:_MOST_FINDINGS] if self.findings is not None else None,
             errors=self.errors[:_MOST_FINDINGS] if self.errors is not None else None,
+            active=self.active,
         )
         return Response(msgspec.json.encode(problem), self.status, self.headers, MEDIA_TYPE)
 

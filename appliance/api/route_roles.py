@@ -63,6 +63,7 @@ _PROBLEMS = {
     "busy": (503, "busy"),
     "failed": (503, "not-available"),
 }
+_STANDBY_SECONDS = 2  # until a client may ask a standby again
 
 
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
@@ -82,6 +83,8 @@ def answered(answer: AdminAnswer[A]) -> A:
     """Return the body of an answer. Raises `ProblemError` for a rejection."""
     if answer.ok:
         return answer.given()
+    if answer.trouble == "standby":
+        raise only_standby(answer.error, answer.active)
     raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))
 
 
@@ -89,3 +92,8 @@ def problem_of(trouble: Trouble, detail: str) -> ProblemError:
     """Return the problem for a rejection by control."""
     status, kind = _PROBLEMS.get(trouble, (503, "not-available"))
     return ProblemError(status, kind, detail)
+
+
+def only_standby(detail: str, active: str) -> ProblemError:
+    """Return the problem for a request to a standby; `active` is the address of the active appliance."""
+    return ProblemError(503, "standby", detail, retry_after=_STANDBY_SECONDS, active=active)

@@ -93,6 +93,8 @@ EVENTS: dict[str, str] = {
     "token revoked": "An access token for REST was revoked before its expiry.",
     "token rotated": "An access token for REST replaced the earlier ones of its name; `detail` has its name, role, id"
     " and expiry, the ids of the `earlier` ones, and their end in `earlier_until`.",
+    "switchover ordered": "An operator ordered the active appliance to hand over to the standby; `detail` has who.",
+    "switchover failed": "An ordered switchover did not happen; `reason` says why, `detail` has who ordered it.",
     "process started": "A process of the appliance started.",
     "process died": "A process of the appliance ended unexpectedly.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
@@ -145,13 +147,14 @@ SEVERITIES: dict[str, Severity] = {
             "evidence exported", "forwarding resumed", "host awaited", "host awaited no longer", "host enrolled",
             "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
-            "token added", "token revoked", "token rotated", "topic looked into",
+            "switchover ordered", "token added", "token revoked", "token rotated", "topic looked into",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "forwarding failed", "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
-            "policy refused", "recording missed", "renewal refused", "specifications refused", "tunnel refused",
+            "policy refused", "recording missed", "renewal refused", "specifications refused", "switchover failed",
+            "tunnel refused",
         ),
         Severity.ALARM: (
             "forwarding gap", "monitors restarted", "probe failed", "process failing", "protection forgotten",

@@ -37,6 +37,7 @@ from appliance.channel.answers import (
     monitor_answers,
     policy_answers,
     recording_answers,
+    standby_answers,
     status,
     token_answers,
 )
@@ -114,6 +115,24 @@ class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
 @rest("viewer", "GET", "/v1/inventory", name="inventory", tag="status")
 class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
     """The running software: version, build, parts with their licences, and the kernel's features in use."""
+
+
+@rest(
+    "viewer", "GET", "/v1/standby", name="standby", tag="status",
+    problems={404: "This appliance is not one of two."},
+)  # fmt: skip
+class StandbyWanted(AdminRequest[standby_answers.StandbyState], frozen=True, tag="standby"):
+    """This appliance, the other one, and the witness on the robot. The standby also answers it."""
+
+
+@rest(
+    "admin", "POST", "/v1/standby/promote", name="promote_standby", tag="status",
+    problems={404: "This appliance is not one of two."},
+)  # fmt: skip
+class StandbyPromote(WaitingRequest[standby_answers.StandbyState], frozen=True, tag="standby promote"):
+    """Make the standby the active appliance: a planned switchover. The answer may be lost, because this appliance
+    becomes the standby; `GET /v1/standby` shows the result.
+    """
 
 
 @rest("operator", "POST", "/v1/policy/reload", _WITHIN, name="reload_policy", of=POLICY)
@@ -710,7 +729,7 @@ def operation_of(request: AdminRequest[Any]) -> Operation | None:
     return None
 
 
-Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]
+Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed", "standby"]
 
 
 class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
@@ -718,7 +737,8 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
 
     `trouble` is the kind of an error: `request` (makes no sense), `refused` (the policy or name given is wrong),
     `conflict` (another revision is in force than expected; `tag` is that of the monitors), `unknown` (no such thing),
-    `forbidden` (not for this client), `busy` (too much at once), `failed` (the appliance cannot do it now).
+    `forbidden` (not for this client), `busy` (too much at once), `failed` (the appliance cannot do it now), `standby`
+    (only the active appliance can do it; `active` is its address).
     """
 
     ok: bool
@@ -727,6 +747,7 @@ class AdminAnswer(msgspec.Struct, Generic[A], frozen=True):
     findings: list[str] = []
     trouble: Trouble = ""
     tag: str = ""
+    active: str = ""
 
     def given(self) -> A:
         """Return the body of a successful answer (`ok`)."""

@@ -1,5 +1,7 @@
 """The health check of a container, `python -m appliance.cli.healthy`: exit status 0 while nodes are served.
 
+A standby is healthy while it runs: its nodes are served by the active appliance.
+
 Problems that do not affect nodes, such as a certificate that expires soon, appear only in `rosrv status`: for them, a
 container engine would restart the appliance in vain. The check runs every few seconds, so it imports very little.
 """
@@ -21,6 +23,8 @@ def main() -> None:
     state = Path(os.environ.get("ROSRV_STATE", _STATE))
     try:
         answer = AdminSocket(state, _SECONDS).ask(StatusWanted())
+        if answer.trouble == "standby":
+            return
         reason = unserved(answer.given()) if answer.ok else answer.error
     except NotRunningError as error:
         reason = f"the appliance does not answer: {error}"

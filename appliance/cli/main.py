@@ -133,6 +133,13 @@ VERBS: dict[str, Verb | Group] = {
             "unblock": Verb("host.block_verbs:unblock"),
         },
     ),
+    "standby": Group(
+        "Run two appliances, of which one stands by to take over.",
+        {
+            "status": Verb("standby.live_verbs:status"),
+            "promote": Verb("standby.live_verbs:promote"),
+        },
+    ),
     "backup": Verb("backup:backup"),
     "restore": Verb("backup:restore"),
     "purge": Verb("backup:purge"),

@@ -2,7 +2,7 @@
 
 import datetime
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
@@ -15,8 +15,9 @@ from rich.text import Text
 from appliance.api.alarms import activity, open_alarms
 from appliance.api.moments import in_full
 from appliance.base.actors import DISK
-from appliance.channel.admin import StatusWanted
+from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     ClockState,
     FirewallState,
@@ -25,10 +26,12 @@ from appliance.channel.answers.status import (
     ProcessInfo,
     Status,
 )
+from appliance.channel.standby_summary import standby_troubles
 from appliance.channel.status_summary import process_names
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
+from appliance.cli.standby.standby_view import answer_in_words, lag_in_words, standby_view
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import counted
@@ -61,6 +64,8 @@ def status(
 ) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 
+    On a standby, show both appliances, as `rosrv standby status` does.
+
     Exit status: 0 in service, 1 needs attention, 2 not running; with --watch that of the last status.
 
     Example: rosrv status --watch --every 5
@@ -71,7 +76,7 @@ def status(
         if watch:
             each = every or _WATCH_SECONDS
             raise typer.Exit(watched(partial(_look, appliance), each, as_json=appliance.as_json))
-        view = _view(appliance.body_or_exit(appliance.ask(StatusWanted())))
+        view = appliance.body_or_exit(_answer(appliance))
     except NotRunningError as error:
         raise usage_error(str(error)) from None
     if appliance.as_json:
@@ -83,10 +88,25 @@ def status(
 
 def _look(appliance: Appliance) -> StatusView:
     """Return the present status. Raises `NotRunningError` also for an appliance that cannot give it now."""
-    answer = appliance.ask(StatusWanted())
+    answer = _answer(appliance)
     if not answer.ok:
         raise NotRunningError(answer.error)
-    return _view(answer.given())
+    return answer.given()
+
+
+def _answer(appliance: Appliance) -> AdminAnswer[StatusView]:
+    """Return the status; on a standby, which has none, the state of both appliances. Raises `NotRunningError`."""
+    answer = appliance.ask(StatusWanted())
+    if answer.trouble == "standby":
+        state = appliance.ask(StandbyWanted())
+        return _shown(state, standby_view)
+    return _shown(answer, _view)
+
+
+def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnswer[StatusView]:
+    if answer.ok:
+        return AdminAnswer(True, view(answer.given()))
+    return AdminAnswer(False, error=answer.error, findings=answer.findings, trouble=answer.trouble)
 
 
 def _view(body: Status) -> StatusView:
@@ -135,6 +155,8 @@ def _grid(body: Status) -> Table:
     doubted = doubted_clock(body.clock)
     if doubted is not None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
+    if body.standby is not None:
+        grid.add_row("standby", _standby(body.standby))
     for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
     grid.add_row("policy", _policy(body.policy))
@@ -169,6 +191,12 @@ def _grid(body: Status) -> Table:
         kept = body.recorder
         grid.add_row("recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB")
     return grid
+
+
+def _standby(state: StandbyState) -> Text:
+    other, witness = lag_in_words(state.other), answer_in_words(state.witness)
+    line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
+    return Text(line, style=_YELLOW if any(standby_troubles(state)) else "")
 
 
 def _policy(policy: PolicyState) -> Text:

@@ -12,6 +12,7 @@ from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.evidence_orders import NotSealedError
+from appliance.control.lease_client import HandOverError
 from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecorderAwayError
@@ -48,16 +49,18 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     TokenRefusedError: "refused",
     RecorderAwayError: "failed",
     NotSealedError: "failed",
+    HandOverError: "failed",
     StoreError: "failed",
 }
 # Requests that are rejected if the store cannot be written. A block or revocation is not in the list: it takes effect
-# at once, and its answer reports if it was not stored. The recorder checks its own disk space.
+# at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a reason
+# to switch over.
 KEPT = (
     admin.CHANGES
     | {admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}
 ) - {
     admin.HostBlock, admin.HostRevoke, admin.TokenRevoke,
-    admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove,
+    admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove, admin.StandbyPromote,
 }  # fmt: skip
 
 

@@ -48,15 +48,11 @@ def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Call
 
 
 async def leave_state(pair: Pair, store: StateStore, relay: RelayControl) -> None:
-    """Stop the relays, and store the state of their monitors.
-
-    Raises `HandOverError` if a relay does not answer; then all relays pass messages again.
-    """
+    """Stop the relays, and store the state of their monitors. Raises `HandOverError` if a relay does not answer."""
     try:
         async with asyncio.timeout(_LEAVE_SECONDS):
             contents = await relay.leave()
     except (TimeoutError, ConnectionError) as error:
-        relay.pass_again()
         raise HandOverError("a relay does not answer; try again") from error
     for index, content in enumerate(contents):
         store.save_monitor_state(index, pair.epoch, content)

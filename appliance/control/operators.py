@@ -15,6 +15,7 @@ from appliance.control.overview import hosts_connected
 from appliance.control.queries import Queries
 from appliance.control.request_methods import request_methods
 from appliance.control.rest import RestLink
+from appliance.control.standby_orders import StandbyOrders, StandbySource
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.control.token_orders import TokenOrders
 from appliance.hosts.certification import Certification
@@ -33,11 +34,12 @@ class Operators:
     forwarded: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
+    standby: StandbyOrders
     administration: Administration
     rest: RestLink
 
 
-def make_operators(base: Foundation, parts: Parts) -> Operators:
+def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Operators:
     """Make the parts that serve operators. The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
     certification = Certification(
@@ -89,7 +91,9 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         live=core.revocation.live,
         switched_off=switched_off.rows,
         blocks=blocks.status,
+        standby=standby.state,
     )
+    orders = StandbyOrders(standby, trail)
     administration = Administration(
         looks,
         request_methods(
@@ -102,6 +106,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
             recordings=ends.recordings,
             blocks=blocks,
             evidence=EvidenceOrders(base.audit, trail),
+            standby=orders,
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,
@@ -123,6 +128,7 @@ def make_operators(base: Foundation, parts: Parts) -> Operators:
         forwarded=forwarded,
         switched_off=switched_off,
         blocks=blocks,
+        standby=orders,
         administration=administration,
         rest=rest(),
     )

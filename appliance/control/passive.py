@@ -10,15 +10,15 @@ from typing import Any
 
 import structlog
 
-from appliance.channel import admin, messages
-from appliance.channel.admin import A
+from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.admin_socket import AdminServer
-from appliance.control.lease_client import LeaseClient
+from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.control.replication import state_of
+from appliance.control.standby_orders import StandbyAdministration
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership
@@ -56,15 +56,20 @@ class PassiveControl:
         self._receiver = ReplicationReceiver(self._replica, self._accepts)
         self._epoch = 0
         self._connected = False
+        self._away_since = time.monotonic()
         self._reason = ""
-        self._rest = PassiveRest(self, ReplicatedTokens(self._folder / "state.db"))
+        self._rest = PassiveRest(
+            StandbyAdministration(self, orders=False), ReplicatedTokens(self._folder / "state.db")
+        )
         self.api: Channel | None = None  # the link to the api, after `run`
 
     async def run(self, until: asyncio.Event) -> None:
         """Stand by until the event is set. Then the state file is closed and consistent."""
         loop = asyncio.get_running_loop()
         following = loop.create_task(self._follow())
-        server = await AdminServer(self).start(self._lifeline.sockets[_ADMIN].dup())
+        server = await AdminServer(StandbyAdministration(self, orders=True)).start(
+            self._lifeline.sockets[_ADMIN].dup()
+        )
         stating = loop.create_task(self._rest.run())
         self._lifeline.hear(self._heard)
         self._lifeline.say(messages.Ready({"stands_by": True}))
@@ -91,19 +96,20 @@ class PassiveControl:
             behind_bytes=0,
             waiting_seconds=None,
             reason="" if self._connected else self._reason,
+            trouble_seconds=None if self._connected else round(time.monotonic() - self._away_since, 3),
         )
         wait = self._settings.availability.wait
         return state_of(self._membership, lease, role="standby", since=self._since, wait=wait, other=other)
 
-    async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:  # noqa: ARG002
-        """Answer a request of an operator on the admin socket."""
-        return admin.AdminAnswer(False, error=self._elsewhere(), trouble="failed")
-
-    def _elsewhere(self) -> str:
-        return (
-            f"this appliance ({self._membership.name}) is the standby of {self._membership.other}"
-            f" ({self._membership.other_address}); give the command there"
-        )
+    async def hand_over(self) -> None:
+        """Ask the active appliance to hand over. Raises `HandOverError` if it is not connected."""
+        try:
+            await self._receiver.want_switchover()
+        except ReplicationError as error:
+            raise HandOverError(
+                f"{self._membership.other} ({self._membership.other_address}): {error}; if it is away, this"
+                " appliance takes over automatically once the lease has expired"
+            ) from error
 
     def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
         """Serve the api; leave the other messages of the supervisor to the active control."""
@@ -124,7 +130,8 @@ class PassiveControl:
                     self._reason = str(error)
                     _log.info("the active appliance is not followed", reason=self._reason)
             finally:
-                self._connected = False
+                if self._connected:
+                    self._connected, self._away_since = False, time.monotonic()
             await asyncio.sleep(_AGAIN_SECONDS)
 
     def _accepts(self, epoch: int) -> bool:

@@ -35,6 +35,7 @@ from appliance.control.policies import PolicyRefusedError
 from appliance.control.replication import Pair
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import SpareMemory
+from appliance.control.standby_orders import standby_source
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.hosts.tunnel_state import Tunnels
@@ -109,7 +110,7 @@ async def _start(
     await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
     if pair is not None:
         parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
-    control = _Control(base, parts, make_operators(base, parts))
+    control = _Control(base, parts, make_operators(base, parts, standby_source(base, parts)))
     await _restore(base, parts)
     await control.serve()
     await parts.reconciler.ready.wait()
@@ -159,7 +160,7 @@ class _Control:
             parts.publisher.run(parts.reconciler.ready),
         ]
         if base.replication is not None:
-            work.append(base.replication.run())
+            work += [base.replication.run(), operators.standby.obey(base.replication.switchover_wanted)]
         self._tasks += map(asyncio.get_running_loop().create_task, work)
 
     async def announce(self, *, restarted: bool) -> None:
@@ -168,6 +169,8 @@ class _Control:
         token = await self._operators.tokens.first() if settings.api_address is not None else None
         host = settings.listen_address[0]
         told = master_address(settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
+        if base.pair is not None:
+            told = base.pair.membership.fixed
         uri = node_uri(told, base.port(RVMASTER))
         base.lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:

@@ -19,6 +19,7 @@ from appliance.channel.answers.graph_answers import (
 from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     AuditState,
     BlocksState,
@@ -58,7 +59,8 @@ class Queries:
 
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
     recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
-    that is switched off. `blocks()` returns the state of the blocks of hosts.
+    that is switched off. `blocks()` returns the state of the blocks of hosts. `standby()` returns the state of the two
+    appliances, or None if this one is not one of two.
     """
 
     parts: Parts
@@ -73,6 +75,7 @@ class Queries:
     live: Callable[[], list[LiveRight]]
     switched_off: Callable[[], list[SwitchedOff]]
     blocks: Callable[[], BlocksState]
+    standby: Callable[[], StandbyState | None]
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
@@ -198,6 +201,7 @@ class Queries:
             switched_off=self.switched_off(),
             blocks=self.blocks(),
             last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
+            standby=self.standby(),
         )
 
     def _policy(self) -> PolicyState:

@@ -10,7 +10,6 @@
 import asyncio
 import socket
 import time
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -97,7 +96,10 @@ def state_of(
 
 
 class Replication:
-    """The replication of an active appliance. Create it before the first change that the standby needs."""
+    """The replication of an active appliance. Create it before the first change that the standby needs.
+
+    `switchover_wanted` is set when an operator of the standby orders a switchover.
+    """
 
     def __init__(
         self,
@@ -115,14 +117,16 @@ class Replication:
         self._database = database
         self._wait = wait
         self._since = time.time()
-        self._sender = ReplicationSender(database, lambda: epoch)
+        self.switchover_wanted = asyncio.Event()
+        self._sender = ReplicationSender(
+            database, lambda: epoch, switchover_wanted=self.switchover_wanted.set
+        )
         self._listener = ReplicationListener(
             self._sender, replication_context(membership, folder, server=True)
         )
         self._permission = 0
+        self._trouble_since: float | None = None
         self._reported: messages.ReplicationReported | None = None
-        self._leaving: Callable[[], Awaitable[None]] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
         lease.listen(self._lease_changed)
 
     async def run(self) -> None:
@@ -148,36 +152,33 @@ class Replication:
 
     def state(self) -> StandbyState:
         """Return the state of both appliances."""
-        lag, lease = self._sender.lag(), self._lease.state
-        waiting = lag.waiting_since
+        lag, lease, now = self._sender.lag(), self._lease.state, asyncio.get_running_loop().time()
+        waiting, trouble = lag.waiting_since, self._trouble_since
         other = OtherAppliance(
             name=self._membership.other,
             address=self._membership.other_address,
             connected=lag.connected,
-            in_sync=lease is not None and lease.in_sync and not lease.alone,
+            in_sync=self._in_sync(),
             behind_changes=lag.changes,
             behind_bytes=lag.bytes,
-            waiting_seconds=None
-            if waiting is None
-            else round(asyncio.get_running_loop().time() - waiting, 3),
+            waiting_seconds=None if waiting is None else round(now - waiting, 3),
             reason="" if lag.connected else lag.reason,
+            trouble_seconds=None if trouble is None else round(now - trouble, 3),
         )
         return state_of(
             self._membership, lease, role="active", since=self._since, wait=self._wait, other=other
         )
 
-    async def hand_over(self, leaving: Callable[[], Awaitable[None]]) -> None:
-        """Let the standby take over: a planned switchover. `leaving()` makes the last changes and records.
-
-        Raises `HandOverError` with the reason if that is not possible now; this appliance then stays active.
-        """
-        lease = self._lease.state
-        if lease is None or not lease.in_sync or lease.alone or not self._sender.lag().connected:
+    def require_ready(self) -> None:
+        """Raise `HandOverError`, with the reason, unless the standby could take over now."""
+        if not self._in_sync() or not self._sender.lag().connected:
             raise HandOverError(
                 f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
                 " in sync"
             )
-        await leaving()
+
+    async def hand_over(self) -> None:
+        """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""
         try:
             async with asyncio.timeout(_SETTLE_SECONDS):
                 await self._sender.acknowledged(self._database.number)
@@ -193,8 +194,16 @@ class Replication:
             self._sender.answer_alone()
             self._report()
 
+    def _in_sync(self) -> bool:
+        lease = self._lease.state
+        return lease is not None and lease.in_sync and not lease.alone
+
     async def _report_always(self) -> None:
         while True:
+            if self._in_sync() and self._sender.lag().connected:
+                self._trouble_since = None
+            elif self._trouble_since is None:
+                self._trouble_since = asyncio.get_running_loop().time()
             self._report()
             await asyncio.sleep(_REPORT_SECONDS)
 

@@ -11,6 +11,7 @@ from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecordingOrders
+from appliance.control.standby_orders import StandbyOrders
 from appliance.control.token_orders import TokenOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
@@ -41,6 +42,7 @@ def request_methods(
     recordings: RecordingOrders,
     blocks: BlockOrders,
     evidence: EvidenceOrders,
+    standby: StandbyOrders,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request."""
     return (
@@ -51,6 +53,8 @@ def request_methods(
         RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),
         RequestMethod(admin.MetricsWanted, queries.metrics, order=False),
         RequestMethod(admin.RegistrationsWanted, queries.registrations, order=False),
+        RequestMethod(admin.StandbyWanted, standby.state, order=False),
+        RequestMethod(admin.StandbyPromote, standby.promote, who=True, order=False),
         RequestMethod(admin.PolicyReload, policies.reload, who=True),
         RequestMethod(admin.PolicyLoad, policies.load, who=True),
         RequestMethod(admin.PolicyRollback, policies.roll_back, who=True),

@@ -129,6 +129,28 @@ METRICS = (
     _gauge("rosrv_recorder_up", "1 while the flight recorder runs; absent if recording is off"),
     _gauge("rosrv_recordings", "stored recordings"),
     _gauge("rosrv_recordings_bytes", "bytes of the stored recordings"),
+    _gauge(
+        "rosrv_standby_role",
+        "1 for the role of this appliance, 0 for the other: active, standby;"
+        " absent, like all `rosrv_standby` metrics, if it is not one of two",
+        "role",
+    ),
+    _gauge("rosrv_standby_connected", "1 while the replication between the two appliances is open"),
+    _gauge("rosrv_standby_in_sync", "1 while the standby may take over; only on the active appliance"),
+    _gauge("rosrv_standby_behind_changes", "changes that the standby lacks; only on the active appliance"),
+    _gauge("rosrv_standby_behind_bytes", "bytes of these changes in memory; only on the active appliance"),
+    _gauge(
+        "rosrv_standby_witness_age_seconds",
+        "time since the last answer of the witness; +Inf if it never answered",
+    ),
+    _gauge(
+        "rosrv_standby_both_active",
+        "1 while this appliance is active, but the witness names the other; only on the active appliance",
+    ),
+    _counter(
+        "rosrv_standby_takeovers_total",
+        "takeovers since the two appliances were joined: the epoch that this appliance knows last",
+    ),
     _gauge("rosrv_policy_revision", "revision of the policy in force"),
     _gauge("rosrv_policy_differs_from_file", "1 while the policy in force differs from its file"),
     _counter("rosrv_process_restarts_total", "times a process was started again", "role"),

@@ -63,7 +63,7 @@ class FakeAppliance:
         self.decide(verb, lambda _request: AdminAnswer(False, None, error, list(findings), trouble))
 
     def decide(self, verb: str, answer: Answer) -> None:
-        """Call this function for each answer from now on."""
+        """Call this function for each answer from now on; `ConnectionResetError` closes the connection instead."""
         assert verb in _KINDS, f"{verb!r} is not one of {sorted(_KINDS)}"
         self._answers[verb] = answer
 
@@ -90,7 +90,10 @@ class FakeAppliance:
                     self.requests.append(line.decode().strip())
                     request = msgspec.json.decode(line)
                     answer = self._answers.get(request["verb"], _unknown)
-                    peer.sendall(encode(answer(request)) + b"\n")
+                    try:
+                        peer.sendall(encode(answer(request)) + b"\n")
+                    except ConnectionResetError:  # the appliance ends before it answers
+                        break
 
     # --- REST ---
 

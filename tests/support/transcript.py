@@ -40,7 +40,7 @@ import re
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast, get_args
 from unittest import mock
 
 import pytest
@@ -153,7 +153,7 @@ class Transcript:
         if not self._serves:
             self._fake.serve(Path("state"))
             self._serves = True
-        if words[-1] in ("request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"):
+        if len(words) > 1 and words[-1] in get_args(Trouble):
             self._fake.reject(" ".join(words[:-1]), cast(Trouble, words[-1]), *below)
         else:
             self._fake.answer(" ".join(words), **(yaml.safe_load("\n".join(below)) or {}))

@@ -20,6 +20,10 @@ class OtherAppliance(msgspec.Struct, frozen=True):
         float | None, doc("age of the oldest answer that waits for it; null: none waits")
     ]
     reason: Annotated[str, doc("why the last replication ended; empty: it is open, or never began")]
+    trouble_seconds: Annotated[
+        float | None,
+        doc("how long it has been away, or (on the active appliance) not in sync; null: neither"),
+    ]
 
 
 class WitnessSeen(msgspec.Struct, frozen=True):

@@ -6,6 +6,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.host_answers import PortsSeen
+from appliance.channel.answers.standby_answers import StandbyState
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):
@@ -218,3 +219,4 @@ class Status(msgspec.Struct, frozen=True):
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
     blocks: BlocksState = BlocksState(0, None)
     last_minute: MinuteState = MinuteState(0, {})
+    standby: Annotated[StandbyState | None, doc("null: this appliance is not one of two")] = None

@@ -30,6 +30,8 @@ class RestWay:
             return AdminAnswer(True, _carry_out(self.client, request))
         except RestProblemError as problem:
             trouble: Trouble = "unknown" if problem.status == 404 else ""
+            if problem.kind == "standby":
+                trouble = "standby"
             return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:], trouble=trouble)
 
     def audit(self) -> "RestLog":

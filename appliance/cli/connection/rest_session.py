@@ -172,7 +172,7 @@ class RestClient:
                 )
             case 403 | 421:
                 return AccessDeniedError(f"{self.url}: {detail}")
-            case 429 | 503 if wait is not None:
+            case 429 | 503 if wait is not None and kind != "standby":
                 return NotRunningError(f"{self.url}: {detail}; try again in {wait} s")
         if kind == "unknown-path":
             return NotRunningError(f"{self.url}: this appliance's version does not offer that over REST")

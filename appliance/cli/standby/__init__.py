@@ -1,0 +1,1 @@
+"""`rosrv standby`: two appliances, of which one stands by."""

@@ -1,0 +1,171 @@
+"""Answer operators about the two appliances, and order a planned switchover (docs/standby.md)."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol
+
+from appliance.channel import admin
+from appliance.channel.admin import A
+from appliance.channel.answers.standby_answers import StandbyState
+from appliance.control.assembly import Parts
+from appliance.control.errors import UnknownThingError
+from appliance.control.foundation import Foundation
+from appliance.control.inheritance import leave_state
+from appliance.control.lease_client import HandOverError
+from appliance.control.replication import Replication
+from appliance.telemetry.audit_trail import AuditTrail
+
+_STANDBY = "the standby"
+_SINGLE = "this appliance is not one of two; to add a standby, run `rosrv standby join` on both appliances"
+
+
+class StandbySource(Protocol):
+    """The state of the two appliances, and the switchover."""
+
+    def state(self) -> StandbyState | None:
+        """Return the state of both appliances; None: this appliance is not one of two."""
+
+    async def hand_over(self) -> None:
+        """Make the standby the active appliance. The active appliance may end before this returns.
+
+        On the standby: ask the active appliance to hand over. Raises `HandOverError`.
+        """
+
+
+class SingleAppliance:
+    """The `StandbySource` of an appliance that is not one of two."""
+
+    def state(self) -> None:
+        """Return None."""
+
+    async def hand_over(self) -> None:
+        """Raise `HandOverError`."""
+        raise HandOverError(_SINGLE)
+
+
+class ActiveAppliance:
+    """The `StandbySource` of the active one of two.
+
+    `leaving()` stops the relays and makes the last changes before the switchover. If it fails, `staying()` is called.
+    """
+
+    def __init__(
+        self,
+        replication: Replication,
+        leaving: Callable[[], Awaitable[None]],
+        staying: Callable[[], None],
+    ) -> None:
+        self._replication = replication
+        self._leaving = leaving
+        self._staying = staying
+
+    def state(self) -> StandbyState:
+        """Return the state of both appliances."""
+        return self._replication.state()
+
+    async def hand_over(self) -> None:
+        """Make the standby the active appliance. Raises `HandOverError`."""
+        self._replication.require_ready()
+        try:
+            await self._leaving()
+            await self._replication.hand_over()
+        except HandOverError:
+            self._staying()
+            raise
+
+
+def standby_source(base: Foundation, parts: Parts) -> StandbySource:
+    """Return the source of an appliance in service."""
+    pair, replication, relay = base.pair, base.replication, parts.endpoints.relay
+    if pair is None or replication is None:
+        return SingleAppliance()
+
+    async def leaving() -> None:
+        await leave_state(pair, base.store, relay)
+        base.store.save_parameters(parts.core.parameters.tree)
+
+    return ActiveAppliance(replication, leaving, relay.pass_again)
+
+
+class StandbyOrders:
+    """The answers of an appliance in service. Its methods raise `UnknownThingError` on a single appliance."""
+
+    def __init__(self, source: StandbySource, trail: AuditTrail) -> None:
+        self._source = source
+        self._trail = trail
+
+    async def state(self, _request: admin.StandbyWanted) -> StandbyState:
+        """Return the state of both appliances."""
+        return _state_of(self._source)
+
+    async def promote(self, _request: admin.StandbyPromote, who: str) -> StandbyState:
+        """Make the standby the active appliance. Raises `HandOverError`.
+
+        The order is on disk before the hand-over begins, because the hand-over ends this process.
+        """
+        other = _state_of(self._source).other
+        self._trail.happened(
+            "switchover ordered", f"{other.name} ({other.address}) is to become the active appliance", who=who
+        )
+        await self._trail.durable()
+        try:
+            await self._source.hand_over()
+        except HandOverError as error:
+            self._trail.happened("switchover failed", str(error), who=who)
+            await self._trail.durable()
+            raise
+        return _state_of(self._source)
+
+    async def obey(self, wanted: asyncio.Event) -> None:
+        """Carry out the orders that operators give on the standby, until cancelled."""
+        while True:
+            await wanted.wait()
+            wanted.clear()
+            with contextlib.suppress(HandOverError):  # recorded
+                await self.promote(admin.StandbyPromote(), _STANDBY)
+
+
+class StandbyAdministration:
+    """The answers of a standby: its state and, if `orders`, the switchover. All other requests are rejected.
+
+    `orders` is for the admin socket only: over REST, the order is given to the active appliance, which records it.
+    """
+
+    def __init__(self, source: StandbySource, *, orders: bool) -> None:
+        self._source = source
+        self._answers: dict[type, Callable[[], Awaitable[StandbyState]]] = {admin.StandbyWanted: self._state}
+        if orders:
+            self._answers[admin.StandbyPromote] = self._promoted
+
+    async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
+        """Answer a request, whose sender does not matter."""
+        del who
+        answer: Callable[[], Awaitable[Any]] | None = self._answers.get(type(request))
+        if answer is None:
+            return on_standby(_state_of(self._source))
+        try:
+            return admin.AdminAnswer(True, await answer())
+        except HandOverError as error:
+            return admin.AdminAnswer(False, error=str(error), trouble="failed")
+
+    async def _state(self) -> StandbyState:
+        return _state_of(self._source)
+
+    async def _promoted(self) -> StandbyState:
+        await self._source.hand_over()
+        return _state_of(self._source)
+
+
+def on_standby(state: StandbyState) -> admin.AdminAnswer[Any]:
+    """Return the answer of a standby to a request that only the active appliance can carry out."""
+    other = state.other
+    text = f"this appliance is the standby of {other.name} ({other.address}); give the command there"
+    return admin.AdminAnswer(False, error=text, trouble="standby", active=other.address)
+
+
+def _state_of(source: StandbySource) -> StandbyState:
+    state = source.state()
+    if state is None:
+        raise UnknownThingError(_SINGLE)
+    return state

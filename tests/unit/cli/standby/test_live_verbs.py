@@ -1,0 +1,89 @@
+"""`rosrv standby promote` waits until the other appliance is active, although the process that answers ends."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.channel.admin import AdminAnswer
+from appliance.channel.answers.standby_answers import StandbyState
+from appliance.cli.standby import live_verbs
+from tests.support.answers import example
+from tests.support.command import rosrv
+from tests.support.fake_appliance import FakeAppliance
+
+AWAY = AdminAnswer[Any](False, error="RVMaster is being restarted", trouble="failed")
+
+
+def state(role: str, epoch: int, holder: str) -> AdminAnswer[Any]:
+    """Return what appliance `a` answers in this role, while the witness names the holder."""
+    others = {"other": {"name": "b"}, "witness": {"holder": holder}}
+    return AdminAnswer(True, example(StandbyState, name="a", role=role, epoch=epoch, **others))
+
+
+class Pair:
+    """Appliance `a` of two; it gives these answers to `standby` in turn, the last one again and again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.fake = FakeAppliance()
+        self.ordered = 0
+        self.answers: list[AdminAnswer[Any]] = []
+        self.fake.decide("standby", lambda _request: self._next())
+        self.fake.decide("standby promote", lambda _request: self._promoted())
+        self.fake.serve(folder)
+
+    def _next(self) -> AdminAnswer[Any]:
+        return self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+
+    def _promoted(self) -> AdminAnswer[Any]:
+        self.ordered += 1
+        return state("active", 4, "a")
+
+    def promote(self, *options: str) -> tuple[int, str, str]:
+        """Run the verb; return the exit status and both outputs."""
+        done = rosrv("standby", "promote", *options, ROSRV_STATE=str(self.folder))
+        return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[Pair]:
+    """Return the active appliance of two."""
+    pair = Pair(tmp_path)
+    with pair.fake:
+        yield pair
+
+
+def test_it_waits_for_the_other_appliance(pair: Pair) -> None:
+    """Neither the old state, a process that is restarted, nor an interim without a holder ends the wait."""
+    pair.answers = [
+        state("active", 4, "a"), state("active", 4, "a"), AWAY, state("standby", 4, ""), state("standby", 5, "b"),
+    ]  # fmt: skip
+    assert pair.promote() == (0, "b is active, epoch 5\n", "")
+    assert (pair.ordered, len(pair.answers)) == (1, 1)
+
+
+def test_a_lost_answer_is_not_a_failure(pair: Pair) -> None:
+    """The switchover ends the process that answers; the state afterwards decides. The order is sent only once."""
+    pair.answers = [state("active", 4, "a"), state("standby", 5, "b")]
+
+    def dies(_request: dict[str, Any]) -> AdminAnswer[Any]:
+        pair.ordered += 1
+        raise ConnectionResetError
+
+    pair.fake.decide("standby promote", dies)
+    status, printed, _errors = pair.promote("--json")
+    assert (status, json.loads(printed)["epoch"], pair.ordered) == (0, 5, 1)
+
+
+def test_a_standby_that_does_not_take_over_is_an_error(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the time limit the verb fails; a takeover back to the first appliance also counts as none."""
+    monkeypatch.setattr(live_verbs, "_SWITCH_SECONDS", 0.3)
+    pair.answers = [state("active", 4, "a"), state("active", 6, "a")]
+    assert pair.promote() == (
+        1,
+        "",
+        "rosrv standby: b is not active after 0.3 s; see: rosrv standby status\n",
+    )
