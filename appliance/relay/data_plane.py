@@ -13,7 +13,6 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
-from appliance.channel.messages.relay_link import ForMonitors
 from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
@@ -116,7 +115,7 @@ class DataPlane:
             self._state(message, descriptors)
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
-        elif isinstance(message, ForMonitors):
+        elif isinstance(message, messages.ForMonitors):
             self._to_monitors(message)
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._tap(message)
@@ -130,7 +129,7 @@ class DataPlane:
             self._table.withdraw(message)
             self._withdrawn(message)
 
-    def _to_monitors(self, message: ForMonitors) -> None:
+    def _to_monitors(self, message: messages.ForMonitors) -> None:
         match message:
             case messages.SpecificationsStated():
                 self.interceptor.state(message)

@@ -21,6 +21,7 @@ from appliance.standby.membership import Membership, path_of, save_membership
 from appliance.standby.witness import LeaseRecord
 from examples.landshark.lab import INTERFACE, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Process
 from tests.support.waiting import eventually
@@ -120,8 +121,6 @@ class StandbySite:
         return one.process
 
     def _up(self, one: Appliance) -> list[str]:
-        from tests.support.command import ROSRV  # noqa: PLC0415
-
         return [
             ROSRV, "up", "--json", "--isolation", "container", "--state", str(one.state), "--policy",
             str(one.policy_file), *one.options,
@@ -141,10 +140,9 @@ class StandbySite:
 
     def cut(self, name: str) -> None:
         """Cut the power of an appliance."""
-        one = self.appliances[name]
-        interfaces.set_link(one.host.namespace, INTERFACE, up=False)  # type: ignore[union-attr]
-        assert one.process is not None
-        for pid in one.host.namespace.processes():  # type: ignore[union-attr]
+        namespace = self.lab.hosts[name].namespace
+        interfaces.set_link(namespace, INTERFACE, up=False)
+        for pid in namespace.processes():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 

@@ -8,7 +8,8 @@ from tests.support.sources import ROOT, product_files
 READERS = {
     "a moment that people are shown, or that stands in a file": [
         "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
-        "cli/status_watch.py", "control/host_blocks.py", "control/policies.py", "control/queries.py",
+        "cli/status_watch.py", "control/host_blocks.py", "control/passive.py", "control/policies.py",
+        "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
         "hosts/checked_ports.py", "hosts/host_table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
@@ -18,7 +19,7 @@ READERS = {
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
-        "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py",
+        "control/passive_rest.py", "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
