@@ -12,7 +12,7 @@ from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.checking import check
-from appliance.specifications.rollout import Revision, Rollout
+from appliance.specifications.rollout import InheritedState, Revision, Rollout
 from appliance.specifications.specification_files import (
     Sources,
     SpecificationsRefusedError,
@@ -346,3 +346,17 @@ async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
         await world.rollout.take(revision(2, **world.files, c=spec("c", "/c")))
     assert world.rollout.compiled_parts == before
     assert not world.fleet.stated
+
+
+async def test_each_relay_inherits_once(world: World) -> None:
+    """A relay gets the inherited state until it has taken it, also in a new process; then none gets it again."""
+    done: list[bool] = []
+    world.rollout.inherit(InheritedState(left=(b"state",)), lambda: done.append(True))
+    first, again = (world.rollout.statement(0) for _ in range(2))
+    assert (first.left, again.left) == ((b"state",), (b"state",))
+    world.rollout.received(taken(again), 0)
+    assert world.rollout.statement(0).left == ()
+    assert done == []
+    world.rollout.received(taken(world.rollout.statement(1)), 1)
+    assert done == [True]
+    assert world.rollout.statement(1).left == ()

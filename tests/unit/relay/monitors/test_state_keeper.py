@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.channel.messages import StateGiven
-from appliance.relay.monitors.state_keeper import StateKeeper
+from appliance.relay.monitors.state_keeper import StateKeeper, received_states
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
@@ -272,3 +272,33 @@ def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
     third = again(monitors)
     begun(third, small)
     assert "exceed the limit" in third.monitor("goals").why_held
+
+
+def test_the_other_appliance_goes_on_with_the_state_that_was_left() -> None:
+    """After a planned switchover the latched stop stays latched, whatever boots the machines are in."""
+    first = stop()
+    keeper = begun(first, bytearray(SIZE))
+    press(first, keeper)
+    second = stop()
+    received = received_states([b"", keeper.content()], time.time_ns())
+    second.recover(received.groups, received.lost, 0)
+    assert second.began == ()
+    assert drives(second) == "dropped"
+    assert not second.monitor("stop").held
+
+
+@pytest.mark.parametrize("wrong", ["damaged", "from the future"])
+def test_a_state_that_was_left_wrongly_is_lost(wrong: str) -> None:
+    """A monitor that acts by it holds its topics, with the reason."""
+    first = stop()
+    keeper = begun(first, bytearray(SIZE))
+    press(first, keeper)
+    content, now = keeper.content(), time.time_ns()
+    second = stop()
+    received = received_states(
+        [content[: len(content) // 2]] if wrong == "damaged" else [content],
+        now if wrong == "damaged" else now - 3_000_000_000,
+    )
+    second.recover(received.groups, received.lost, 0)
+    assert drives(second) == "dropped"
+    assert second.monitor("stop").why_held

@@ -1,0 +1,72 @@
+"""A latched emergency stop survives a switchover, and after a power cut its topics are held."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from examples.landshark.lab import Lab
+from tests.integration.monitors.test_emergency_stop import STOP
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_root, needs
+from tests.support.standby_site import StandbySite
+from tests.support.waiting import eventually
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[StandbySite]:
+    """Yield two appliances in sync, `a` active, with the stop loaded."""
+    need_root()
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with Lab("rosrv-monitors") as lab, StandbySite(lab, tmp_path) as made:
+        made.start_witness()
+        made.start("a")
+        eventually(lambda: made.holder() == "a", made.story)
+        made.start("b")
+        made.until_both_in_sync()
+        spec = made.appliances["a"].directory / "stop.rv"
+        spec.write_text(STOP)
+        made.appliances["a"].rosrv("monitor", "load", str(spec))
+        yield made
+
+
+def monitor(site: StandbySite, name: str) -> dict[str, Any] | None:
+    """Return the row of the monitor in `rosrv monitor list` of an appliance, once that is active."""
+    done = site.appliances[name].rosrv("monitor", "list", "--json", check=False)
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    return next((row for row in rows if row["name"] == "stop"), None)
+
+
+def dropped(site: StandbySite, name: str, least: int) -> bool:
+    """Whether the monitor of an active appliance has dropped this number of messages."""
+    row = monitor(site, name)
+    return row is not None and row["drops"] >= least
+
+
+@pytest.mark.parametrize("planned", [True, False], ids=["switchover", "power cut"])
+def test_a_latched_stop_stays(site: StandbySite, planned: bool) -> None:
+    """After a switchover the monitor goes on; after a power cut it holds its topics until an operator resumes it."""
+    with site.ros() as ros:
+        listener = ros.listener("rospy", "/chatter")
+        ros.talker("roscpp", "/chatter")
+        listener.wait_for_count(3, event="received")
+        ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
+        eventually(lambda: dropped(site, "a", 3), site.story)
+        seen = len(listener.seen(event="received"))
+        if planned:
+            site.appliances["a"].rosrv("standby", "promote")
+        else:
+            site.cut("a")
+        eventually(lambda: site.holder() == "b", site.story)
+        eventually(lambda: dropped(site, "b", 10), site.story)
+        assert len(listener.seen(event="received")) == seen
+        row = monitor(site, "b")
+        assert row is not None
+        assert row["held"] is not planned
+        if planned:
+            ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: false")
+        else:
+            site.appliances["b"].rosrv("monitor", "resume", "stop")
+        listener.wait_for_count(seen + 3, event="received")
