@@ -22,15 +22,24 @@ def demo(
     as_json: Annotated[
         bool, typer.Option("--json", help="One JSON object for each result; the story goes to standard error")
     ] = False,
+    standby: Annotated[
+        bool,
+        typer.Option(
+            "--standby",
+            help="Show two appliances instead: the active one loses its power while the operator drives",
+        ),
+    ] = False,
 ) -> None:
     """Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.
 
-    Exit status: 0 the robot obeyed only its operator, 1 it did not.
+    Exit status: 0 the robot obeyed only its operator (with --standby: the standby took over), 1 it did not.
 
     Example: rosrv demo --hold --picture drive.svg
     """
     if not (SHIPPED / "examples").is_dir():
         raise refused([f"rosrv demo: the simulated robot is missing from {SHIPPED}: install rosrv again"])
+    if standby and picture is not None:
+        raise refused(["rosrv demo: --picture draws the drives of the demonstration without --standby"])
     sys.path.insert(0, str(SHIPPED))
     demonstration = importlib.import_module("examples.landshark.demonstration")
-    raise typer.Exit(demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json))
+    raise typer.Exit(demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json, standby=standby))

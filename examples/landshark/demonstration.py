@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -38,6 +39,7 @@ from examples.landshark.stage import (
     Record,
     Stage,
 )
+from examples.landshark.standby_show import StandbyShow, StandbyStage
 
 PERMITTED = "watch the battery"  # the policy allows this to the attacker's host
 BYPASS = "go past the master"  # bypasses the appliance
@@ -255,7 +257,7 @@ def require_everything() -> None:
         raise DemoError(f"ROS 1 is missing for {NODE_PYTHON}: sudo apt-get install rosout {packages}")
 
 
-def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
+def demonstrate(*, hold: bool, picture: Path | None, as_json: bool, standby: bool = False) -> int:
     """Run the demonstration and return the exit status; draw the robot's paths into the file `picture`."""
     console, errors = Console(stderr=as_json), Console(stderr=True)
     signal.signal(signal.SIGTERM, _interrupt)
@@ -263,13 +265,12 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
         require_everything()
         with ExitStack() as stack:
             lab = stack.enter_context(Lab("rosrv-demo"))
+            if standby:
+                return _show_standby(stack.enter_context(StandbyStage(lab, SHIPPED)), console, hold, as_json)
             stage = stack.enter_context(Stage(lab, SHIPPED))
             show = Show(stage, stack.enter_context(stage.console()), console)
             good = show.run()
-            if as_json:
-                for result in show.results:
-                    say_json(asdict(result))
-                sys.stdout.flush()
+            _print_results(show.results, as_json)
             if picture is not None:
                 stage.draw(show.ways, picture)
                 console.print(f"  {picture}: the robot's paths from above", soft_wrap=True)
@@ -298,6 +299,31 @@ def demonstrate(*, hold: bool, picture: Path | None, as_json: bool) -> int:
         errors.print(f"[red]rosrv demo:[/] {escape(str(error))}", soft_wrap=True)
         return 1
     return 0 if good else 1
+
+
+def _show_standby(stage: StandbyStage, console: Console, hold: bool, as_json: bool) -> int:
+    """Run the demonstration of two appliances; return the exit status."""
+    show = StandbyShow(stage, console)
+    good = show.run()
+    _print_results(show.results, as_json)
+    if hold:
+        command = shutil.which("rosrv") or Path(sys.executable).with_name("rosrv")
+        console.print(
+            f"\nEverything keeps running until Ctrl-C, with b as the active appliance.\n"
+            f"Explore:  {command} standby status --state {stage.other_state}\n"
+            f"          {command} status --state {stage.other_state}",
+            soft_wrap=True,
+            highlight=False,
+        )
+        signal.pause()
+    return 0 if good else 1
+
+
+def _print_results(results: Sequence[Result], as_json: bool) -> None:
+    if as_json:
+        for result in results:
+            say_json(asdict(result))
+        sys.stdout.flush()
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> None:

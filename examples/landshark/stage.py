@@ -145,7 +145,10 @@ class Actor:
 class Stage:
     """The hosts and all their programs, as a context manager that ends them."""
 
-    def __init__(self, lab: Lab, shipped: Path) -> None:
+    def __init__(self, lab: Lab, shipped: Path, master: str = MASTER_URI) -> None:
+        """Make the hosts; `master` is the URI that the nodes get."""
+        self.master = master
+        self.appliances = [APPLIANCE]
         self.shipped = shipped
         self.nodes = shipped / "examples" / "landshark" / "nodes"
         self.monitors = shipped / "monitors"
@@ -162,10 +165,14 @@ class Stage:
 
     def start_appliance(self) -> Event:
         """Start `rosrv up` in its own namespace; return the ready line, once nodes may connect."""
+        return self.run_appliance(self.appliance_host, "rosrv up", self.state).expect("ready")
+
+    def run_appliance(self, host: Host, name: str, state: Path) -> Actor:
+        """Start `rosrv up` on a host."""
         command = [sys.executable, "-m", "appliance.cli.main", "up", "--json", "--isolation", "container"]
         command += [
             "--listen",
-            f"{APPLIANCE}:11311",
+            f"{host.address}:11311",
             "--policy",
             str(self.policy),
             "--monitors",
@@ -173,11 +180,11 @@ class Stage:
             "--enable",
             "none",
             "--state",
-            str(self.state),
+            str(state),
             "--api",
             f"{CONSOLE[0]}:{CONSOLE[1]}",
         ]
-        return self._start(self.appliance_host, "rosrv up", command).expect("ready")
+        return self._start(host, name, command)
 
     def start_robot(self) -> list[Actor]:
         """Start the LandShark's drivers and sensors: five rospy nodes and, if it was compiled, one roscpp node."""
@@ -214,7 +221,9 @@ class Stage:
 
     def protect_robot(self) -> None:
         """Run `rosrv protect` on the robot's machine, so that its nodes' own ports answer the appliance only."""
-        command = [sys.executable, "-m", "appliance.cli.main", "protect", "--appliance", APPLIANCE, "--apply"]
+        command = [sys.executable, "-m", "appliance.cli.main", "protect", "--apply"]
+        for address in self.appliances:
+            command += ["--appliance", address]
         protect = self.robot_host.popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -308,7 +317,7 @@ class Stage:
     def _start(self, host: Host, name: str, command: list[str]) -> Actor:
         kept = {key: value for key, value in os.environ.items() if not key.startswith(("ROS_", "ROSRV_"))}
         environment = kept | {
-            "ROS_MASTER_URI": MASTER_URI,
+            "ROS_MASTER_URI": self.master,
             "ROS_IP": host.address,
             "ROS_HOME": str(self.directory / host.name),
             "PYTHONUNBUFFERED": "1",

@@ -1,10 +1,11 @@
 """Run /ocu, the operator control unit: drive out, aim, fire once, then patrol until a signal.
 
-Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far),
-`position`.
+Prints one JSON object per line: `connected`, `drove` (metres), `aimed` (radians), `fired` (shots so far), `position`.
+While it patrols, `lost` means that the robot's odometry is late, and `regained` has the seconds until it arrived again.
 """
 
 import threading
+import time
 
 import rospy
 from geometry_msgs.msg import TwistStamped
@@ -15,6 +16,7 @@ from sensor_msgs.msg import JointState, NavSatFix
 from std_msgs.msg import UInt32
 
 HERTZ = 10.0
+LATE = 0.3  # seconds; the odometry comes twenty times a second
 PaintballTrigger = paintball_trigger()
 
 
@@ -24,6 +26,8 @@ class Operator:
     def __init__(self):
         self.changed = threading.Condition()
         self.seen = {}
+        self.odometry = 0.0  # monotonic time of the last odometry
+        self.lost = False
         self.velocity = rospy.Publisher("/landshark_control/base_velocity", TwistStamped, queue_size=10)
         self.turret = rospy.Publisher("/landshark_control/turret", JointState, queue_size=10)
         self.trigger = rospy.Publisher("/landshark_control/trigger", PaintballTrigger, queue_size=10)
@@ -39,6 +43,11 @@ class Operator:
         """Store the newest message of a topic."""
         with self.changed:
             self.seen[topic] = message
+            if topic == "/landshark/odom":
+                before, self.odometry = self.odometry, time.monotonic()
+                if self.lost:
+                    self.lost = False
+                    report("regained", seconds=round(self.odometry - before, 2))
             self.changed.notify_all()
 
     def wait(self, condition, seconds=30.0):
@@ -70,6 +79,13 @@ class Operator:
         message = PaintballTrigger(trigger=PaintballTrigger.SINGLE_SHOT)
         message.header.stamp = rospy.Time.now()
         self.trigger.publish(message)
+
+    def watch(self):
+        """Report once that the odometry is late."""
+        with self.changed:
+            if not self.lost and time.monotonic() - self.odometry > LATE:
+                self.lost = True
+                report("lost")
 
     def x(self):
         """Return how far east the robot is, in metres."""
@@ -107,6 +123,7 @@ def main():
         turns = 0
         while not rospy.is_shutdown():
             operator.drive(0.3, 0.5)
+            operator.watch()
             if turns % HERTZ == 0:
                 fix = operator.seen["/landshark/gps"]
                 shots = operator.seen["/landshark/shots"].data
