@@ -13,6 +13,9 @@ FILE = "membership.json"
 LEASE_FILE, LINK_FILE = "lease.json", "link.json"
 """The parts of it that the supervisor writes for the process `lease` and for control."""
 
+LEFT_FILE = "left.json"
+"""The membership that this appliance left last, without its secrets."""
+
 PORT = 7412
 """The default port of both appliances: promises (UDP) and replication (TCP)."""
 
