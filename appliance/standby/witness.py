@@ -3,6 +3,7 @@
 
     witness.py shut   [--settings FILE]                              at boot: shut out both appliances
     witness.py serve  [--settings FILE]                              answer the appliances
+    witness.py follow [--settings FILE]                              on another computer: do as the witness does
     witness.py begin  [--settings FILE] --in-sync a,b --epoch N      write the lease again, after damage
     witness.py remove [--settings FILE]                              remove the firewall rules
 
@@ -20,9 +21,13 @@ holder with TCP resets, also in established connections. An idle connection send
 Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
 acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and
 requests to the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+
+A robot has one witness. Its other computers, and other machines that use the fixed address, are followers: they ask the
+witness (`look`, which changes nothing) and write the same firewall rules.
 """
 
 import argparse
+import contextlib
 import fcntl
 import hashlib
 import hmac
@@ -39,7 +44,7 @@ import struct
 import subprocess
 import sys
 import time
-from typing import Any, Callable, Dict, List, NamedTuple, Optional, Set, Tuple
+from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
 EXPIRY = 1.2  # seconds after a renewal until another appliance may have the lease
 LONGEST = 1024  # bytes of a datagram
@@ -67,6 +72,10 @@ _PROGRAM_SECONDS = 2.0
 _CHECK_SECONDS = 1.0
 _RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
 _BATCH = 256  # datagrams between two checks of the time
+_LOOK_SECONDS = 0.2  # between two requests of a follower
+_LOOKS_A_SECOND = 50  # that the firewall accepts from a follower, so that a flood delays no renewal
+_MOST_PENDING = 8
+_MOST_FOLLOWERS = 32
 _LINES, _LINES_SECONDS = 20, 10.0
 _ESTABLISHED = ("01", "04", "05", "06", "08")  # in /proc/net/tcp: all states in which the peer may still send
 _MAPPED = "0000000000000000FFFF0000"  # an IPv4 address in /proc/net/tcp6
@@ -93,9 +102,15 @@ WitnessSettings = NamedTuple(
         ("ports", Tuple[str, ...]),
         ("appliances", Dict[str, AppliancePeer]),
         ("state", str),
+        ("followers", Dict[str, AppliancePeer]),
+        ("follows_as", str),
     ],
 )
-"""`fixed` is the address that the robot's nodes use; `ports` are translated to the holder."""
+"""`fixed` is the address that the robot's nodes use; `ports` are translated to the holder.
+
+`listen` is the address and port of the witness. `followers` are the other computers that ask it. In the settings of a
+follower, `follows_as` is its name, `followers` has only itself, and the appliances have no keys.
+"""
 
 
 # ---- Datagrams
@@ -320,24 +335,36 @@ class WitnessGate:
     answer repeats both and the appliance's own nonce. An old nonce or number is answered with the present ones.
     """
 
-    def __init__(self, witness: Witness, appliances: Dict[str, AppliancePeer], nonce: str) -> None:
+    def __init__(
+        self,
+        witness: Witness,
+        appliances: Dict[str, AppliancePeer],
+        nonce: str,
+        followers: Optional[Dict[str, AppliancePeer]] = None,
+    ) -> None:
         self._witness = witness
         self._appliances = appliances
+        self._peers = dict(followers or {})
+        self._peers.update(appliances)
         self._nonce = nonce
-        self._last = dict.fromkeys(appliances, 0)
+        self._last = dict.fromkeys(self._peers, 0)
         self.rejected = 0
 
     def answer(self, datagram: bytes, address: str) -> Optional[bytes]:
         """Return the answer to a datagram from `address`, or None if the datagram is not authenticated."""
         name = name_in(datagram)
-        appliance = self._appliances.get(name)
+        peer = self._peers.get(name)
         body = None
-        if appliance is not None and appliance.address == address:
-            body = unseal(REQUEST, appliance.key, datagram)
-        if appliance is None or body is None or not self._well_formed(body):
+        if peer is not None and peer.address == address:
+            body = unseal(REQUEST, peer.key, datagram)
+        if peer is None or body is None or not (self._well_formed(body) and self._allowed(name, body)):
             self.rejected += 1
             return None
-        return seal(ANSWER, name, appliance.key, self._answer(name, body))
+        return seal(ANSWER, name, peer.key, self._answer(name, body))
+
+    def _allowed(self, name: str, body: Dict[str, Any]) -> bool:
+        """Whether this operation is allowed: a follower cannot change the lease, so no rule depends on it."""
+        return name in self._appliances or body["do"] == "look"
 
     def _well_formed(self, body: Dict[str, Any]) -> bool:
         return (
@@ -354,7 +381,7 @@ class WitnessGate:
             answer.update(stale=True, last=self._last[name])
             return answer
         self._last[name] = body["number"]
-        (other,) = set(self._appliances) - {name}
+        other = next(iter(set(self._appliances) - {name}))  # not used for `look`, the operation of followers
         reason = self._witness.handle(name, body["do"], body["epoch"], other)
         record = self._witness.record
         answer.update(
@@ -365,7 +392,122 @@ class WitnessGate:
             in_sync=list(record.in_sync) if record is not None else [],
             expired=not self._witness.left(),
         )
+        if name not in self._appliances:
+            admitted = self._witness.admitted
+            answer.update(
+                admitted=admitted if admitted in self._appliances else "",
+                left=int(self._witness.left() * 1000),
+            )
         return answer
+
+
+class Follower:
+    """The rules of a computer that does as the witness does.
+
+    R1 to R4 of the lease are rules of the witness and the appliances; a follower only asks (`look`). It admits an
+    appliance only while the lease of that appliance runs at the witness: for the time that the answer has left, counted
+    from the time the request was *sent*. The witness grants the lease only after it has expired, or was released by an
+    appliance that had become passive. So whenever the robot admits one appliance, no follower that runs admits the
+    other one, unless that one has given the lease up. Without answers, both are shut out after at most one expiry.
+
+    An answer to an earlier process, an old answer and a repeated one are ignored. `epoch` is the greatest that was
+    saved; a smaller one, of a witness that was restored from an old disk, is not accepted. `save` and `admit` are those
+    of the witness.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        key: bytes,
+        appliances: Iterable[str],
+        session: str,
+        epoch: int,
+        save: Callable[[int], None],
+        admit: Callable[[str], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self.epoch = epoch
+        self.refusal = ""
+        self._name = name
+        self._key = key
+        self._appliances = frozenset(appliances)
+        self._session = session
+        self._save = save
+        self._admit = admit
+        self._clock = clock
+        self._boot = ""
+        self._number = 0
+        self._pending = {}  # type: Dict[int, float]
+        self._holder = ""
+        self._until = 0.0
+        self._admitted = "?"  # unknown: an earlier process may have written rules
+        self.tick()
+
+    def request(self) -> bytes:
+        """Return the next request to the witness."""
+        self._number += 1
+        self._pending[self._number] = self._clock()
+        if len(self._pending) > _MOST_PENDING:
+            del self._pending[min(self._pending)]
+        return seal(
+            REQUEST,
+            self._name,
+            self._key,
+            {
+                "boot": self._boot,
+                "session": self._session,
+                "number": self._number,
+                "do": "look",
+                "epoch": self.epoch,
+            },
+        )
+
+    def receive(self, datagram: bytes) -> None:
+        """Use an answer of the witness. Raises `WitnessError` if the epoch or the rules cannot be written."""
+        body = unseal(ANSWER, self._key, datagram) if name_in(datagram) == self._name else None
+        if body is None or body.get("session") != self._session or not is_count(body.get("number")):
+            return
+        sent = self._pending.get(body["number"])
+        if sent is None:
+            return
+        # An answer that overtook earlier ones is newer: theirs no longer count.
+        self._pending = {number: at for number, at in self._pending.items() if number > body["number"]}
+        if body.get("stale") is True:
+            if isinstance(body.get("boot"), str) and is_count(body.get("last")):
+                self._boot, self._number = body["boot"], max(self._number, body["last"])
+            return
+        epoch, left, admitted = body.get("epoch"), body.get("left"), body.get("admitted")  # type: Any, Any, Any
+        if not (is_count(epoch) and is_count(left) and isinstance(admitted, str)):
+            return
+        self.refusal = ""
+        if body.get("ok") is not True:
+            self.refusal = str(body.get("reason"))[:200]
+        elif epoch < self.epoch:
+            self.refusal = "the witness has epoch %d, but had %d before" % (epoch, self.epoch)
+        if self.refusal or (admitted and admitted not in self._appliances):
+            return
+        if epoch > self.epoch:
+            self._save(epoch)
+            self.epoch = epoch
+        self._holder, self._until = admitted, sent + min(left / 1000.0, EXPIRY)
+        self.tick()
+
+    def tick(self) -> None:
+        """Admit the holder, or shut out both when its time has passed. Raises `WitnessError`."""
+        wanted = self._holder if self._clock() < self._until else ""
+        if wanted != self._admitted:
+            self.enforce(wanted)
+
+    def enforce_again(self) -> None:
+        """Write the firewall rules again, because another program changed them. Raises `WitnessError`."""
+        self.enforce(self._holder if self._clock() < self._until else "")
+
+    def enforce(self, name: str) -> None:
+        """Write the rules. Raises `WitnessError`; then the next `tick` tries again."""
+        self._admitted = "?"
+        self._admit(name)
+        self._admitted = name
 
 
 # ---- The firewall
@@ -392,8 +534,11 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
                 "%s ip protocol tcp reject with tcp reset" % match,
                 "%s drop" % match,
             ]
-    addresses = ", ".join(settings.appliances[name].address for name in names)
-    arriving.append("udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses))
+    followers = [settings.followers[name].address for name in sorted(settings.followers)]
+    limit = "limit rate over %d/second burst %d packets drop" % (_LOOKS_A_SECOND, _LOOKS_A_SECOND)
+    requests = ["udp dport %d ip saddr %s %s" % (settings.listen[1], one, limit) for one in followers]
+    addresses = ", ".join([settings.appliances[name].address for name in names] + followers)
+    requests.append("udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses))
     leaving += [
         "ip daddr %s ip protocol tcp reject with tcp reset" % settings.fixed,
         "ip daddr %s drop" % settings.fixed,
@@ -402,9 +547,9 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
         ("untracked", "filter hook output priority -300", ["meta mark %d notrack" % MARK]),
         ("translate_own", "nat hook output priority -100", translate),
         ("translate_others", "nat hook prerouting priority -100", translate),
-        ("arriving", "filter hook input priority 0", arriving),
+        ("arriving", "filter hook input priority 0", arriving + requests),
         ("leaving", "filter hook output priority 0", leaving),
-        ("forwarded", "filter hook forward priority 0", arriving[1:-1] + leaving),
+        ("forwarded", "filter hook forward priority 0", arriving[1:] + leaving),
     )
     return "table ip %s\ndelete table ip %s\ntable ip %s {\n%s}\n" % (
         TABLE,
@@ -443,6 +588,11 @@ def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, 
             rules += ["%s %s %s" % (side, address, reset), "%s %s -j DROP" % (side, address)]
     going += ["-d %s %s" % (settings.fixed, reset), "-d %s -j DROP" % settings.fixed]
     requests = ["-s %s -j RETURN" % settings.appliances[name].address for name in names]
+    requests += [
+        "-s %s -p udp --dport %d -m limit --limit %d/second --limit-burst %d -j RETURN"
+        % (settings.followers[name].address, settings.listen[1], _LOOKS_A_SECOND, _LOOKS_A_SECOND)
+        for name in sorted(settings.followers)
+    ]
     requests.append("-p udp --dport %d -j DROP" % settings.listen[1])
     chains = {
         "in": ["-i lo -j RETURN", *coming, *requests],
@@ -678,16 +828,26 @@ def read_settings(path: str) -> WitnessSettings:
                 raise ValueError("other users can read its keys: chmod 600 %s" % path)
             body = json.loads(file.read(65536))
         host, _, port = body["listen"].rpartition(":")
-        appliances = {}
-        for name, one in body["appliances"].items():
-            if not _NAME.match(name):
-                raise ValueError("the name %r is not valid; use a-z, 0-9 and -" % name)
-            if not re.match(r"[0-9a-f]{64}\Z", one["key"]):
-                raise ValueError("the key of %s does not have 64 hexadecimal digits" % name)
-            appliances[name] = AppliancePeer(_address(one["address"]), bytes.fromhex(one["key"]))
-        addresses = {one.address for one in appliances.values()} | {_address(body["fixed"])}
-        if len(appliances) != 2 or len(addresses) != 3 or len({one.key for one in appliances.values()}) != 2:
-            raise ValueError("it needs two appliances with different keys, and three different addresses")
+        follows_as = body.get("follows_as", "")
+        appliances = _peers(body["appliances"], keys=not follows_as)
+        followers = _peers(body.get("followers", {}), keys=True)
+        fixed = {_address(body["fixed"]), _address(host)}
+        addresses = fixed.union(
+            *({one.address for one in table.values()} for table in (appliances, followers))
+        )
+        keys = [one.key for table in (appliances, followers) for one in table.values() if one.key]
+        if len(appliances) != 2 or len(set(keys)) != len(keys) or set(appliances) & set(followers):
+            raise ValueError(
+                "it needs two appliances, and a name and a key of its own for each and each follower"
+            )
+        if len(addresses) != 4 + len(followers):
+            raise ValueError(
+                "it needs different addresses: the witness, fixed, two appliances, each follower"
+            )
+        if len(followers) > _MOST_FOLLOWERS:
+            raise ValueError("it has more than %d followers" % _MOST_FOLLOWERS)
+        if follows_as and list(followers) != [follows_as]:
+            raise ValueError("follows_as must be the only follower in it")
         ports = tuple(_ports(text) for text in body["ports"])
         if not ports:
             raise ValueError("ports is empty; list those of the ROS master and the relay, such as 11311")
@@ -697,11 +857,24 @@ def read_settings(path: str) -> WitnessSettings:
             ports,
             appliances,
             str(body["state"]),
+            followers,
+            follows_as,
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = "%s is missing" % error if isinstance(error, KeyError) else str(error)
         raise WitnessError("the settings %s cannot be used: %s" % (path, reason)) from error
     return settings
+
+
+def _peers(table: Dict[str, Dict[str, str]], keys: bool) -> Dict[str, AppliancePeer]:
+    found = {}
+    for name, one in table.items():
+        if not _NAME.match(name):
+            raise ValueError("the name %r is not valid; use a-z, 0-9 and -" % name)
+        if keys and not re.match(r"[0-9a-f]{64}\Z", one["key"]):
+            raise ValueError("the key of %s does not have 64 hexadecimal digits" % name)
+        found[name] = AppliancePeer(_address(one["address"]), bytes.fromhex(one["key"]) if keys else b"")
+    return found
 
 
 def _address(text: str) -> str:
@@ -744,16 +917,45 @@ def _write_error(text: str) -> None:
     sys.stderr.flush()  # before Python 3.9 a pipe gets the text only when the buffer is full
 
 
+class Enforcement:
+    """The firewall and the idle connections of this computer."""
+
+    def __init__(self, settings: WitnessSettings, backend: str, log: BoundedLog) -> None:
+        self._firewall = LeaseFirewall(settings, backend)
+        self._idle = IdleConnections(settings)
+        self._log = log
+        self._checked = self._reset = time.monotonic()
+
+    def admit(self, name: str) -> None:
+        """Admit one appliance, or none (""), and reset the connections with the other one. Raises `WitnessError`."""
+        self._firewall.admit(name)
+        self._idle.reset(name)
+        self._log.add("the robot admits %s" % (name or "no appliance"))
+
+    def go_on(self, enforce_again: Callable[[], None]) -> bool:
+        """Go on with the resets, and check the rules once a second; return whether they were checked."""
+        now = time.monotonic()
+        if now - self._reset >= _RESET_SECONDS:
+            self._reset = now
+            self._idle.go_on()
+        if now - self._checked < _CHECK_SECONDS:
+            return False
+        self._checked = now
+        try:
+            if not self._firewall.intact():
+                self._log.add(
+                    "another program changed the firewall rules of the witness; they are written again"
+                )
+                enforce_again()
+        except WitnessError as error:
+            self._log.add(str(error))
+        return True
+
+
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     """Answer the appliances until the process ends."""
     log = BoundedLog(_write_error, time.monotonic)
-    firewall, idle = LeaseFirewall(settings, backend), IdleConnections(settings)
-
-    def admit(name: str) -> None:
-        firewall.admit(name)
-        idle.reset(name)
-        log.add("the robot admits %s" % (name or "no appliance"))
-
+    enforcement = Enforcement(settings, backend, log)
     try:
         record = lease.read()  # type: Optional[LeaseRecord]
     except WitnessError as error:
@@ -761,30 +963,24 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         log.add(str(error))
     with open(BOOT_ID, encoding="ascii") as file:
         boot = file.read().strip()
-    witness = Witness(record=record, save=lease.write, admit=admit, boot=boot, clock=time.monotonic)
-    gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex())
+    witness = Witness(
+        record=record, save=lease.write, admit=enforcement.admit, boot=boot, clock=time.monotonic
+    )
+    gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex(), settings.followers)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as requests:
         requests.setsockopt(socket.SOL_IP, _FREEBIND, 1)
         requests.bind(settings.listen)
         requests.setblocking(False)
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
-        checked = reset = time.monotonic()
         rejected = 0
         while True:  # until the process is ended; each turn is bounded
             ready, _, _ = select.select([requests], [], [], 0.2)
             for _ in range(_BATCH if ready else 0):
                 if not _answer_one(requests, gate):
                     break
-            now = time.monotonic()
-            if now - reset >= _RESET_SECONDS:
-                reset = now
-                idle.go_on()
-            if now - checked >= _CHECK_SECONDS:
-                checked = now
-                _check(firewall, witness, log)
-                if gate.rejected > rejected:
-                    log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
-                    rejected = gate.rejected
+            if enforcement.go_on(witness.enforce_again) and gate.rejected > rejected:
+                log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
+                rejected = gate.rejected
 
 
 def _answer_one(requests: socket.socket, gate: WitnessGate) -> bool:
@@ -800,13 +996,80 @@ def _answer_one(requests: socket.socket, gate: WitnessGate) -> bool:
     return True
 
 
-def _check(firewall: LeaseFirewall, witness: Witness, log: BoundedLog) -> None:
+def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
+    """Do as the witness does until the process ends. First, both appliances are shut out."""
+    log = BoundedLog(_write_error, time.monotonic)
+    enforcement = Enforcement(settings, backend, log)
+    names = tuple(sorted(settings.appliances))
+    own = settings.followers[settings.follows_as]
+    follower = Follower(
+        name=settings.follows_as,
+        key=own.key,
+        appliances=names,
+        session=os.urandom(16).hex(),
+        epoch=_followed_epoch(lease, log),
+        save=lambda epoch: lease.write(LeaseRecord(epoch, "", names, "")),
+        admit=enforcement.admit,
+        clock=time.monotonic,
+    )
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        asking.setsockopt(socket.SOL_IP, _FREEBIND, 1)
+        asking.bind((own.address, 0))
+        asking.setblocking(False)
+        log.add(
+            "%s follows the witness at %s:%d and uses %s" % (settings.follows_as, *settings.listen, backend)
+        )
+        asked = time.monotonic() - _LOOK_SECONDS
+        refusal = ""
+        while True:  # until the process is ended; each turn is bounded
+            left = asked + _LOOK_SECONDS - time.monotonic()
+            ready, _, _ = select.select([asking], [], [], max(0.0, left))
+            try:
+                for _ in range(_BATCH if ready else 0):
+                    if not _receive_one(asking, settings.listen, follower):
+                        break
+                follower.tick()
+            except WitnessError as error:
+                log.add(str(error))
+            if time.monotonic() - asked >= _LOOK_SECONDS:
+                asked = time.monotonic()
+                _send_look(asking, settings.listen, follower)
+            if follower.refusal != refusal:
+                refusal = follower.refusal
+                log.add(refusal or "the witness answers again")
+            enforcement.go_on(follower.enforce_again)
+
+
+def _followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
+    """Return the greatest epoch that this follower saved. If it is damaged, no answer is new enough."""
+    if not os.path.exists(lease.path):
+        return 0
     try:
-        if not firewall.intact():
-            log.add("another program changed the firewall rules of the witness; they are written again")
-            witness.enforce_again()
+        return lease.read().epoch
     except WitnessError as error:
-        log.add(str(error))
+        log.add(
+            "the epoch %s cannot be used: %s; both appliances are shut out. If the lease of the witness was not"
+            " restored from an older disk: rm %s; systemctl restart rosrv-witness-follow"
+            % (lease.path, error.__cause__, lease.path)
+        )
+        return HIGHEST
+
+
+def _send_look(asking: socket.socket, witness: Tuple[str, int], follower: Follower) -> None:
+    with contextlib.suppress(OSError):  # no route to the witness at present; it is asked again
+        asking.sendto(follower.request(), witness)
+
+
+def _receive_one(asking: socket.socket, witness: Tuple[str, int], follower: Follower) -> bool:
+    try:
+        datagram, source = asking.recvfrom(LONGEST + 1)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True  # an earlier request was not delivered
+    if source == witness:
+        follower.receive(datagram)
+    return True
 
 
 def begin(settings: WitnessSettings, lease: LeaseFile, in_sync: List[str], epoch: int) -> None:
@@ -825,10 +1088,16 @@ def begin(settings: WitnessSettings, lease: LeaseFile, in_sync: List[str], epoch
     lease.write(LeaseRecord(epoch, "", tuple(sorted(set(in_sync))), ""))
 
 
+def _require_place(settings: WitnessSettings, command: str) -> None:
+    if (command == "follow") != bool(settings.follows_as):
+        place = "the computer with the witness" if settings.follows_as else "a follower"
+        raise WitnessError("`%s` is a command for %s; this computer has other settings" % (command, place))
+
+
 def main(arguments: List[str]) -> int:
     """Run a command; return the exit status."""
     parser = argparse.ArgumentParser(description="The witness of two appliances, on the robot's computer.")
-    parser.add_argument("command", choices=("shut", "serve", "begin", "remove"))
+    parser.add_argument("command", choices=("shut", "serve", "follow", "begin", "remove"))
     parser.add_argument("--settings", default=SETTINGS, help="default: %(default)s")
     parser.add_argument("--backend", choices=("nft", "iptables"), help="default: nft, on Linux 4.18 or newer")
     parser.add_argument("--in-sync", default="", help="begin: the appliances that have all data, such as a,b")
@@ -837,14 +1106,16 @@ def main(arguments: List[str]) -> int:
     try:
         settings = read_settings(chosen.settings)
         lease = LeaseFile(settings.state, tuple(sorted(settings.appliances)))
+        if chosen.command in ("serve", "begin", "follow"):
+            _require_place(settings, chosen.command)
         if chosen.command == "begin":
             with lease:
                 begin(settings, lease, [name for name in chosen.in_sync.split(",") if name], chosen.epoch)
             return 0
         backend = chosen.backend or chosen_backend(platform.release(), shutil.which)
-        if chosen.command == "serve":
+        if chosen.command in ("serve", "follow"):
             with lease:
-                serve(settings, backend, lease)
+                (serve if chosen.command == "serve" else follow)(settings, backend, lease)
         elif chosen.command == "shut":
             LeaseFirewall(settings, backend).admit("")
         else:

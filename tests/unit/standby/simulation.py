@@ -41,6 +41,8 @@ SETTINGS = witness.WitnessSettings(
         "b": witness.AppliancePeer("10.0.0.3", KEYS["b"]),
     },
     "/lease",
+    {},
+    "",
 )
 TICK = 0.1
 HEALED = 10.0  # seconds after the last fault

@@ -370,8 +370,8 @@ def test_begin_waits_until_the_witness_is_stopped(settings: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
-        ('"aa', '"bb', "different keys"),
-        ("10.0.0.3", "10.0.0.2", "three different addresses"),
+        ('"aa', '"bb', "a key of its own"),
+        ("10.0.0.3", "10.0.0.2", "different addresses"),
         ("10.0.0.3", "127.0.0.1", "cannot be an address"),
         ("10.0.0.3", "fd00::1", "fd00::1"),
         ('"aaaa', '"zzaa', "64 hexadecimal digits"),
@@ -483,7 +483,7 @@ def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -
     """Another program flushes the filter between our change and our reading of it."""
     settings = WitnessSettings(
         ("10.0.0.1", 7411), "10.0.0.100", ("11311",),
-        {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease",
+        {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease", {}, "",
     )  # fmt: skip
     firewall = LeaseFirewall(settings, "iptables", lambda _command, _text: "*filter\nCOMMIT\n")
     firewall.admit("a")
