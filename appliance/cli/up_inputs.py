@@ -19,6 +19,7 @@ from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
 
+_STATE = Path("control", "state.db")
 _VALID = "valid"
 
 
@@ -27,15 +28,23 @@ def read_inputs(settings: Settings) -> range:
 
     Raises `StartError` with every error of the policy or of the specifications.
     """
-    state = settings.state / "control" / "state.db"
+    state = settings.state / _STATE
     if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
         _require_specifications(settings.monitors, settings.site_keys)
+    return read_node_ports(settings)
+
+
+def read_node_ports(settings: Settings) -> range:
+    """Validate the policy; return the range of ports that the policy file gives to nodes.
+
+    Raises `StartError` with every error of the policy.
+    """
     try:
         text, signature = _text(settings.policy), read_signature(settings.policy)
         known = PolicyContext(site_keys=settings.site_keys)
         return judge(text, str(settings.policy), known, signature).policy.ports
     except (PolicyError, StartError) as error:
-        if not _is_read_at_start(state, "policy_revision"):
+        if not _is_read_at_start(settings.state / _STATE, "policy_revision"):
             return DEFAULT_PORTS
         if isinstance(error, StartError):
             raise

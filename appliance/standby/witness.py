@@ -671,6 +671,14 @@ def chosen_backend(release: str, find: Callable[[str], Optional[str]]) -> str:
     raise WitnessError("neither `nft` nor `iptables` is installed: sudo apt install nftables")
 
 
+def remove_rules(backend: str, run: Program = run_program) -> None:
+    """Remove all rules of this program. Raises `WitnessError`."""
+    if backend == "nft":
+        run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE))
+    else:
+        run(["iptables-restore", "--noflush"], without_iptables_rules(run(["iptables-save"], "")))
+
+
 class LeaseFirewall:
     """The robot's firewall, by `nft` or `iptables`."""
 
@@ -706,19 +714,9 @@ class LeaseFirewall:
         whole = present[: len(jumps)] == jumps and len(present) == len(jumps) + self._rules
         return present == self._written and (whole or self._backend == "nft")
 
-    def remove(self) -> None:
-        """Remove all rules. Raises `WitnessError`."""
-        if self._backend == "nft":
-            self._run(["nft", "-f", "-"], "table ip %s\ndelete table ip %s\n" % (TABLE, TABLE))
-        else:
-            self._run(["iptables-restore", "--noflush"], without_iptables_rules("\n".join(self._saved())))
-
-    def _saved(self) -> List[str]:
-        return [line for line in self._run(["iptables-save"], "").splitlines() if not line.startswith("#")]
-
     def _chains(self) -> Dict[str, List[str]]:
         found, table = {}, ""  # type: Dict[str, List[str]], str
-        for line in self._saved():
+        for line in self._run(["iptables-save"], "").splitlines():
             table = line[1:] if line.startswith("*") else table
             if line.startswith("-A "):
                 found.setdefault("%s %s" % (table, line.split()[1]), []).append(line)
@@ -1104,22 +1102,24 @@ def main(arguments: List[str]) -> int:
     parser.add_argument("--epoch", type=int, default=0, help="begin: greater than both appliances show")
     chosen = parser.parse_args(arguments)
     try:
+        if chosen.command == "begin":
+            backend = ""  # it changes no rule
+        else:
+            backend = chosen.backend or chosen_backend(platform.release(), shutil.which)
+        if chosen.command == "remove":
+            remove_rules(backend)  # also if the settings are damaged
+            return 0
         settings = read_settings(chosen.settings)
         lease = LeaseFile(settings.state, tuple(sorted(settings.appliances)))
-        if chosen.command in ("serve", "begin", "follow"):
-            _require_place(settings, chosen.command)
-        if chosen.command == "begin":
-            with lease:
-                begin(settings, lease, [name for name in chosen.in_sync.split(",") if name], chosen.epoch)
-            return 0
-        backend = chosen.backend or chosen_backend(platform.release(), shutil.which)
-        if chosen.command in ("serve", "follow"):
-            with lease:
-                (serve if chosen.command == "serve" else follow)(settings, backend, lease)
-        elif chosen.command == "shut":
+        if chosen.command == "shut":
             LeaseFirewall(settings, backend).admit("")
-        else:
-            LeaseFirewall(settings, backend).remove()
+            return 0
+        _require_place(settings, chosen.command)
+        with lease:
+            if chosen.command == "begin":
+                begin(settings, lease, [name for name in chosen.in_sync.split(",") if name], chosen.epoch)
+            else:
+                (serve if chosen.command == "serve" else follow)(settings, backend, lease)
     except (WitnessError, OSError) as error:
         sys.stderr.write("witness.py: %s\n" % error)
         return 1

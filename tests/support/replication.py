@@ -10,7 +10,13 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from appliance.standby.link_certificates import link_context, make_link_certificate
+from appliance.standby.link_certificates import (
+    CERTIFICATE,
+    KEY,
+    LinkCertificate,
+    link_context,
+    make_link_certificate,
+)
 from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_receiver import ReplicationReceiver
@@ -57,12 +63,22 @@ def change_randomly(database: Database, chosen: random.Random) -> None:
 
 
 def certificates(directory: Path) -> tuple[ssl.SSLContext, ssl.SSLContext]:
-    """Return the TLS contexts of the active appliance and of the standby."""
+    """Return the TLS contexts of the active appliance and of the standby; the same ones for a directory."""
     homes = [directory / "certificates-active", directory / "certificates-standby"]
-    for home in homes:
-        home.mkdir(exist_ok=True)
-    active, standby = (make_link_certificate(home) for home in homes)
-    return link_context(homes[0], standby, server=True), link_context(homes[1], active, server=False)
+    active, standby = map(_kept_certificate, homes)
+    return (
+        link_context(active, standby.certificate, homes[0], server=True),
+        link_context(standby, active.certificate, homes[1], server=False),
+    )
+
+
+def _kept_certificate(home: Path) -> LinkCertificate:
+    home.mkdir(exist_ok=True)
+    files = home / CERTIFICATE, home / KEY
+    if not all(file.exists() for file in files):
+        for file, text in zip(files, make_link_certificate(), strict=True):
+            file.write_text(text)
+    return LinkCertificate(*(file.read_text() for file in files))
 
 
 def listening_socket() -> socket.socket:

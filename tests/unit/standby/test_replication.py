@@ -14,7 +14,13 @@ import msgspec
 import pytest
 
 from appliance.standby import replication_frames, replication_sender, replication_transport
-from appliance.standby.link_certificates import link_context, make_link_certificate
+from appliance.standby.link_certificates import (
+    CERTIFICATE,
+    KEY,
+    LinkCertificate,
+    link_context,
+    make_link_certificate,
+)
 from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import (
     Changes,
@@ -353,18 +359,19 @@ async def test_only_the_known_certificate_is_accepted(tmp_path: Path) -> None:
     """Another certificate, none, an older TLS, and no TLS at all get nothing; the standby also checks its side."""
     server, client = certificates(tmp_path)
     active = ActiveSide(tmp_path / "active.db", server)
-    strange = tmp_path / "strange"
-    strange.mkdir()
-    make_link_certificate(strange)
-    theirs = (tmp_path / "certificates-active" / "standby.pem").read_text()
-    other = link_context(strange, theirs, server=False)
+    homes = {name: tmp_path / name for name in ("strange", "old", "mistrusting")}
+    for home in homes.values():
+        home.mkdir()
+    strange = make_link_certificate()
+    theirs = (tmp_path / "certificates-active" / CERTIFICATE).read_text()
+    files = (tmp_path / "certificates-standby" / name for name in (CERTIFICATE, KEY))
+    own = LinkCertificate(*(file.read_text() for file in files))
+    other = link_context(strange, theirs, homes["strange"], server=False)
     none = ssl.create_default_context(cadata=theirs)
     none.check_hostname = False
-    old = link_context(tmp_path / "certificates-standby", theirs, server=False)
+    old = link_context(own, theirs, homes["old"], server=False)
     old.minimum_version, old.maximum_version = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_2
-    mistrusting = link_context(
-        tmp_path / "certificates-standby", (strange / "standby.pem").read_text(), server=False
-    )
+    mistrusting = link_context(own, strange.certificate, homes["mistrusting"], server=False)
     async with asyncio.timeout(SECONDS):
         for context in (other, none, old, mistrusting, None):
             with pytest.raises((ReplicationError, OSError)):

@@ -1,0 +1,68 @@
+#!/bin/sh
+# Install the witness of two ROSRV appliances on this computer, or the follower of a witness. Run it again to repair it.
+set -eu
+
+die() { echo "install.sh: $*" >&2; exit 1; }
+say() { echo "install.sh: $*"; }
+
+cd "$(dirname "$0")"
+PATH=$PATH:/usr/sbin:/sbin
+[ "$(id -u)" = 0 ] || die "run it as root: sudo ./install.sh"
+/usr/bin/python3 -c 'import sys; sys.exit(sys.version_info < (3, 5))' 2>/dev/null \
+    || die "/usr/bin/python3 must be Python 3.5 or newer: sudo apt install python3"
+command -v nft >/dev/null || command -v iptables-restore >/dev/null \
+    || die "neither nft nor iptables is installed: sudo apt install nftables"
+[ -d /run/systemd/system ] || die "this computer is not run by systemd; install the services of this folder by hand"
+
+unit=rosrv-witness
+other=rosrv-witness-follow
+if [ ! -e rosrv-witness.service ]; then
+    unit=rosrv-witness-follow
+    other=rosrv-witness
+fi
+for file in witness.py witness.json remove.sh rosrv-witness-shut.service "$unit.service"; do
+    [ -s "$file" ] || die "$file is missing: copy the whole folder of the kit"
+done
+
+# A file is complete before it gets its name: a boot after a power cut must find the boot rule.
+put() {
+    install -m "$1" "$2" "$3.new"
+    sync
+    mv "$3.new" "$3"
+}
+install -d -m 0755 /etc/rosrv
+put 0755 witness.py /etc/rosrv/witness.py
+put 0600 witness.json /etc/rosrv/witness.json
+put 0755 remove.sh /etc/rosrv/remove-witness.sh
+put 0644 rosrv-witness-shut.service /etc/systemd/system/rosrv-witness-shut.service
+put 0644 "$unit.service" "/etc/systemd/system/$unit.service"
+if [ -e "/etc/systemd/system/$other.service" ]; then
+    systemctl disable --quiet --now "$other.service"
+    rm -f "/etc/systemd/system/$other.service"
+fi
+
+# Only the first installation of this kit begins a lease: an earlier lease knows which appliance has all data.
+if [ "$unit" = rosrv-witness ] && [ ! -e "@lease@" ]; then
+    systemctl stop rosrv-witness.service 2>/dev/null || true
+    /usr/bin/python3 -I /etc/rosrv/witness.py begin --in-sync @name@ --epoch @epoch@ || die "the lease was not written"
+    say "the first lease is written: @name@ has all data"
+fi
+
+systemctl daemon-reload
+systemctl enable --quiet rosrv-witness-shut.service "$unit.service"
+systemctl restart "$unit.service"
+sync
+
+applied() { nft list table ip rosrv_witness >/dev/null 2>&1 || iptables-save 2>/dev/null | grep -q '^:rosrv-witness-in '; }
+tries=0
+until applied; do
+    tries=$((tries + 1))
+    [ "$tries" -lt 100 ] || die "the firewall rules are missing: journalctl -u $unit -u rosrv-witness-shut"
+    sleep 0.1
+done
+if command -v ip >/dev/null && ! ip route get @fixed@ >/dev/null 2>&1; then
+    say "warning: this computer has no route to @fixed@: choose an unused address of its own network"
+fi
+say "$unit runs. Check it: journalctl -u $unit"
+say "close the ROS ports to all other machines: rosrv protect --appliance @own@ --appliance @other@ --apply"
+say "start the nodes with ROS_MASTER_URI=http://@fixed@:@master@"

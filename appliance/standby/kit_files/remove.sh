@@ -1,0 +1,30 @@
+#!/bin/sh
+# Remove what install.sh made on this computer: the witness or follower, its lease, its keys and all its firewall rules.
+set -eu
+
+die() { echo "remove.sh: $*" >&2; exit 1; }
+
+PATH=$PATH:/usr/sbin:/sbin
+[ "$(id -u)" = 0 ] || die "run it as root: sudo $0"
+for unit in rosrv-witness rosrv-witness-follow rosrv-witness-shut; do
+    if [ -e "/etc/systemd/system/$unit.service" ]; then
+        systemctl disable --quiet --now "$unit.service"
+        rm -f "/etc/systemd/system/$unit.service"
+    fi
+done
+systemctl daemon-reload
+
+# Both programs: after an upgrade of the system, the rules may be those of the one that is no longer used.
+if [ -e /etc/rosrv/witness.py ]; then
+    if command -v nft >/dev/null; then /usr/bin/python3 -I /etc/rosrv/witness.py remove --backend nft; fi
+    if command -v iptables-restore >/dev/null; then
+        /usr/bin/python3 -I /etc/rosrv/witness.py remove --backend iptables
+    fi
+fi
+if nft list table ip rosrv_witness >/dev/null 2>&1 || iptables-save 2>/dev/null | grep -q rosrv-witness; then
+    die "firewall rules remain: nft list table ip rosrv_witness; iptables-save | grep rosrv-witness"
+fi
+rm -rf /var/lib/rosrv-witness
+rm -f /etc/rosrv/witness.py /etc/rosrv/witness.json /etc/rosrv/remove-witness.sh
+rmdir /etc/rosrv 2>/dev/null || true
+echo "remove.sh: this computer no longer admits or shuts out appliances"
