@@ -136,6 +136,7 @@ VERBS: dict[str, Verb | Group] = {
     "standby": Group(
         "Run two appliances, of which one stands by to take over.",
         {
+            "join": Verb("standby.membership_verbs:join"),
             "leave": Verb("standby.membership_verbs:leave"),
             "status": Verb("standby.live_verbs:status"),
             "promote": Verb("standby.live_verbs:promote"),

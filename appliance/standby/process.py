@@ -32,7 +32,7 @@ from appliance.standby.peer_link import PeerChannel
 from appliance.standby.witness import HIGHEST
 from appliance.standby.witness_link import WitnessChannel
 
-_EPOCH = "epoch"
+EPOCH = "epoch"
 _CONTROL_SECONDS = 1.0
 _LARGEST = 2048
 _BATCH = 64  # datagrams between two ticks
@@ -50,7 +50,7 @@ def main(lifeline_fd: int, membership: Path) -> None:
     found = load_membership(membership)
     if found is None:
         raise FileNotFoundError(f"{membership} is missing")
-    asyncio.run(LeaseProcess(found, lifeline_fd, Path.cwd() / _EPOCH).run())
+    asyncio.run(LeaseProcess(found, lifeline_fd, Path.cwd() / EPOCH).run())
 
 
 class LeaseProcess:
@@ -59,7 +59,7 @@ class LeaseProcess:
     def __init__(self, membership: Membership, lifeline_fd: int, epoch_file: Path) -> None:
         self._membership = membership
         self._epoch_file = epoch_file
-        self._stored = _epoch_in(epoch_file)
+        self._stored = stored_epoch(epoch_file)
         session = secrets.token_hex(16)
         own, other = membership.name, membership.other
         self._lease = ApplianceLease(own, other, session, self._stored, boot_time())
@@ -219,7 +219,7 @@ class LeaseProcess:
         self._after(due)
 
 
-def _epoch_in(path: Path) -> int:
+def stored_epoch(path: Path) -> int:
     """Return the stored epoch; 0 if there is no file. Raises `ValueError` if it is damaged: then nothing is safe."""
     try:
         text = path.read_text("ascii").strip()

@@ -824,44 +824,43 @@ def read_settings(path: str) -> WitnessSettings:
         with open(path, encoding="utf-8") as file:
             if stat.S_IMODE(os.fstat(file.fileno()).st_mode) & 0o077:
                 raise ValueError("other users can read its keys: chmod 600 %s" % path)
-            body = json.loads(file.read(65536))
-        host, _, port = body["listen"].rpartition(":")
-        follows_as = body.get("follows_as", "")
-        appliances = _peers(body["appliances"], keys=not follows_as)
-        followers = _peers(body.get("followers", {}), keys=True)
-        fixed = {_address(body["fixed"]), _address(host)}
-        addresses = fixed.union(
-            *({one.address for one in table.values()} for table in (appliances, followers))
-        )
-        keys = [one.key for table in (appliances, followers) for one in table.values() if one.key]
-        if len(appliances) != 2 or len(set(keys)) != len(keys) or set(appliances) & set(followers):
-            raise ValueError(
-                "it needs two appliances, and a name and a key of its own for each and each follower"
-            )
-        if len(addresses) != 4 + len(followers):
-            raise ValueError(
-                "it needs different addresses: the witness, fixed, two appliances, each follower"
-            )
-        if len(followers) > _MOST_FOLLOWERS:
-            raise ValueError("it has more than %d followers" % _MOST_FOLLOWERS)
-        if follows_as and list(followers) != [follows_as]:
-            raise ValueError("follows_as must be the only follower in it")
-        ports = tuple(_ports(text) for text in body["ports"])
-        if not ports:
-            raise ValueError("ports is empty; list those of the ROS master and the relay, such as 11311")
-        settings = WitnessSettings(
-            (_address(host), int(_ports(port))),
-            _address(body["fixed"]),
-            ports,
-            appliances,
-            str(body["state"]),
-            followers,
-            follows_as,
-        )
+            return settings_of(json.loads(file.read(65536)))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = "%s is missing" % error if isinstance(error, KeyError) else str(error)
         raise WitnessError("the settings %s cannot be used: %s" % (path, reason)) from error
-    return settings
+
+
+def settings_of(body: Dict[str, Any]) -> WitnessSettings:
+    """Return the settings in this object. Raises `ValueError`, and errors of Python for wrong types."""
+    host, _, port = body["listen"].rpartition(":")
+    follows_as = body.get("follows_as", "")
+    appliances = _peers(body["appliances"], keys=not follows_as)
+    followers = _peers(body.get("followers", {}), keys=True)
+    fixed = {_address(body["fixed"]), _address(host)}
+    addresses = fixed.union(one.address for table in (appliances, followers) for one in table.values())
+    keys = [one.key for table in (appliances, followers) for one in table.values() if one.key]
+    if len(appliances) != 2 or len(set(keys)) != len(keys) or set(appliances) & set(followers):
+        raise ValueError(
+            "it needs two appliances, and a name and a key of its own for each and each follower"
+        )
+    if len(addresses) != 4 + len(followers):
+        raise ValueError("it needs different addresses: the witness, fixed, two appliances, each follower")
+    if len(followers) > _MOST_FOLLOWERS:
+        raise ValueError("it has more than %d followers" % _MOST_FOLLOWERS)
+    if follows_as and list(followers) != [follows_as]:
+        raise ValueError("follows_as must be the only follower in it")
+    ports = tuple(_ports(text) for text in body["ports"])
+    if not ports:
+        raise ValueError("ports is empty; list those of the ROS master and the relay, such as 11311")
+    return WitnessSettings(
+        (_address(host), int(_ports(port))),
+        _address(body["fixed"]),
+        ports,
+        appliances,
+        str(body["state"]),
+        followers,
+        follows_as,
+    )
 
 
 def _peers(table: Dict[str, Dict[str, str]], keys: bool) -> Dict[str, AppliancePeer]:
