@@ -21,7 +21,14 @@ from collections.abc import Collection
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
-from appliance.standby.membership import LEASE_FILE, LINK_FILE, Membership, path_of, save_membership
+from appliance.standby.membership import (
+    LEASE_FILE,
+    LEFT_FILE,
+    LINK_FILE,
+    Membership,
+    path_of,
+    save_membership,
+)
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.users import account_of
@@ -41,7 +48,9 @@ def foreign(path: Path) -> str | None:
     if not path.is_dir():
         return None
     found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
-    if not found or _has_lock(path) or (path / _RESTORED).is_file() or path_of(path).is_file():
+    membership = path_of(path)
+    joined = membership.is_file() or membership.with_name(LEFT_FILE).is_file()
+    if not found or _has_lock(path) or (path / _RESTORED).is_file() or joined:
         return None
     more = " …" if len(found) > _SHOWN else ""
     return f"{path} is not the state directory of an appliance: it contains {', '.join(found[:_SHOWN])}{more}"

@@ -3,6 +3,7 @@
 import os
 import shutil
 from dataclasses import dataclass
+from ipaddress import IPv4Address
 from pathlib import Path
 
 import msgspec
@@ -114,7 +115,12 @@ def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
                 " appliance with isolation netns or container"
             ]
         )
-    master = settings.listen_address[1]
+    followers = _followers(options.followers)
+    for text in (options.address, options.other, options.witness, options.fixed, *followers.values()):
+        try:
+            IPv4Address(text)
+        except ValueError:
+            raise usage_error(f"{text!r} is not an IPv4 address", _VERB) from None
     try:
         epoch = stored_epoch(options.state / "lease" / EPOCH)
     except (OSError, ValueError) as error:
@@ -128,9 +134,9 @@ def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
         fixed=options.fixed,
         port=options.port,
         ports=_ports(options, settings),
-        master_port=master,
+        master_port=settings.listen_address[1],
         epoch=epoch + 1,
-        followers=_followers(options.followers),
+        followers=followers,
     )
 
 

@@ -47,7 +47,8 @@ def _given(file: Path) -> Membership:
     try:
         membership = load_membership(file)
     except MembershipError as error:
-        raise usage_error(str(error), _VERB) from None
+        reason = f"{file} is not a file standby-NAME.json of the first appliance: {error.__cause__}"
+        raise usage_error(reason, _VERB) from None
     except OSError as error:
         raise usage_error(f"{file}: {error.strerror}", _VERB) from None
     if membership is None:
