@@ -1,0 +1,196 @@
+"""A robot with the witness, two appliances that ask it, an attacker and a follower, on one network."""
+
+import contextlib
+import json
+import os
+import shutil
+import socket
+import struct
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from appliance.standby import witness
+from appliance.standby.lease import Operation, WitnessAnswer, WitnessRequest
+from appliance.standby.witness import LeaseFile
+from appliance.standby.witness_link import WitnessChannel
+from examples.landshark.lab import Host, Lab
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import need_program
+from tests.support.waiting import eventually
+
+ROBOT, FIXED = "10.77.0.10", "10.77.0.100"
+ADDRESSES = {"a": "10.77.0.2", "b": "10.77.0.3"}
+KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
+FOLLOWER, FOLLOWER_KEY = "10.77.0.20", b"\xff" * 32
+MASTER, NODE, WITNESS = 11311, 40000, 7411
+AT_ONCE = LIMIT  # seconds; a hanging connection would last for hours
+BACKENDS = ("nft", "iptables-nft", "iptables-legacy")
+
+
+class Peer:
+    """An appliance that asks the witness."""
+
+    def __init__(self, host: Host, name: str) -> None:
+        self.name = name
+        self.channel = WitnessChannel(name, KEYS[name], os.urandom(8).hex())
+        self.socket = host.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self.socket.connect((ROBOT, WITNESS))
+        self.socket.settimeout(0.2)
+        self.sent = b""
+
+    def ask(self, operation: Operation, epoch: int) -> WitnessAnswer:
+        """Return the witness's answer; a lost one is asked for again."""
+
+        def answer() -> WitnessAnswer | None:
+            self.sent = self.channel.write(WitnessRequest(operation, epoch, 1, 0.0))
+            with contextlib.suppress(OSError):
+                self.socket.send(self.sent)
+                found = self.channel.read(self.socket.recv(1024))
+                return None if found is None else found[1]
+            return None
+
+        return eventually(answer, "the witness answers")
+
+    def granted(self, epoch: int) -> int:
+        """Claim until the claim is granted; return the epoch."""
+
+        def grant() -> int | None:
+            answer = self.ask("claim", epoch)
+            return answer.epoch if answer.ok else None
+
+        return eventually(grant, f"{self.name} gets the lease")
+
+
+class Site:
+    """The machines, the witness's files, and its process."""
+
+    def __init__(self, lab: Lab, folder: Path, backend: str, sockets: contextlib.ExitStack) -> None:
+        self.sockets = sockets
+        self.robot = lab.host("robot", f"{ROBOT}/24")
+        self.hosts = {name: lab.host(name, f"{address}/24") for name, address in ADDRESSES.items()}
+        self.attacker = lab.host("attacker", "10.77.0.66/24")
+        self.follower = lab.host("follower", f"{FOLLOWER}/24")
+        self.folder = folder
+        self.backend = "nft" if backend == "nft" else "iptables"
+        programs = folder / "programs"
+        programs.mkdir()
+        if self.backend == "iptables":
+            for tool in ("restore", "save"):
+                path = need_program(f"{backend}-{tool}", "iptables")
+                (programs / f"iptables-{tool}").symlink_to(path)
+        self.environment = {"PATH": f"{programs}:{os.environ['PATH']}:/usr/sbin"}
+        self.settings = folder / "witness.json"
+        appliances = {
+            name: {"address": address, "key": KEYS[name].hex()} for name, address in ADDRESSES.items()
+        }
+        common: dict[str, object] = {
+            "listen": f"{ROBOT}:{WITNESS}",
+            "fixed": FIXED,
+            "ports": [str(MASTER), "20000-20999"],
+            "followers": {"arm": {"address": FOLLOWER, "key": FOLLOWER_KEY.hex()}},
+        }
+        own: dict[str, object] = {"appliances": appliances, "state": str(folder / "lease")}
+        write_settings(self.settings, common | own)
+        self.follower_settings = folder / "follower.json"
+        own = {"appliances": {name: {"address": address} for name, address in ADDRESSES.items()}}
+        own |= {"follows_as": "arm", "state": str(folder / "epoch")}
+        write_settings(self.follower_settings, common | own)
+        shutil.copy(str(witness.__file__), folder / "witness.py")
+        self.lease = LeaseFile(str(folder / "lease"), ("a", "b"))
+        self.servers = {name: self._listening(host, MASTER) for name, host in self.hosts.items()}
+        self.node = self._listening(self.robot, NODE)
+        self.process: Process | None = None
+        self.following: Process | None = None
+
+    def command(self, *words: str, settings: Path | None = None) -> list[str]:
+        """Return a command of the witness's program, as on a robot without the product."""
+        program = str(self.folder / "witness.py")
+        options = ["--settings", str(settings or self.settings), "--backend", self.backend]
+        return [sys.executable, "-I", "-S", program, *words, *options]
+
+    def run(self, *words: str) -> None:
+        """Run a command on the robot to its end."""
+        with Process(self.robot, self.command(*words), env=self.environment, label=words[0]) as process:
+            process.wait()
+            assert process.popen.returncode == 0, process.errors
+
+    def serve(self) -> Process:
+        """Start the witness."""
+        self.process = Process(self.robot, self.command("serve"), env=self.environment, label="witness")
+        eventually(lambda: "answers at" in self.log(), self.log)
+        return self.process
+
+    def follow(self) -> Process:
+        """Start the follower."""
+        command = self.command("follow", settings=self.follower_settings)
+        following = Process(self.follower, command, env=self.environment, label="follower")
+        self.following = following
+        eventually(
+            lambda: "follows the witness" in "\n".join(following.errors), lambda: str(following.errors)
+        )
+        return following
+
+    def log(self) -> str:
+        """Return the witness's log."""
+        return "\n".join(self.process.errors) if self.process is not None else ""
+
+    def stop(self) -> None:
+        """Stop the witness and the follower."""
+        for process in (self.process, self.following):
+            if process is not None:
+                process.stop()
+
+    def peer(self, name: str) -> Peer:
+        """Return an appliance."""
+        peer = Peer(self.hosts[name], name)
+        self.sockets.enter_context(peer.socket)
+        return peer
+
+    def connect(self, host: Host, address: str, port: int, seconds: float = LIMIT) -> socket.socket:
+        """Connect from a host."""
+        made = host.run(lambda: socket.create_connection((address, port), timeout=seconds))
+        return self.sockets.enter_context(made)
+
+    def accepted(self, server: socket.socket) -> socket.socket:
+        """Return the next connection of a server."""
+        return self.sockets.enter_context(server.accept()[0])
+
+    def _listening(self, host: Host, port: int) -> socket.socket:
+        return self.sockets.enter_context(host.run(lambda: socket.create_server((host.address, port))))
+
+    def refused(self, host: Host, address: str, port: int) -> bool:
+        """Whether a connection is refused at once. While the rules change, an attempt may get no answer."""
+        begun = time.monotonic()
+        try:
+            self.connect(host, address, port, LIMIT / 3).close()
+        except ConnectionRefusedError:
+            return time.monotonic() - begun < AT_ONCE
+        except TimeoutError:
+            pass
+        return False
+
+
+def write_settings(path: Path, settings: dict[str, object]) -> None:
+    """Write settings that only their owner can read."""
+    path.write_text(json.dumps(settings))
+    path.chmod(0o600)
+
+
+def forged(source: str, payload: bytes) -> bytes:
+    """Return an IPv4 packet with a UDP datagram to the witness, from any address."""
+    udp = struct.pack("!HHHH", 5555, WITNESS, 8 + len(payload), 0) + payload
+    ends = socket.inet_aton(source) + socket.inet_aton(ROBOT)
+    return struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, socket.IPPROTO_UDP, 0) + ends + udp
+
+
+def seconds_until_reset(connections: list[socket.socket]) -> float:
+    """Return the time until all are reset; none of them sends."""
+    begun = time.monotonic()
+    for connection in connections:
+        connection.settimeout(LIMIT)
+        with pytest.raises(ConnectionResetError):
+            connection.recv(1)
+    return time.monotonic() - begun
