@@ -33,9 +33,9 @@ BACKENDS = ("nft", "iptables-nft", "iptables-legacy")
 class Peer:
     """An appliance that asks the witness."""
 
-    def __init__(self, host: Host, name: str) -> None:
+    def __init__(self, host: Host, name: str, key: bytes) -> None:
         self.name = name
-        self.channel = WitnessChannel(name, KEYS[name], os.urandom(8).hex())
+        self.channel = WitnessChannel(name, key, os.urandom(8).hex())
         self.socket = host.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         self.socket.connect((ROBOT, WITNESS))
         self.socket.settimeout(0.2)
@@ -145,7 +145,7 @@ class Site:
 
     def peer(self, name: str) -> Peer:
         """Return an appliance."""
-        peer = Peer(self.hosts[name], name)
+        peer = Peer(self.hosts[name], name, KEYS[name])
         self.sockets.enter_context(peer.socket)
         return peer
 

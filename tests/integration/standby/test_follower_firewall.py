@@ -113,16 +113,15 @@ def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:
         seconds_until_reset([idle])
         for name in ADDRESSES:
             assert site.refused(site.follower, ADDRESSES[name], MASTER)
-        site.connect(
-            site.robot, FIXED, MASTER
-        ).close()  # the end of the witness alone changes nothing on the robot
+        # The end of the witness alone changes nothing on the robot.
+        site.connect(site.robot, FIXED, MASTER).close()
+        site.accepted(site.servers["a"])
         site.serve()
-        peer = site.peer("a")
-        renewing = Renewing(peer, holder.epoch)
+        again = Renewing(site.peer("a"), holder.epoch)
         try:
             eventually(lambda: reaches(site, "a"), lambda: f"admitted again: {following.errors}")
         finally:
-            renewing.end()
+            again.end()
 
 
 def test_a_restored_witness_is_not_followed(site: Site) -> None:
