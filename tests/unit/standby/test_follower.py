@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from appliance.standby import witness
 from appliance.standby.witness import (
     ANSWER,
     EXPIRY,
@@ -12,7 +13,9 @@ from appliance.standby.witness import (
     OPERATIONS,
     REQUEST,
     AppliancePeer,
+    BoundedLog,
     Follower,
+    LeaseFile,
     LeaseRecord,
     Witness,
     WitnessError,
@@ -169,6 +172,18 @@ def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
     assert robot.follower_admits[-1] == ""
 
 
+def test_an_older_answer_does_not_replace_a_newer_one() -> None:
+    """The robot was rebooted in between and admits no appliance; the epoch is the same."""
+    robot = following()
+    first = robot.answer()
+    robot.start_witness(robot.witness.record, boot="two")
+    for _ in range(2):
+        robot.look()
+    assert robot.follower_admits[-1] == "" and first is not None
+    robot.follower.receive(first)
+    assert robot.follower_admits[-1] == ""
+
+
 def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
     """An attacker who keeps a packet back gains nothing."""
     robot = following()
@@ -306,6 +321,21 @@ def test_a_restarted_follower_goes_on_with_the_witnesss_numbers() -> None:
     robot.start_follower(epoch=2, session="second")
     robot.look()
     assert robot.look() == "a"
+
+
+def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
+    """The log has the reason and the commands; a missing one is that of a new follower."""
+    lines: list[str] = []
+    log, file = BoundedLog(lines.append, lambda: 0.0), LeaseFile(str(tmp_path / "epoch"), BOTH)
+    assert witness._followed_epoch(file, log) == 0
+    file.write(LeaseRecord(7, "", BOTH, ""))
+    assert witness._followed_epoch(file, log) == 7
+    (tmp_path / "epoch").write_bytes(b"damaged")
+    robot = Robot(epoch=witness._followed_epoch(file, log))
+    assert "systemctl restart rosrv-witness-follow" in lines[0]
+    robot.claim("a")
+    for _ in range(2):
+        assert robot.look() == ""
 
 
 # ---- Settings and rules
