@@ -7,7 +7,6 @@ link down, as a power cut does.
 import contextlib
 import json
 import os
-import secrets
 import shutil
 import signal
 import sys
@@ -16,8 +15,8 @@ from typing import Any, Self
 
 from appliance.network import interfaces
 from appliance.standby import witness
-from appliance.standby.link_certificates import make_link_certificate
-from appliance.standby.membership import Membership, path_of, save_membership
+from appliance.standby.kit import PairPlan, make_kits
+from appliance.standby.membership import PORT, Membership, path_of, save_membership
 from appliance.standby.witness import LeaseRecord
 from examples.landshark.lab import INTERFACE, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
@@ -28,44 +27,28 @@ from tests.support.waiting import eventually
 
 ROBOT, FIXED, OCU = "10.79.0.10", "10.79.0.100", "10.79.0.20"
 ADDRESSES = {"a": "10.79.0.2", "b": "10.79.0.3"}
-WITNESS_PORT = 7411
 MASTER = f"http://{FIXED}:11311"
 PORTS = ["11311", "19001-26000"]
 
 
 def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any]]:
     """Return the memberships of both appliances, and the settings of the witness."""
-    keys = {name: secrets.token_hex(32) for name in ADDRESSES}
-    peer = secrets.token_hex(32)
-    certificates = {}
-    for name in ADDRESSES:
-        (folder / name).mkdir()
-        certificates[name] = make_link_certificate(folder / name)
-    made = {
-        name: Membership(
-            name=name,
-            other=other,
-            address=ADDRESSES[name],
-            other_address=ADDRESSES[other],
-            fixed=FIXED,
-            witness=ROBOT,
-            witness_port=WITNESS_PORT,
-            witness_key=keys[name],
-            peer_key=peer,
-            certificate=certificates[name],
-            key=(folder / name / "standby-key.pem").read_text(),
-            other_certificate=certificates[other],
-        )
-        for name, other in (("a", "b"), ("b", "a"))
-    }
-    settings = {
-        "listen": f"{ROBOT}:{WITNESS_PORT}",
-        "fixed": FIXED,
-        "ports": PORTS,
-        "appliances": {name: {"address": ADDRESSES[name], "key": keys[name]} for name in ADDRESSES},
-        "state": str(folder / "lease"),
-    }
-    return made, settings
+    plan = PairPlan(
+        name="a",
+        address=ADDRESSES["a"],
+        other="b",
+        other_address=ADDRESSES["b"],
+        witness=ROBOT,
+        fixed=FIXED,
+        port=PORT,
+        ports=tuple(PORTS),
+        master_port=11311,
+        epoch=1,
+        followers={},
+    )
+    kits = make_kits(plan)
+    (settings,) = (json.loads(file.text) for file in kits.folders["witness"] if file.name == "witness.json")
+    return {"a": kits.own, "b": kits.other}, settings | {"state": str(folder / "lease")}
 
 
 class StandbySite:
