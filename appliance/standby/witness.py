@@ -75,6 +75,8 @@ _BATCH = 256  # datagrams between two checks of the time
 _LOOK_SECONDS = 0.2  # between two requests of a follower
 _LOOKS_A_SECOND = 50  # that the firewall accepts from a follower, so that a flood delays no renewal
 _MOST_PENDING = 8
+_CONFIDENCE = 0.9  # of the time that an answer has left
+_CLOCK_BOOTTIME = 7  # runs while the computer sleeps; Python 3.5 does not name it
 _MOST_FOLLOWERS = 32
 _LINES, _LINES_SECONDS = 20, 10.0
 _ESTABLISHED = ("01", "04", "05", "06", "08")  # in /proc/net/tcp: all states in which the peer may still send
@@ -401,18 +403,20 @@ class WitnessGate:
         return answer
 
 
-class Follower:
+class WitnessFollower:
     """The rules of a computer that does as the witness does.
 
     R1 to R4 of the lease are rules of the witness and the appliances; a follower only asks (`look`). It admits an
-    appliance only while the lease of that appliance runs at the witness: for the time that the answer has left, counted
-    from the time the request was *sent*. The witness grants the lease only after it has expired, or was released by an
-    appliance that had become passive. So whenever the robot admits one appliance, no follower that runs admits the
-    other one, unless that one has given the lease up. Without answers, both are shut out after at most one expiry.
+    appliance only while the lease of that appliance runs at the witness: for 0.9 of the time that the answer has left,
+    counted from the time the request was *sent*. The rest allows for clocks of different speeds.
+
+    The witness grants the lease only after it has expired, or was released by an appliance that had become passive. So
+    whenever the robot admits one appliance, no follower that runs admits the other one, unless that one has given the
+    lease up. Without answers, both are shut out after at most one expiry.
 
     An answer to an earlier process, an old answer and a repeated one are ignored. `epoch` is the greatest that was
-    saved; a smaller one, of a witness that was restored from an old disk, is not accepted. `save` and `admit` are those
-    of the witness.
+    saved; a smaller one, of a witness that was restored from an old disk, is not accepted. `clock` also runs while the
+    computer sleeps; `answered` is its time at the last authentic answer. `save` and `admit` are those of the witness.
     """
 
     def __init__(
@@ -429,6 +433,7 @@ class Follower:
     ) -> None:
         self.epoch = epoch
         self.refusal = ""
+        self.answered = clock()
         self._name = name
         self._key = key
         self._appliances = frozenset(appliances)
@@ -471,6 +476,7 @@ class Follower:
         sent = self._pending.get(body["number"])
         if sent is None:
             return
+        self.answered = self._clock()
         # An answer that overtook earlier ones is newer: theirs no longer count.
         self._pending = {number: at for number, at in self._pending.items() if number > body["number"]}
         if body.get("stale") is True:
@@ -490,7 +496,7 @@ class Follower:
         if epoch > self.epoch:
             self._save(epoch)
             self.epoch = epoch
-        self._holder, self._until = admitted, sent + min(left / 1000.0, EXPIRY)
+        self._holder, self._until = admitted, sent + _CONFIDENCE * min(left / 1000.0, EXPIRY)
         self.tick()
 
     def tick(self) -> None:
@@ -914,7 +920,7 @@ def _write_error(text: str) -> None:
     sys.stderr.flush()  # before Python 3.9 a pipe gets the text only when the buffer is full
 
 
-class Enforcement:
+class LeaseEnforcement:
     """The firewall and the idle connections of this computer."""
 
     def __init__(self, settings: WitnessSettings, backend: str, log: BoundedLog) -> None:
@@ -952,7 +958,7 @@ class Enforcement:
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     """Answer the appliances until the process ends."""
     log = BoundedLog(_write_error, time.monotonic)
-    enforcement = Enforcement(settings, backend, log)
+    enforcement = LeaseEnforcement(settings, backend, log)
     try:
         record = lease.read()  # type: Optional[LeaseRecord]
     except WitnessError as error:
@@ -996,10 +1002,10 @@ def _answer_one(requests: socket.socket, gate: WitnessGate) -> bool:
 def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     """Do as the witness does until the process ends. First, both appliances are shut out."""
     log = BoundedLog(_write_error, time.monotonic)
-    enforcement = Enforcement(settings, backend, log)
+    enforcement = LeaseEnforcement(settings, backend, log)
     names = tuple(sorted(settings.appliances))
     own = settings.followers[settings.follows_as]
-    follower = Follower(
+    follower = WitnessFollower(
         name=settings.follows_as,
         key=own.key,
         appliances=names,
@@ -1007,7 +1013,7 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         epoch=_followed_epoch(lease, log),
         save=lambda epoch: lease.write(LeaseRecord(epoch, "", names, "")),
         admit=enforcement.admit,
-        clock=time.monotonic,
+        clock=_boot_seconds,
     )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         asking.setsockopt(socket.SOL_IP, _FREEBIND, 1)
@@ -1017,7 +1023,7 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
             "%s follows the witness at %s:%d and uses %s" % (settings.follows_as, *settings.listen, backend)
         )
         asked = time.monotonic() - _LOOK_SECONDS
-        refusal = ""
+        shown = ""
         while True:  # until the process is ended; each turn is bounded
             left = asked + _LOOK_SECONDS - time.monotonic()
             ready, _, _ = select.select([asking], [], [], max(0.0, left))
@@ -1031,10 +1037,16 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
             if time.monotonic() - asked >= _LOOK_SECONDS:
                 asked = time.monotonic()
                 _send_look(asking, settings.listen, follower)
-            if follower.refusal != refusal:
-                refusal = follower.refusal
-                log.add(refusal or "the witness answers again")
+            silent = _boot_seconds() - follower.answered > EXPIRY
+            state = "the witness at %s:%d does not answer" % settings.listen if silent else follower.refusal
+            if state != shown:
+                shown = state
+                log.add(state or "the witness answers again")
             enforcement.go_on(follower.enforce_again)
+
+
+def _boot_seconds() -> float:
+    return time.clock_gettime(_CLOCK_BOOTTIME)
 
 
 def _followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
@@ -1052,12 +1064,12 @@ def _followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
         return HIGHEST
 
 
-def _send_look(asking: socket.socket, witness: Tuple[str, int], follower: Follower) -> None:
+def _send_look(asking: socket.socket, witness: Tuple[str, int], follower: WitnessFollower) -> None:
     with contextlib.suppress(OSError):  # no route to the witness at present; it is asked again
         asking.sendto(follower.request(), witness)
 
 
-def _receive_one(asking: socket.socket, witness: Tuple[str, int], follower: Follower) -> bool:
+def _receive_one(asking: socket.socket, witness: Tuple[str, int], follower: WitnessFollower) -> bool:
     try:
         datagram, source = asking.recvfrom(LONGEST + 1)
     except BlockingIOError:

@@ -8,8 +8,8 @@ from tests.support.sources import ROOT, product_files
 READERS = {
     "a moment that people are shown, or that stands in a file": [
         "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
-        "cli/status_watch.py", "control/host_blocks.py", "control/passive.py", "control/policies.py",
-        "control/queries.py", "control/replication.py",
+        "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
+        "control/policies.py", "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
         "hosts/checked_ports.py", "hosts/host_table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",

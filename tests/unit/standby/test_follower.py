@@ -1,6 +1,7 @@
 """A follower admits what the witness admits, never longer than the lease runs there, and never an older epoch."""
 
 import json
+import random
 from pathlib import Path
 
 import pytest
@@ -14,11 +15,11 @@ from appliance.standby.witness import (
     REQUEST,
     AppliancePeer,
     BoundedLog,
-    Follower,
     LeaseFile,
     LeaseRecord,
     Witness,
     WitnessError,
+    WitnessFollower,
     WitnessGate,
     iptables_rules,
     main,
@@ -61,7 +62,7 @@ class Robot:
 
     def start_follower(self, epoch: int = 0, session: str = "first") -> None:
         """Start the follower, or start it again."""
-        self.follower = Follower(
+        self.follower = WitnessFollower(
             name="arm",
             key=KEY,
             appliances=BOTH,
@@ -125,10 +126,10 @@ def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
     robot.now += 0.1
     answer = robot.answer(request)
     assert answer is not None
-    robot.now += 0.9
+    robot.now += 0.8
     robot.follower.receive(answer)
     assert robot.follower_admits[-1] == "a"
-    robot.now += 0.21
+    robot.now += 0.31
     assert robot.witness.handle("b", "claim", 0, "") == ""
     robot.follower.tick()
     assert robot.follower_admits[-1] == ""
@@ -336,6 +337,91 @@ def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
     robot.claim("a")
     for _ in range(2):
         assert robot.look() == ""
+
+
+class RandomHistory:
+    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats; 3 % of drift."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)  # noqa: S311  a reproducible history
+        self.seconds = 0.0
+        self.speeds = [self.random.uniform(0.97, 1.03) for _ in range(2)]
+        self.robot_admits = self.follower_admits = ""
+        self.record, self.boot, self.saved = LeaseRecord(1, "", BOTH, ""), 1, 0
+        self.up = dict.fromkeys(BOTH, True)
+        self.wire: list[tuple[float, bytes, bool]] = []
+        self.admitted_seconds = 0.0
+        self.start_witness()
+        self.start_follower()
+
+    def start_witness(self) -> None:
+        """Start the witness again, sometimes after a reboot of the robot."""
+        self.boot += self.random.random() < 0.3
+        self.witness = Witness(
+            record=self.record,
+            save=lambda record: setattr(self, "record", record),
+            admit=lambda name: setattr(self, "robot_admits", name),
+            boot=str(self.boot),
+            clock=lambda: self.seconds * self.speeds[0],
+        )
+        self.gate = WitnessGate(self.witness, APPLIANCES, f"{self.random.random()}", FOLLOWERS)
+
+    def start_follower(self) -> None:
+        """Start the follower again."""
+        self.follower = WitnessFollower(
+            name="arm",
+            key=KEY,
+            appliances=BOTH,
+            session=f"{self.random.random()}",
+            epoch=self.saved,
+            save=lambda epoch: setattr(self, "saved", epoch),
+            admit=lambda name: setattr(self, "follower_admits", name),
+            clock=lambda: self.seconds * self.speeds[1],
+        )
+
+    def send(self, datagram: bytes, *, answer: bool) -> None:
+        """Lose, delay or repeat a datagram; most arrive at once."""
+        chosen = self.random.random()
+        for _ in range(0 if chosen < 0.1 else 2 if chosen > 0.9 else 1):
+            delay = self.random.uniform(0, 2) if self.random.random() < 0.2 else 0.01
+            self.wire.append((self.seconds + delay, datagram, answer))
+
+    def step(self) -> None:
+        """Let 20 ms pass; check what is admitted."""
+        self.seconds += 0.02
+        if self.random.random() < 0.03:
+            self.up[self.random.choice(BOTH)] ^= True
+        if self.random.random() < 0.004:
+            self.start_witness()
+        if self.random.random() < 0.002:
+            self.start_follower()
+        for name in [one for one in BOTH if self.up[one] and self.random.random() < 0.1]:
+            other = "b" if name == "a" else "a"
+            operation = "renew" if self.record.holder == name else "claim"
+            self.witness.handle(name, operation, self.record.epoch, other)
+        if self.random.random() < 0.1:
+            self.send(self.follower.request(), answer=False)
+        due = [one for one in self.wire if one[0] <= self.seconds]
+        self.wire = [one for one in self.wire if one[0] > self.seconds]
+        for _, datagram, answer in due:
+            if answer:
+                self.follower.receive(datagram)
+            elif (made := self.gate.answer(datagram, "10.0.0.20")) is not None:
+                self.send(made, answer=True)
+        self.follower.tick()
+        both = {self.robot_admits, self.follower_admits} - {""}
+        assert len(both) < 2, f"after {self.seconds} s"
+        self.admitted_seconds += 0.02 if self.follower_admits else 0
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_robot_and_follower_never_admit_different_appliances(seed: int) -> None:
+    """Whatever is lost, late, repeated or restarted; most of the time the follower admits one."""
+    history = RandomHistory(seed)
+    for _ in range(3_000):
+        history.step()
+    assert history.record.epoch > 3, "there were takeovers"
+    assert history.admitted_seconds > 10
 
 
 # ---- Settings and rules
