@@ -85,6 +85,15 @@ def signed_checkpoints(log: Path, after: int = 0, limit: int = 1000) -> list[Sig
         raise LogUnreadableError(f"{log}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
 
+def newest_checkpoint(log: Path) -> SignedCheckpoint | None:
+    """Return the last signed checkpoint of the log, or None. Raises `LogUnreadableError`."""
+    query = "SELECT max(number) FROM checkpoint WHERE signature IS NOT NULL AND public_key IS NOT NULL"
+    with reading(log) as connection:
+        (number,) = connection.execute(query).fetchone()
+    found = [] if number is None else signed_checkpoints(log, number - 1, 1)
+    return found[0] if found else None
+
+
 def read_copies(file: Path) -> list[SignedCheckpoint]:
     """Return the checkpoints in a file: NDJSON (`rosrv audit checkpoints`), or the output of a syslog receiver.
 

@@ -101,6 +101,10 @@ EVENTS: dict[str, str] = {
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
     "appliance started": "The appliance is in service.",
     "appliance stopped": "The appliance was shut down in an orderly way.",
+    "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
+    " checkpoint of the other appliance's log that was replicated (null: none), and the takeover before.",
+    "handed over": "This appliance of a pair handed over to the other one in an orderly way; it decides nothing after"
+    " this record until it takes over again.",
     "malformed": "A peer sent an invalid request, or a publisher an invalid header; it was rejected for the `reason`"
     " given.",
     "connection opened": "A subscriber or service client is connected through the relay.",
@@ -144,10 +148,10 @@ SEVERITIES: dict[str, Severity] = {
         Severity.NOTICE: (
             "host block ended", "host unblocked",
             "appliance started", "appliance stopped", "clock not synchronised", "clock synchronised",
-            "evidence exported", "forwarding resumed", "host awaited", "host awaited no longer", "host enrolled",
-            "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
+            "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
+            "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
-            "switchover ordered", "token added", "token revoked", "token rotated", "topic looked into",
+            "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (

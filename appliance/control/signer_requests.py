@@ -17,6 +17,8 @@ class SignerRequests:
 
     def __init__(self, audit: Callable[[], AuditLog]) -> None:
         self.link = Link(self._heard)
+        self.signed = asyncio.Event()
+        """Set with each signature of a checkpoint, after the log got it."""
         self._audit = audit
         self._loop = asyncio.get_running_loop()
 
@@ -40,6 +42,7 @@ class SignerRequests:
         match message:
             case messages.SignatureMade(number, signature, public_key):
                 self._audit().signed(number, signature, public_key)
+                self.signed.set()
             case messages.SignatureRefused(number, reason):
                 self._audit().refused(number, reason)
             case messages.RemovalApproved(number, text, signature, public_key):

@@ -10,16 +10,18 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated, TextIO, TypeVar
 
 import msgspec
 import typer
 
+from appliance.audit.chain_findings import Verification
 from appliance.audit.copies import read_copies
 from appliance.audit.query import Filter
 from appliance.audit.record_format import LogEntry, as_json, as_object
 from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
+from appliance.audit.takeover_verification import PairVerification, VerifiedLog, verify_takeovers
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.filter import filtered
 from appliance.cli.audit.record_argument import RecordArgument
@@ -31,14 +33,18 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
+from appliance.cli.audit.takeover_table import print_pair
+from appliance.cli.connection.audit_file import FileLog
+from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.evidence.export_verification import verify_export
+from appliance.evidence.export_verification import ExportVerification, verify_export
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (
     5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
+_R = TypeVar("_R", Verification, PairVerification, ExportVerification)
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
 _AlwaysJson = Annotated[bool, typer.Option("--json", help="Accepted; the output is always NDJSON")]
 
@@ -135,6 +141,21 @@ def verify(
             "--export", help="Deprecated: verify this output of `rosrv audit export` instead; needs --key"
         ),
     ] = None,
+    other: Annotated[
+        Path | None,
+        typer.Option(
+            "--other",
+            help="State directory, or a copy, of the other appliance of a pair: verify both logs, and the takeovers"
+            " between them",
+        ),
+    ] = None,
+    other_key: Annotated[
+        Path | None, typer.Option("--other-key", help="Public key (PEM) of the other appliance's log")
+    ] = None,
+    other_checkpoints: Annotated[
+        Path | None,
+        typer.Option("--other-checkpoints", help="Checkpoints of the other log kept on another machine"),
+    ] = None,
 ) -> None:
     """Verify that the log is complete and unchanged. Exit status: 0 yes, 1 no, 2 cannot be read.
 
@@ -144,21 +165,48 @@ def verify(
 
     Example: rosrv audit verify --key /media/safe/audit.pub --checkpoints /media/safe/checkpoints.ndjson
     """
+    if other is None and (other_key is not None or other_checkpoints is not None):
+        fail("--other-key and --other-checkpoints need --other, the other appliance's state directory", 2)
+    if export_file is not None and other is not None:
+        fail("--export and --other exclude each other: verify the export alone", 2)
     if export_file is not None:
         _verify_export(export_file, key, copies=checkpoints is not None, as_json_lines=appliance.as_json)
         return
     with Errors():
         source = appliance.audit()
-        copies = None if checkpoints is None else read_copies(checkpoints)
-        public_key = None if key is None else read_public_key(key)
-        with progress("checking the chain", source.last) as report:
-            result = source.verify(public_key, copies, report)
-        if appliance.as_json:
-            write(json.dumps(msgspec.to_builtins(result)))
+        partner = None if other is None else _files(source, other)
+        result = _verified(source, key, checkpoints)
+        if partner is not None:
+            of_other = VerifiedLog(partner[1].path, _verified(partner[1], other_key, other_checkpoints))
+            pair = verify_takeovers(VerifiedLog(partner[0].path, result), of_other)
+            _print_result(pair, print_pair, as_json_lines=appliance.as_json)
         else:
-            print_verification(result)
-        if not result.ok:
-            raise typer.Exit(1)
+            _print_result(result, print_verification, as_json_lines=appliance.as_json)
+
+
+def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
+    if not isinstance(source, FileLog):
+        fail("--other needs the logs' files: run this with --state, on any machine with copies of both", 2)
+    if not other.is_dir():
+        fail(f"{other}: no such directory; give the other appliance's state directory with --other", 2)
+    return source, FileLog(other)
+
+
+def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | None) -> Verification:
+    copies = None if checkpoints is None else read_copies(checkpoints)
+    public_key = None if key is None else read_public_key(key)
+    with progress("checking the chain", source.last) as report:
+        return source.verify(public_key, copies, report)
+
+
+def _print_result(result: _R, printed: Callable[[_R], None], *, as_json_lines: bool) -> None:
+    """Print the result of a verification; exit with status 1 if it has findings."""
+    if as_json_lines:
+        write(json.dumps(msgspec.to_builtins(result)))
+    else:
+        printed(result)
+    if not result.ok:
+        raise typer.Exit(1)
 
 
 def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines: bool) -> None:
@@ -173,12 +221,7 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
             "--export is deprecated: use `rosrv evidence export`, and `rosrv evidence verify` for its bundle"
         )
         result = verify_export(file, read_public_key(key))
-        if as_json_lines:
-            write(json.dumps(msgspec.to_builtins(result)))
-        else:
-            print_export_verification(result)
-        if not result.ok:
-            raise typer.Exit(1)
+        _print_result(result, print_export_verification, as_json_lines=as_json_lines)
 
 
 @speaks_with(_AlwaysJson)

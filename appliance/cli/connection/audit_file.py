@@ -29,7 +29,8 @@ class FileLog:
         self._state = state
 
     @property
-    def _path(self) -> Path:
+    def path(self) -> Path:
+        """Return the path of the log's file."""
         if not self._state.is_dir():
             raise LogUnreadableError(
                 f"{self._state}: no such directory; give the appliance's state directory with --state"
@@ -38,29 +39,27 @@ class FileLog:
 
     def search(self, wanted: Filter, cursor: str | None, limit: int, *, newest_first: bool) -> SearchPage:
         """Return at most `limit` records from `cursor` on."""
-        return search(self._path, wanted, cursor, limit, newest_first=newest_first)
+        return search(self.path, wanted, cursor, limit, newest_first=newest_first)
 
     def denials(self, wanted: Filter, limit: int) -> DenialSummary:
         """Return the denials that match, by host."""
-        return summary_of_log(self._path, wanted, limit)
+        return summary_of_log(self.path, wanted, limit)
 
     def show(self, record_id: str, neighbours: int) -> RecordInContext | None:
         """Return one record with its neighbours; None if the log has no such record."""
-        return show(self._path, record_id, neighbours)
+        return show(self.path, record_id, neighbours)
 
     def export(self, wanted: Filter) -> Iterator[LogEntry]:
         """Yield all records that match, the oldest first."""
-        return export(self._path, wanted)
+        return export(self.path, wanted)
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         """Yield the sequence and the NDJSON line of all matching records, oldest first."""
-        return (
-            (entry.sequence, evidence_line(entry, chain)) for entry, chain in evidence(self._path, wanted)
-        )
+        return ((entry.sequence, evidence_line(entry, chain)) for entry, chain in evidence(self.path, wanted))
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
         """Yield the last matching records, oldest first; then, if `on`, yield new records without end."""
-        path = self._path
+        path = self.path
         follower = Follower(path, wanted)
         if lines:
             yield search(path, wanted, str(follower.position + 1), lines).entries[::-1]
@@ -76,15 +75,15 @@ class FileLog:
 
         `progress` is called with the sequence of the last verified record.
         """
-        path = self._path
+        path = self.path
         signer = path.parent.parent / "signer"
         may = os.access(signer, os.R_OK | os.X_OK)
         return verify(path, key, signer if may else None, copies, progress)
 
     def checkpoints(self, after: int) -> list[SignedCheckpoint]:
         """Return some of the signed checkpoints after a number, in order; empty at the end."""
-        return signed_checkpoints(self._path, after)
+        return signed_checkpoints(self.path, after)
 
     def last(self) -> int:
         """Return the sequence of the last record; 0 for an empty log."""
-        return last_sequence(self._path)
+        return last_sequence(self.path)

@@ -1,0 +1,179 @@
+"""Define the records of takeovers between two appliances, and read them from a log.
+
+Each appliance has a chain and a key of its own. The record of a takeover links the two chains: it names the other
+chain's last checkpoint that was replicated, with its signature. It also names the takeover before it, so that a removed
+record leaves a gap, although the epochs of a lease may have gaps.
+"""
+
+import sqlite3
+from bisect import bisect_left, bisect_right
+from itertools import accumulate, islice
+from typing import Annotated, NamedTuple
+
+import msgspec
+
+from appliance.audit.chain_findings import Verification
+from appliance.audit.copies import SignedCheckpoint
+from appliance.audit.signatures import signature_is_valid
+from appliance.signing.signed_statements import parse_checkpoint
+
+TOOK_OVER, HANDED_OVER = "took over", "handed over"
+CLOCK_EVENTS = ("clock set back", "clock set forward")
+_Epoch = Annotated[int, msgspec.Meta(ge=0, lt=1 << 63)]
+_Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
+_NOT_AS_WRITTEN = (msgspec.MsgspecError, ValueError, RecursionError, MemoryError)
+
+
+class EpochOf(msgspec.Struct, frozen=True):
+    """An epoch, and the appliance that took over in it."""
+
+    epoch: _Epoch
+    appliance: _Name
+
+
+class TookOver(msgspec.Struct, frozen=True, kw_only=True):
+    """The detail of a `took over` record.
+
+    `checkpoint` is the last replicated checkpoint of the `other` appliance's log, and `previous` the last takeover
+    before this one; None if this appliance had none.
+    """
+
+    epoch: _Epoch
+    appliance: _Name
+    other: _Name
+    checkpoint: SignedCheckpoint | None
+    previous: EpochOf | None
+
+
+class HandedOver(msgspec.Struct, frozen=True, kw_only=True):
+    """The detail of a `handed over` record: `appliance` decided for the last time in this epoch."""
+
+    epoch: _Epoch
+    appliance: _Name
+    to: _Name
+
+
+class Takeover(NamedTuple):
+    """A takeover with its place and time (nanoseconds since the epoch, by its own machine's clock)."""
+
+    sequence: int
+    time: int
+    detail: TookOver
+
+
+class Handover(NamedTuple):
+    """A hand-over with its place."""
+
+    sequence: int
+    detail: HandedOver
+
+
+class Decision(NamedTuple):
+    """The place and time of a decision."""
+
+    sequence: int
+    time: int
+
+
+def checkpoint_fault(checkpoint: SignedCheckpoint) -> str:
+    """Return why a checkpoint is not valid in itself; empty for a valid one."""
+    try:
+        parse_checkpoint(checkpoint.text())
+        key, signature = bytes.fromhex(checkpoint.key), bytes.fromhex(checkpoint.signature)
+    except ValueError as error:
+        return str(error)
+    return "" if signature_is_valid(key, signature, checkpoint.text()) else "its signature is wrong"
+
+
+def _epoch(takeover: Takeover) -> int:
+    return takeover.detail.epoch
+
+
+class TakeoverLog:
+    """The verified part of one log, read from one snapshot. Methods raise `sqlite3.DatabaseError`."""
+
+    def __init__(self, connection: sqlite3.Connection, result: Verification) -> None:
+        self._connection = connection
+        self.result = result
+        self.takeovers: list[Takeover] = []
+        self.handovers: list[Handover] = []
+        self.unreadable: list[int] = []
+        """The sequences of records whose detail is not that of a takeover or hand-over."""
+        self._read()
+        self.names = {takeover.detail.appliance for takeover in self.takeovers}
+        self.epochs = {takeover.detail.epoch for takeover in self.takeovers}
+        self.first_epoch = min(self.epochs, default=None)
+        self._places = [takeover.sequence for takeover in self.takeovers]
+        self._latest = list(accumulate(self.takeovers, lambda *two: max(two, key=_epoch)))
+
+    def _read(self) -> None:
+        rows = self._connection.execute(
+            "SELECT sequence, time, event, CAST(detail AS BLOB) FROM record WHERE event IN (?, ?) AND sequence <= ?"
+            " ORDER BY sequence",
+            (TOOK_OVER, HANDED_OVER, self.result.last),
+        )
+        for sequence, time, event, detail in rows:
+            _require_integers(sequence, time)
+            try:
+                if event == TOOK_OVER:
+                    decoded = msgspec.json.decode(detail, type=TookOver)
+                    self.takeovers.append(Takeover(sequence, time, decoded))
+                else:
+                    self.handovers.append(Handover(sequence, msgspec.json.decode(detail, type=HandedOver)))
+            except _NOT_AS_WRITTEN:
+                self.unreadable.append(sequence)
+
+    def before(self, sequence: int) -> Takeover | None:
+        """Return the last takeover before a record."""
+        place = bisect_left(self._places, sequence)
+        return self.takeovers[place - 1] if place else None
+
+    def latest_epoch(self, through: int) -> Takeover | None:
+        """Return the takeover with the greatest epoch up to a place."""
+        place = bisect_right(self._places, through)
+        return self._latest[place - 1] if place else None
+
+    def end_of(self, sequence: int, epoch: int = -1) -> int:
+        """Return the place before the first takeover after a record and an epoch, or the last place of the log."""
+        later = islice(self.takeovers, bisect_right(self._places, sequence), None)
+        return next((one.sequence - 1 for one in later if one.detail.epoch > epoch), self.result.last)
+
+    def last_decision(self, after: int, through: int) -> Decision | None:
+        """Return the last decision after a place and up to another."""
+        return self._decision("DESC", after, through)
+
+    def first_decision(self, after: int, through: int) -> Decision | None:
+        """Return the first decision after a place and up to another."""
+        return self._decision("ASC", after, through)
+
+    def _decision(self, order: str, after: int, through: int) -> Decision | None:
+        # Retention writes old denials again, with their old time and `kept`; a quote inside a string is escaped.
+        row = self._connection.execute(
+            "SELECT sequence, time FROM record WHERE +event = 'decision' AND sequence > ? AND sequence <= ?"  # noqa: S608  a fixed word
+            f""" AND instr(CAST(detail AS TEXT), '"kept":') = 0 ORDER BY sequence {order} LIMIT 1""",
+            (after, through),
+        ).fetchone()
+        if row is None:
+            return None
+        _require_integers(*row)
+        return Decision(*row)
+
+    def clock_was_set(self, after: int, through: int) -> bool:
+        """Whether a change of the machine's clock is recorded after a place and up to another."""
+        query = "SELECT 1 FROM record WHERE event IN (?, ?) AND sequence > ? AND sequence <= ? LIMIT 1"
+        return self._connection.execute(query, (*CLOCK_EVENTS, after, through)).fetchone() is not None
+
+    def hash_at(self, sequence: int) -> str | None:
+        """Return the hash of a record, or None if the log does not have it."""
+        row = self._connection.execute("SELECT hash FROM record WHERE sequence = ?", (sequence,)).fetchone()
+        return row[0].hex() if row is not None and isinstance(row[0], bytes) else None
+
+    def checkpoint_text(self, number: int) -> bytes | None:
+        """Return the text of a checkpoint, or None if the log does not have it."""
+        row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
+        return row[0] if row is not None and isinstance(row[0], bytes) else None
+
+
+def _require_integers(*values: object) -> None:
+    if not all(isinstance(value, int) for value in values):
+        raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
