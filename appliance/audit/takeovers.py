@@ -19,7 +19,7 @@ from appliance.signing.signed_statements import parse_checkpoint
 
 TOOK_OVER, HANDED_OVER = "took over", "handed over"
 CLOCK_EVENTS = ("clock set back", "clock set forward")
-_Epoch = Annotated[int, msgspec.Meta(ge=0, lt=1 << 63)]
+_Epoch = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
 _NOT_AS_WRITTEN = (msgspec.MsgspecError, ValueError, RecursionError, MemoryError)
 

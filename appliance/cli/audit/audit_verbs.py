@@ -128,6 +128,7 @@ def show(
 @speaks_with(_Json)
 def verify(
     appliance: Appliance,
+    *,
     key: Annotated[
         Path | None, typer.Option("--key", help="Public key (PEM) that the checkpoints must be signed with")
     ] = None,

@@ -1,52 +1,60 @@
 """Print the verification of two logs and of the takeovers between them."""
 
+from collections.abc import Iterator
+
 from appliance.audit.record_format import printable, rfc3339
 from appliance.audit.takeover_verification import PairVerification, TakeoverProof
 from appliance.cli.audit.record_table import print_verification, write
 
 
 def print_pair(pair: PairVerification) -> None:
-    """Print both verifications, then one line for each finding between the logs and for each takeover."""
+    """Print both verifications, then the findings between the logs, and each takeover with its proof."""
+    names = {takeover.log: takeover.appliance for takeover in pair.takeovers}
     for result in pair.logs:
+        if result.log in names:
+            write(f"Log of {names[result.log]}:")
         print_verification(result)
         write("")
     for finding in pair.findings:
         write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
     for takeover in pair.takeovers:
-        write(
-            f"epoch {takeover.epoch}, {rfc3339(takeover.time)}: {takeover.appliance} took over from"
-            f" {takeover.other} (record {takeover.sequence} of log {takeover.log}); {_link(takeover)}{_overlap(takeover)}"
-        )
+        by = f"{takeover.appliance} took over from {takeover.other}"
+        write(f"epoch {takeover.epoch}, {rfc3339(takeover.time)}: {by} (record {takeover.sequence})")
+        for text in _proven(takeover):
+            write(f"    {text}")
     write(_verdict(pair))
 
 
-def _link(takeover: TakeoverProof) -> str:
-    other = takeover.other
+def _proven(takeover: TakeoverProof) -> Iterator[str]:
+    other, through = takeover.other, takeover.through
     match takeover.link:
         case "none":
-            return f"no checkpoint of {other} is named, so nothing links the logs here"
+            yield f"it names no checkpoint of {other}, so it proves nothing about that log"
         case "wrong":
-            return f"the checkpoint of {other} that it names is wrong, see above"
+            yield f"it names a checkpoint of {other} that is wrong, see above"
         case "removed":
-            return f"it names the log of {other} up to record {takeover.through}, which retention has removed since"
+            yield f"retention has removed the records of {other} up to record {through}, which it names"
         case "proven":
-            tail = f"{takeover.tail} later records of {other}, {takeover.tail_signed} of them sealed by later checkpoints"
-            return f"it proves the log of {other} up to record {takeover.through}; not the {tail}"
-
-
-def _overlap(takeover: TakeoverProof) -> str:
+            yield f"the log of {other} agrees with it up to record {through}"
+    if through:
+        yield (
+            f"records of {other} after that, until its next takeover: {takeover.tail};"
+            f" later checkpoints seal {takeover.tail_signed}"
+        )
     match takeover.overlap:
         case "excluded":
-            return f"; {takeover.other} decided nothing more until it took over again"
+            yield f"{other} decided nothing more until it took over again"
         case "found":
-            return f"; {takeover.other} went on deciding, see above"
+            yield f"{other} went on deciding, see above"
         case "unknown":
-            return ""
+            yield f"the logs do not show whether {other} went on deciding"
 
 
 def _verdict(pair: PairVerification) -> str:
     if not pair.ok:
         return "A log was tampered with or is damaged, or the two logs do not fit together."
     if not pair.takeovers:
-        return "Both logs have no finding, but they have no takeover: nothing links them."
-    return f"Both logs, and the {len(pair.takeovers)} takeovers between them, have no finding."
+        return "Both logs are complete and unchanged, but neither has a takeover: nothing links them."
+    count = len(pair.takeovers)
+    takeovers = "the takeover" if count == 1 else f"the {count} takeovers"
+    return f"Both logs are complete and unchanged, and so are {takeovers} between them."

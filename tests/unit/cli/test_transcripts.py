@@ -16,6 +16,7 @@ from appliance.channel.answers.recording_answers import Recording, Recordings
 from appliance.network.scan import ScanResult
 from rosmop.tests.acting import message
 from tests.support.answers import example
+from tests.support.appliance_pair import four_takeovers, play
 from tests.support.audit import decision, settle
 from tests.support.bags import make_bag, number
 from tests.support.fake_appliance import FakeAppliance
@@ -54,6 +55,13 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
             log.record(decision(log, place, **yaml.safe_load(changes)))
             assert not signed or settle(log) is None
     assert log.close() is None
+
+
+def write_pair(*, below: list[str]) -> None:
+    """`pair`: the state of two appliances after four takeovers, in `state` and `other`."""
+    assert not below
+    for member, folder in zip(play(Path("pair"), four_takeovers), ("state", "other"), strict=True):
+        shutil.copytree(member.state, folder, dirs_exist_ok=True)
 
 
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
@@ -103,6 +111,7 @@ def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Tran
         more: dict[str, Callable[..., None]] = {
             "bag": write_bag,
             "log": write_log,
+            "pair": write_pair,
             "recordings": functools.partial(keep_recordings, fake),
             "scan": functools.partial(set_scan, monkeypatch),
         }

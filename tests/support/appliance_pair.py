@@ -1,0 +1,178 @@
+"""Two appliances with an audit log, a key and a state each, which take over from each other."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
+from appliance.audit.log import AuditLog
+from appliance.control.takeover_record import TakeoverRecorder
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.audit import decision
+from tests.support.waiting import eventually
+
+SECOND = 1_000_000_000
+BEGAN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
+
+
+class World:
+    """The time that passes for both appliances, in nanoseconds since the epoch."""
+
+    def __init__(self) -> None:
+        self.now = BEGAN
+
+    def passes(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += int(seconds * SECOND)
+
+
+class Member:
+    """One appliance of a pair; its clock is `ahead` seconds. Call `open` in an event loop."""
+
+    def __init__(self, state: Path, name: str, other: str, world: World, *, ahead: float = 0) -> None:
+        self.state, self.name, self.other = state, name, other
+        self.key = Ed25519PrivateKey.generate()
+        self.ahead = ahead
+        self._world = world
+        (state / "control").mkdir(parents=True)
+        self.path = state / "control" / "audit.db"
+
+    def clock(self) -> int:
+        """Return the time of this machine's clock."""
+        return self._world.now + int(self.ahead * SECOND)
+
+    def open(self) -> None:
+        """Start control's log, state and recorder."""
+        loop, signed = asyncio.get_running_loop(), asyncio.Event()
+        self.signed = signed
+        self._signs = True
+        public, logs = self.key.public_key().public_bytes_raw(), list[AuditLog]()
+
+        def sign(number: int, text: bytes) -> None:
+            if logs and self._signs:  # requests made by the constructor are repeated by `request_signatures`
+                logs[0].signed(number, self.key.sign(text), public)
+                loop.call_soon_threadsafe(signed.set)
+
+        self.log = AuditLog(
+            self.path, signer=sign, clock=self.clock, checkpoint_every=1_000_000, checkpoint_seconds=1e6
+        )
+        logs.append(self.log)
+        self.log.request_signatures()
+        self.store = StateStore(self.state / "control", failed=lambda _reason: None)
+        trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+        self.trail = trail
+        self.recorder = TakeoverRecorder(
+            trail, self.log, self.store, signed, name=self.name, other=self.other
+        )
+
+    def silence(self) -> None:
+        """Let the signer answer no further request."""
+        self._signs = False
+
+    def close(self) -> None:
+        """End control; the last checkpoint gets no signature, as after a crash."""
+        self.silence()
+        assert self.log.close() is None
+        self.store.close()
+
+    @asynccontextmanager
+    async def active(self, epoch: int, *, sealed: bool = True) -> AsyncIterator[None]:
+        """Take over, wait until the takeover is `sealed`, and stay active for the block."""
+        with self.timed():
+            await self.recorder.took_over(epoch)
+        following = asyncio.create_task(self.recorder.follow())
+        try:
+            if sealed:
+                await self.sealed()
+            yield
+        finally:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
+
+    def timed(self) -> "mock._patch[object]":
+        """Return a patch that gives records of the trail this machine's time."""
+        times = SimpleNamespace(time_ns=self.clock, monotonic_ns=lambda: 0)
+        return mock.patch("appliance.telemetry.audit_trail.time", times)
+
+    async def decide(self, count: int, seconds: float) -> None:
+        """Record decisions over some seconds."""
+        for number in range(count):
+            self._world.passes(seconds / count)
+            self.log.record(decision(self.log, number, time=self.clock()))
+        assert await self.log.wait_durable() is None
+
+    async def sealed(self) -> None:
+        """Wait until the state has a checkpoint of everything recorded so far."""
+        assert await self.log.wait_signed() is None
+        newest = newest_checkpoint(self.path)
+        await asyncio.to_thread(
+            eventually, lambda: self.replicated() == newest, "the checkpoint is replicated"
+        )
+
+    def replicated(self) -> SignedCheckpoint | None:
+        """Return this appliance's checkpoint in its state."""
+        text = self.store.settings().get(f"audit checkpoint of {self.name}")
+        return None if text is None else msgspec.json.decode(text, type=SignedCheckpoint)
+
+    def replicate_to(self, other: "Member") -> None:
+        """Copy the state to the other appliance, as the link between them does."""
+        for name, value in self.store.settings().items():
+            other.store.save_setting(name, value)
+
+    async def hand_over(self, epoch: int) -> None:
+        """Hand over in an orderly way."""
+        with self.timed():
+            await asyncio.wait_for(self.recorder.handed_over(epoch), 60)
+
+
+Story = Callable[[Member, Member, World], Awaitable[None]]
+
+
+def play(folder: Path, story: Story) -> tuple[Member, Member]:
+    """Return two appliances, `a` and `b`, after a story; their clocks differ by an hour."""
+    world = World()
+    a = Member(folder / "a", "a", "b", world)
+    b = Member(folder / "b", "b", "a", world, ahead=3600)
+
+    async def tell() -> None:
+        a.open()
+        b.open()
+        try:
+            await story(a, b, world)
+        finally:
+            a.close()
+            b.close()
+
+    asyncio.run(tell())
+    return a, b
+
+
+async def four_takeovers(a: Member, b: Member, world: World) -> None:
+    """Let a and b take over in turn: a dies, b hands over, epoch 3 is lost, a dies again."""
+    async with a.active(1):
+        await a.decide(10, 100)
+        await a.sealed()
+        a.replicate_to(b)
+        await a.decide(5, 2)
+    world.passes(3)
+    async with b.active(2):
+        await b.decide(10, 100)
+    await b.hand_over(2)
+    b.replicate_to(a)
+    world.passes(1)
+    async with a.active(4):
+        await a.decide(10, 100)
+        await a.sealed()
+        a.replicate_to(b)
+        await a.decide(5, 2)
+    world.passes(3)
+    async with b.active(5):
+        await b.decide(10, 100)
+        await b.sealed()
