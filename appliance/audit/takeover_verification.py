@@ -1,9 +1,9 @@
 """Verify the takeovers between the verified logs of two appliances.
 
 1. The checkpoint that a takeover names is in the other log, with this hash and a signature by the other log's key.
-2. Epochs increase in each log and over both. No record up to a named checkpoint is of that epoch or a later one.
+2. Epochs increase in each log and over both. No record up to a named checkpoint is of a later epoch.
 3. The takeover that a takeover names as the one before it is in its log.
-4. An appliance decides nothing between its hand-over and its next takeover.
+4. An appliance decides nothing between its hand-over and its next takeover, except what was under way.
 5. While one appliance decided, the other was silent for at least as long. Each duration is measured with one clock, so
    the two clocks need not agree. `_TOLERANCE` allows for a clock that was set while its machine was off.
 
@@ -24,7 +24,7 @@ import msgspec
 from appliance.audit.chain_findings import Verification
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.log_database import reading
-from appliance.audit.takeovers import EpochOf, Takeover, TakeoverLog, checkpoint_fault
+from appliance.audit.takeovers import EpochOf, Handover, Takeover, TakeoverLog, checkpoint_fault
 
 _SECOND = 1_000_000_000
 _TOLERANCE = 5 * _SECOND
@@ -117,7 +117,6 @@ def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerificatio
 
 
 def _opened(connection: sqlite3.Connection, log: VerifiedLog) -> TakeoverLog:
-    connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
     connection.execute("BEGIN")
     return TakeoverLog(connection, log.result)
 
@@ -190,13 +189,20 @@ class _Pair:
                     f" appliance took over in epoch {held.detail.epoch} from {held.detail.other}"
                 )
                 self._find(TakeoverFindingKind.EPOCH_ORDER, epoch, message)
-            late = log.first_decision(sequence, log.end_of(sequence))
-            if late is not None:
-                message = (
-                    f"{handover.detail.appliance} handed over in record {sequence} of log {log.result.log}, and"
-                    f" decided again in record {late.sequence} before it took over"
-                )
-                self._find(TakeoverFindingKind.OVERLAP, epoch, message)
+            self._check_silence(log, handover)
+
+    def _check_silence(self, log: TakeoverLog, handover: Handover) -> None:
+        """Find decisions after a hand-over, except those that were under way or came after it failed."""
+        end = log.end_of(handover.sequence)
+        late = log.last_decision(handover.sequence, log.stayed(handover.sequence, end) or end)
+        if late is None or log.clock_was_set(handover.sequence, late.sequence):
+            return
+        if late.time - handover.time > _TOLERANCE:
+            message = (
+                f"{handover.detail.appliance} handed over in record {handover.sequence} of log {log.result.log}, and"
+                f" decided again in record {late.sequence} before it took over"
+            )
+            self._find(TakeoverFindingKind.OVERLAP, handover.detail.epoch, message)
 
     # --- the links between the logs ---------------------------------------------------------------------------
 
@@ -305,9 +311,9 @@ def _contradiction(
 
 
 def _later_epoch(one: _Placed, named: SignedCheckpoint) -> str | None:
-    """Return why a named checkpoint is too late: it seals a takeover of the same epoch or a later one."""
-    sealed = one.other.latest_epoch(named.sequence)
-    if sealed is None or sealed.detail.epoch < one.epoch:
+    """Return why a named checkpoint is too late: it seals a takeover of a later epoch."""
+    sealed = one.other.before(named.sequence + 1)
+    if sealed is None or sealed.detail.epoch <= one.epoch:
         return None
     return (
         f"checkpoint {named.number}, which seals the takeover of epoch {sealed.detail.epoch}, record"

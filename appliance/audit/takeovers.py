@@ -7,7 +7,7 @@ record leaves a gap, although the epochs of a lease may have gaps.
 
 import sqlite3
 from bisect import bisect_left, bisect_right
-from itertools import accumulate, islice
+from itertools import islice
 from typing import Annotated, NamedTuple
 
 import msgspec
@@ -17,7 +17,7 @@ from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.signatures import signature_is_valid
 from appliance.signing.signed_statements import parse_checkpoint
 
-TOOK_OVER, HANDED_OVER = "took over", "handed over"
+TOOK_OVER, HANDED_OVER, STAYED = "took over", "handed over", "switchover failed"
 CLOCK_EVENTS = ("clock set back", "clock set forward")
 _Epoch = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
@@ -46,7 +46,7 @@ class TookOver(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HandedOver(msgspec.Struct, frozen=True, kw_only=True):
-    """The detail of a `handed over` record: `appliance` decided for the last time in this epoch."""
+    """The detail of a `handed over` record: `appliance` answered for the last time in this epoch."""
 
     epoch: _Epoch
     appliance: _Name
@@ -62,13 +62,14 @@ class Takeover(NamedTuple):
 
 
 class Handover(NamedTuple):
-    """A hand-over with its place."""
+    """A hand-over with its place and time."""
 
     sequence: int
+    time: int
     detail: HandedOver
 
 
-class Decision(NamedTuple):
+class DecisionPlace(NamedTuple):
     """The place and time of a decision."""
 
     sequence: int
@@ -83,10 +84,6 @@ def checkpoint_fault(checkpoint: SignedCheckpoint) -> str:
     except ValueError as error:
         return str(error)
     return "" if signature_is_valid(key, signature, checkpoint.text()) else "its signature is wrong"
-
-
-def _epoch(takeover: Takeover) -> int:
-    return takeover.detail.epoch
 
 
 class TakeoverLog:
@@ -104,7 +101,6 @@ class TakeoverLog:
         self.epochs = {takeover.detail.epoch for takeover in self.takeovers}
         self.first_epoch = min(self.epochs, default=None)
         self._places = [takeover.sequence for takeover in self.takeovers]
-        self._latest = list(accumulate(self.takeovers, lambda *two: max(two, key=_epoch)))
 
     def _read(self) -> None:
         rows = self._connection.execute(
@@ -119,7 +115,8 @@ class TakeoverLog:
                     decoded = msgspec.json.decode(detail, type=TookOver)
                     self.takeovers.append(Takeover(sequence, time, decoded))
                 else:
-                    self.handovers.append(Handover(sequence, msgspec.json.decode(detail, type=HandedOver)))
+                    handed = msgspec.json.decode(detail, type=HandedOver)
+                    self.handovers.append(Handover(sequence, time, handed))
             except _NOT_AS_WRITTEN:
                 self.unreadable.append(sequence)
 
@@ -128,25 +125,20 @@ class TakeoverLog:
         place = bisect_left(self._places, sequence)
         return self.takeovers[place - 1] if place else None
 
-    def latest_epoch(self, through: int) -> Takeover | None:
-        """Return the takeover with the greatest epoch up to a place."""
-        place = bisect_right(self._places, through)
-        return self._latest[place - 1] if place else None
-
     def end_of(self, sequence: int, epoch: int = -1) -> int:
         """Return the place before the first takeover after a record and an epoch, or the last place of the log."""
         later = islice(self.takeovers, bisect_right(self._places, sequence), None)
         return next((one.sequence - 1 for one in later if one.detail.epoch > epoch), self.result.last)
 
-    def last_decision(self, after: int, through: int) -> Decision | None:
+    def last_decision(self, after: int, through: int) -> DecisionPlace | None:
         """Return the last decision after a place and up to another."""
         return self._decision("DESC", after, through)
 
-    def first_decision(self, after: int, through: int) -> Decision | None:
+    def first_decision(self, after: int, through: int) -> DecisionPlace | None:
         """Return the first decision after a place and up to another."""
         return self._decision("ASC", after, through)
 
-    def _decision(self, order: str, after: int, through: int) -> Decision | None:
+    def _decision(self, order: str, after: int, through: int) -> DecisionPlace | None:
         # Retention writes old denials again, with their old time and `kept`; a quote inside a string is escaped.
         row = self._connection.execute(
             "SELECT sequence, time FROM record WHERE +event = 'decision' AND sequence > ? AND sequence <= ?"  # noqa: S608  a fixed word
@@ -156,12 +148,22 @@ class TakeoverLog:
         if row is None:
             return None
         _require_integers(*row)
-        return Decision(*row)
+        return DecisionPlace(*row)
 
     def clock_was_set(self, after: int, through: int) -> bool:
         """Whether a change of the machine's clock is recorded after a place and up to another."""
-        query = "SELECT 1 FROM record WHERE event IN (?, ?) AND sequence > ? AND sequence <= ? LIMIT 1"
-        return self._connection.execute(query, (*CLOCK_EVENTS, after, through)).fetchone() is not None
+        return any(self._first(event, after, through) for event in CLOCK_EVENTS)
+
+    def stayed(self, after: int, through: int) -> int | None:
+        """Return the place of the first failed switchover after a place and up to another."""
+        return self._first(STAYED, after, through)
+
+    def _first(self, event: str, after: int, through: int) -> int | None:
+        query = "SELECT min(sequence) FROM record WHERE event = ? AND sequence > ? AND sequence <= ?"
+        (place,) = self._connection.execute(query, (event, after, through)).fetchone()
+        if place is not None:
+            _require_integers(place)
+        return place  # type: ignore[no-any-return]  # checked above
 
     def hash_at(self, sequence: int) -> str | None:
         """Return the hash of a record, or None if the log does not have it."""
@@ -171,7 +173,7 @@ class TakeoverLog:
     def checkpoint_text(self, number: int) -> bytes | None:
         """Return the text of a checkpoint, or None if the log does not have it."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
-        return row[0] if row is not None and isinstance(row[0], bytes) else None
+        return None if row is None else row[0]
 
 
 def _require_integers(*values: object) -> None:

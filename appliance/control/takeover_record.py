@@ -32,7 +32,7 @@ class TakeoverRecorder:
     """The recorder of the appliance `name`, which is one of two with `other`.
 
     `signed` is set with each signature of a checkpoint. Only the active appliance uses this class, because only it
-    changes the state: call `took_over`, then run `follow` as a task, and end the task before `handed_over`.
+    changes the state: call `took_over`, then run `follow` as a task.
     """
 
     def __init__(
@@ -51,6 +51,7 @@ class TakeoverRecorder:
         self._signed = signed
         self._name = name
         self._other = other
+        self._replicated = 0  # the number of the newest replicated checkpoint
 
     async def took_over(self, epoch: int) -> None:
         """Record that this appliance became the active one in this epoch, before it decides anything.
@@ -79,9 +80,10 @@ class TakeoverRecorder:
             self._store.save_setting(_LAST_TAKEOVER, msgspec.json.encode(last).decode())
 
     async def handed_over(self, epoch: int) -> None:
-        """Record that this appliance hands over, after its last decision; return when the state has the sealed log.
+        """Record that this appliance hands over, after its last answer; return when the state has the sealed log.
 
-        The signer may be slow or away: the caller bounds the wait. Raises `StoreError` after the state was closed.
+        If the hand-over fails afterwards, the event `switchover failed` revokes this record. The signer may be slow or
+        away: the caller bounds the wait. Raises `StoreError` after the state was closed.
         """
         self._trail.happened(
             "handed over",
@@ -112,7 +114,8 @@ class TakeoverRecorder:
         except LogUnreadableError as error:
             _log.error("the checkpoint of the audit log is not replicated", reason=str(error))
             return
-        if checkpoint is not None:
+        if checkpoint is not None and checkpoint.number > self._replicated:
+            self._replicated = checkpoint.number
             self._store.save_setting(_CHECKPOINT + self._name, checkpoint.as_json())
 
     def _last_recorded(self) -> EpochOf | None:

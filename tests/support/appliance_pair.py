@@ -1,6 +1,7 @@
 """Two appliances with an audit log, a key and a state each, which take over from each other."""
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -12,6 +13,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.log import AuditLog
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.control.signer_requests import SignerRequests
 from appliance.control.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
@@ -50,27 +54,31 @@ class Member:
 
     def open(self) -> None:
         """Start control's log, state and recorder."""
-        loop, signed = asyncio.get_running_loop(), asyncio.Event()
-        self.signed = signed
-        self._signs = True
-        public, logs = self.key.public_key().public_bytes_raw(), list[AuditLog]()
-
-        def sign(number: int, text: bytes) -> None:
-            if logs and self._signs:  # requests made by the constructor are repeated by `request_signatures`
-                logs[0].signed(number, self.key.sign(text), public)
-                loop.call_soon_threadsafe(signed.set)
-
+        requests = SignerRequests(lambda: self.log)
+        self.signed, self._signs = requests.signed, True
         self.log = AuditLog(
-            self.path, signer=sign, clock=self.clock, checkpoint_every=1_000_000, checkpoint_seconds=1e6
+            self.path,
+            signer=requests.want,
+            clock=self.clock,
+            checkpoint_every=1_000_000,
+            checkpoint_seconds=1e6,
         )
-        logs.append(self.log)
-        self.log.request_signatures()
+        ours, theirs = socket.socketpair()
+        self._signer = Channel(theirs, messages.SignerLink)
+        self._signer.attach(asyncio.get_running_loop(), self._sign, lambda: None, lambda _reason: None)
+        requests.attach(Channel(ours, messages.SignerLink))
+        self._requests = requests
         self.store = StateStore(self.state / "control", failed=lambda _reason: None)
         trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
         self.trail = trail
         self.recorder = TakeoverRecorder(
-            trail, self.log, self.store, signed, name=self.name, other=self.other
+            trail, self.log, self.store, self.signed, name=self.name, other=self.other
         )
+
+    def _sign(self, message: object, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, messages.SignatureWanted) and self._signs:
+            public = self.key.public_key().public_bytes_raw()
+            self._signer.send(messages.SignatureMade(message.number, self.key.sign(message.text), public))
 
     def silence(self) -> None:
         """Let the signer answer no further request."""
@@ -81,6 +89,8 @@ class Member:
         self.silence()
         assert self.log.close() is None
         self.store.close()
+        self._requests.link.close()
+        self._signer.close()
 
     @asynccontextmanager
     async def active(self, epoch: int, *, sealed: bool = True) -> AsyncIterator[None]:

@@ -1,6 +1,6 @@
 """Tests of verifying two logs and the takeovers between them.
 
-The attacker is root on one appliance, with its signing key and its signer's memory: each forged log is valid by itself.
+The attacker is root on one appliance, with its signing key and its signer's memory: each forged log alone is valid.
 """
 
 import shutil
@@ -77,13 +77,13 @@ def verified(a: Path, b: Path) -> PairVerification:
 
 
 def found(pair: Pair) -> list[tuple[Kind, int]]:
-    """Return the findings between two logs that are both valid by themselves."""
+    """Return the findings between two logs that are both valid on their own."""
     result = verified(pair.a, pair.b)
     assert [log.findings for log in result.logs] == [[], []]
     turned = verified(pair.b, pair.a)
     assert sorted(turned.findings, key=str) == sorted(
         result.findings, key=str
-    )  # the order of the logs is no matter
+    )  # the order of the logs does not matter
     return [(one.kind, one.epoch) for one in result.findings]
 
 
@@ -141,6 +141,13 @@ def test_the_tail_is_counted(pair: Pair) -> None:
     assert third.tail <= 1  # the record of the checkpoint itself
 
 
+def test_signatures_before_the_named_checkpoint_seal_no_tail(pair: Pair) -> None:
+    """If the other log has lost its later signatures, none of its tail counts as sealed."""
+    lost = msgspec.structs.replace(verify(pair.a), signed_through=3)
+    result = verify_takeovers(VerifiedLog(pair.a, lost), VerifiedLog(pair.b, verify(pair.b)))
+    assert [one.tail_signed for one in result.takeovers if one.other == "a"] == [0, 0]
+
+
 def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
     """Records of an appliance that never came back are in the tail, and no checkpoint seals them."""
 
@@ -162,30 +169,76 @@ def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
     assert result.takeovers[1].tail_signed == 0
 
 
+def begun_after(path: Path, removed: int) -> VerifiedLog:
+    """Remove the first records of a log, with the result of a verification before it, as retention leaves it."""
+    result = msgspec.structs.replace(verify(path), removed=removed)
+    execute(path, f"DELETE FROM record WHERE sequence <= {removed}")
+    return VerifiedLog(path, result)
+
+
 def test_retention_leaves_the_rest_proven(pair: Pair) -> None:
     """A named checkpoint whose records retention removed is not a finding, and is reported as removed."""
-    ends = verify(pair.a)
-    removed = msgspec.structs.replace(ends, removed=ends.last)
-    result = verify_takeovers(VerifiedLog(pair.a, removed), VerifiedLog(pair.b, verify(pair.b)))
-    assert result.ok
-    assert [one.link for one in result.takeovers] == ["none", "removed", "proven", "removed"]
+    first = verified(pair.a, pair.b).takeovers[1]
+    result = verify_takeovers(begun_after(pair.a, first.through), VerifiedLog(pair.b, verify(pair.b)))
+    assert result.ok, result.findings
+    assert [(one.epoch, one.link) for one in result.takeovers] == [
+        (2, "removed"),
+        (4, "proven"),
+        (5, "proven"),
+    ]
 
 
-def test_a_takeover_removed_by_retention_is_no_gap(pair: Pair) -> None:
-    """A missing takeover is not a finding if retention removed records and all later takeovers are there."""
-    pair.forge_a(removing(1))
-    log = verify(pair.a)
-    assert (Kind.TAKEOVER_MISSING, 1) in found(pair)
-    begun = msgspec.structs.replace(log, removed=log.last)
-    result = verify_takeovers(VerifiedLog(pair.a, begun), VerifiedLog(pair.b, verify(pair.b)))
-    assert Kind.TAKEOVER_MISSING not in {one.kind for one in result.findings}
-    pair.forge_a("UPDATE record SET reason = 'x' WHERE sequence = 2")
-    pair.forge_b(setting("previous.epoch", "3", 5))  # within what is left, a gap is one
-    later = verify_takeovers(VerifiedLog(pair.b, verify(pair.b)), VerifiedLog(pair.a, begun))
-    assert (Kind.TAKEOVER_MISSING, 3) not in [(one.kind, one.epoch) for one in later.findings]
-    pair.forge_b(setting("previous", 'json(\'{"epoch": 4, "appliance": "b"}\')', 5))
-    own = verify_takeovers(VerifiedLog(pair.b, verify(pair.b)), VerifiedLog(pair.a, begun))
-    assert (Kind.TAKEOVER_MISSING, 4) in [(one.kind, one.epoch) for one in own.findings]
+def test_a_takeover_removed_by_retention_is_not_missing(pair: Pair) -> None:
+    """A takeover that retention can have removed is not missing; one after the first that is left is."""
+    pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "a"}\')', 5))
+    assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
+    b = VerifiedLog(pair.b, verify(pair.b))
+    within = verify_takeovers(begun_after(pair.a, 1), b)
+    assert [(one.kind, one.epoch) for one in within.findings] == [(Kind.TAKEOVER_MISSING, 3)]
+    ((place,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
+    assert verify_takeovers(begun_after(pair.a, place - 1), b).findings == []
+    assert verify_takeovers(begun_after(pair.a, place), b).findings == []
+
+
+def test_records_after_the_verified_part_are_not_read(pair: Pair) -> None:
+    """A takeover that was written after the verification is not part of the result."""
+    result = verify(pair.b)
+    ((place,),) = read(pair.b, "SELECT max(sequence) FROM record WHERE event = 'took over'")
+    part = msgspec.structs.replace(result, last=place - 1)
+    epochs = [
+        one.epoch
+        for one in verify_takeovers(VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, part)).takeovers
+    ]
+    assert epochs == [1, 2, 4]
+
+
+def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
+    """A takeover that the other appliance did not get to know of belongs to the tail, and no checkpoint seals it."""
+
+    async def story(a: Member, b: Member, world: World) -> None:
+        async with a.active(1):
+            a.replicate_to(b)
+        a.silence()
+        async with a.active(2, sealed=False):
+            await a.decide(5, 5)
+        world.passes(3)
+        async with b.active(3):
+            await b.decide(3, 3)
+
+    made = build(tmp_path, story)
+    result = verified(made.a, made.b)
+    assert result.ok, result.findings
+    last = result.takeovers[-1]
+    assert last.tail == result.logs[0].last - last.through > 5
+    assert last.tail_signed == 0
+
+
+def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forged log cannot make an endless result."""
+    pair.forge_b(removing(2))
+    assert len(verified(pair.a, pair.b).findings) > 1
+    monkeypatch.setattr("appliance.audit.takeover_verification._MOST_FINDINGS", 1)
+    assert len(verified(pair.a, pair.b).findings) == 1
 
 
 def test_logs_without_a_takeover_have_no_link(tmp_path: Path) -> None:
@@ -249,7 +302,7 @@ def test_a_removed_unsealed_takeover(pair: Pair) -> None:
 
 
 def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
-    """The log of another pair, valid by itself, does not have the named checkpoints."""
+    """The log of another pair, although valid on its own, does not have the named checkpoints."""
     stranger = build(tmp_path / "stranger", four_takeovers)
     kinds = found(pair._replace(b=stranger.b))
     assert (Kind.LOG_REPLACED, 4) in kinds
@@ -380,9 +433,23 @@ def test_a_replaced_table(pair: Pair, statement: str) -> None:
     assert not result.logs[0].ok
 
 
+def test_a_log_that_changes_after_its_verification(pair: Pair) -> None:
+    """Hashes that are replaced by other values between two steps are a finding, not a crash."""
+    results = VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, verify(pair.b))
+    execute(
+        pair.a,
+        "CREATE TABLE loose AS SELECT * FROM record",
+        "DROP TABLE record",
+        "ALTER TABLE loose RENAME TO record",
+        "UPDATE record SET hash = 7",
+    )
+    found_now = verify_takeovers(*results).findings
+    assert [(one.kind, one.epoch) for one in found_now] == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
+
+
 @pytest.mark.parametrize("side", ["a", "b"])
 def test_a_fault_of_either_log_is_one_of_the_pair(pair: Pair, side: str) -> None:
-    """A log that is not valid by itself makes the pair invalid."""
+    """A log that is not valid on its own makes the pair invalid."""
     execute(getattr(pair, side), "UPDATE record SET reason = 'x' WHERE sequence = 3")
     assert not verified(pair.a, pair.b).ok
 
@@ -398,36 +465,45 @@ def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
 # --- overlapping epochs -------------------------------------------------------------------------------------------
 
 
-def overlapping(tmp_path: Path, both: float, *, clock_set: str = "", after_hand_over: bool = False) -> Pair:
-    """Return the logs of a pair in which a decides for `both` seconds while b is active."""
+def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
+    """Return the logs of a pair in which a decides for `both` seconds while b is active for `lasting` seconds."""
 
     async def story(a: Member, b: Member, world: World) -> None:
         async with a.active(1):
             await a.decide(5, 5)
             await a.sealed()
             a.replicate_to(b)
-        if after_hand_over:
-            await a.hand_over(1)
         async with b.active(2):
             if both:
                 await a.decide(1, both)
             world.passes(1)
             if clock_set:
                 (a if clock_set == "a" else b).trail.happened("clock set forward", "by a person", seconds=9)
-            await b.decide(5, 60)
+            await b.decide(5, lasting)
             await b.sealed()
         b.replicate_to(a)
         async with a.active(3):
             await a.decide(2, 2)
             await a.sealed()
 
-    return build(tmp_path, story)
+    return build(folder, story)
 
 
-@pytest.mark.parametrize(("both", "findings"), [(0, []), (4, []), (10, [(Kind.OVERLAP, 2)])])
-def test_decisions_of_both_at_once(tmp_path: Path, both: float, findings: list[Any]) -> None:
+@pytest.mark.parametrize(
+    ("both", "lasting", "findings"),
+    [
+        (0, 60, []),
+        (4, 60, []),
+        (10, 60, [(Kind.OVERLAP, 2)]),
+        (10, 50_000, []),
+        (30, 50_000, [(Kind.OVERLAP, 2)]),
+    ],
+)
+def test_decisions_of_both_at_once(tmp_path: Path, both: float, lasting: float, findings: list[Any]) -> None:
     """An appliance that decided for longer than the tolerance while the other one was active is found."""
-    assert found(overlapping(tmp_path, both)) == findings
+    made = overlapping(tmp_path, both, lasting=lasting)
+    assert found(made) == findings
+    assert verified(made.a, made.b).takeovers[1].overlap == ("found" if findings else "excluded")
 
 
 @pytest.mark.parametrize("who", ["a", "b"])
@@ -438,9 +514,31 @@ def test_a_clock_that_was_set_proves_no_overlap(tmp_path: Path, who: str) -> Non
     assert verified(made.a, made.b).takeovers[1].overlap == "unknown"
 
 
-def test_a_decision_after_the_hand_over(tmp_path: Path) -> None:
-    """A decision between a hand-over and the next takeover is found without any clock."""
-    assert found(overlapping(tmp_path, 1, after_hand_over=True)) == [(Kind.OVERLAP, 1)]
+@pytest.mark.parametrize(
+    ("seconds", "event", "findings"),
+    [
+        (6, "", [(Kind.OVERLAP, 1)]),
+        (4, "", []),  # a call that was under way
+        (6, "clock set forward", []),
+        (6, "switchover failed", []),
+    ],
+)
+def test_decisions_after_a_hand_over(tmp_path: Path, seconds: float, event: str, findings: list[Any]) -> None:
+    """Decisions long after a hand-over are found, unless a failed hand-over or a change of the clock is recorded."""
+
+    async def story(a: Member, b: Member, _world: World) -> None:
+        async with a.active(1):
+            await a.decide(2, 2)
+        await a.hand_over(1)
+        if event:
+            a.trail.happened(event, "for a reason")
+        await a.decide(2, seconds)
+        await a.hand_over(1)
+        a.replicate_to(b)
+        async with b.active(2):
+            await b.decide(2, 2)
+
+    assert found(build(tmp_path, story)) == findings
 
 
 def test_denials_that_retention_wrote_again_are_old(tmp_path: Path) -> None:

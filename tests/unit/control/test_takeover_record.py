@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import pytest
+import structlog
 
 from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.query import Filter
@@ -201,18 +202,22 @@ def test_each_signed_checkpoint_is_replicated(tmp_path: Path) -> None:
 def test_an_earlier_checkpoint_is_replicated_at_the_start(tmp_path: Path) -> None:
     """The checkpoint of an earlier run is replicated before a new one is signed."""
 
+    signed: list[SignedCheckpoint] = []
+
     async def story(a: Member, _b: Member) -> None:
         await a.decide(2, 1)
         assert await a.log.wait_signed() is None
         first = newest_checkpoint(a.path)
         assert first is not None
+        signed.append(first)
         a.silence()
         async with a.active(1, sealed=False):
             await asyncio.to_thread(
                 eventually, lambda: a.replicated() == first, "the first one is replicated"
             )
 
-    after(tmp_path, story)
+    a, _b = after(tmp_path, story)
+    assert newest_checkpoint(a.path) == signed[0]  # those after it have no signature
 
 
 def test_a_hand_over_returns_when_the_state_has_the_sealed_log(tmp_path: Path) -> None:
@@ -237,13 +242,35 @@ def test_a_log_that_cannot_be_read_does_not_end_the_replication(tmp_path: Path) 
 
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
-            await a.sealed()
-            a.path.rename(a.path.with_name("away"))
-            a.signed.set()
-            await asyncio.to_thread(eventually, lambda: not a.signed.is_set(), "the replication has looked")
-            a.path.with_name("away").rename(a.path)
+            with structlog.testing.capture_logs() as printed:
+                a.path.rename(a.path.with_name("away"))
+                a.signed.set()
+                await asyncio.to_thread(
+                    eventually,
+                    lambda: [one for one in printed if "not replicated" in one["event"]],
+                    "an error",
+                )
+                a.path.with_name("away").rename(a.path)
             await asyncio.to_thread(eventually, lambda: a.log.failed is None, "the log is written")
             await a.decide(2, 1)
             await a.sealed()
+
+    after(tmp_path, story)
+
+
+def test_an_older_checkpoint_replaces_no_newer_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A checkpoint that was read before a newer one, and arrives later, is not replicated."""
+
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            older = a.replicated()
+            await a.decide(2, 1)
+            await a.sealed()
+        newer = a.replicated()
+        assert older is not None
+        assert newer is not None
+        monkeypatch.setattr("appliance.control.takeover_record.newest_checkpoint", lambda _path: older)
+        await a.hand_over(1)
+        assert a.replicated() == newer
 
     after(tmp_path, story)
