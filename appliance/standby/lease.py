@@ -22,6 +22,7 @@ from typing import Literal
 from appliance.standby.witness import EXPIRY
 
 RENEW_SECONDS = 0.3
+CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted
 CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different speeds
 SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
 _MOST_PENDING = 16
@@ -105,6 +106,7 @@ class ApplianceLease:
         self._asked: dict[int, float] = {}
         self._number = 0
         self._started = self._heard = now - EXPIRY
+        self._next_removal = now
         self._expired = False
         self._last_add = 0
         # A switchover: requests and promises up to these numbers no longer make this appliance active.
@@ -149,10 +151,14 @@ class ApplianceLease:
         acknowledged all changes.
         """
         if now < self._next_round:
-            return ()
+            return self._remove(now, waiting_since)
         self._next_round = now + RENEW_SECONDS
         if self.held is None:
-            return (self._to_witness("claim" if now >= self._promised_until else "look", now),)
+            if now >= self._promised_until:
+                self._next_round = now + CLAIM_SECONDS
+                return (self._to_witness("claim", now),)
+            self._next_round = min(self._next_round, self._promised_until)
+            return (self._to_witness("look", now),)
         if self._switching_until is not None:
             if now < self._switching_until:
                 return (self._take_over() if self._released else self._to_witness("release", now),)
@@ -160,9 +166,8 @@ class ApplianceLease:
         due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
         if self.is_active(now):
             due.append(self._ask(now))
-            if not self.answers_alone and waiting_since is not None and now - waiting_since > SILENCE:
-                due.append(self._to_witness("remove", now))
-            elif self.answers_alone and caught_up:
+            due += self._remove(now, waiting_since)
+            if self.answers_alone and caught_up:
                 self.answers_alone = False
                 due.append(self._to_witness("add", now))
                 self._last_add = self._sequence
@@ -200,7 +205,11 @@ class ApplianceLease:
                 if not self.follow(message.epoch) or self._expired:
                     return ()
                 self._promised_until = max(self._promised_until, now + EXPIRY)
-                self._promised_to = message
+                last = self._promised_to
+                if last is None or (message.epoch, message.number) > (last.epoch, last.number):
+                    self._promised_to = (
+                        message  # an earlier request that arrives late is not the last promise
+                    )
                 return (ClaimPromise(message.epoch, message.session, message.number),)
             case ClaimPromise(epoch, session, number):
                 asked = self._asked.get(number)
@@ -239,6 +248,14 @@ class ApplianceLease:
         if epoch > self.epoch:
             self.epoch = epoch
             self.held = None
+
+    def _remove(self, now: float, waiting_since: float | None) -> Sequence[WitnessRequest]:
+        """Return the request to remove the standby if a change has waited for it too long; at most one in a round."""
+        waits = waiting_since is not None and now - waiting_since > SILENCE
+        if not waits or self.answers_alone or now < self._next_removal or not self.is_active(now):
+            return ()
+        self._next_removal = now + RENEW_SECONDS
+        return (self._to_witness("remove", now),)
 
     def _to_witness(self, operation: Operation, now: float) -> WitnessRequest:
         self._sequence += 1

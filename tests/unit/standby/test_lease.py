@@ -20,6 +20,14 @@ from tests.unit.standby.test_witness import KEYS, Robot
 BOTH, ALONE = frozenset("ab"), frozenset("a")
 
 
+def answer_of(**changes: object) -> WitnessAnswer:
+    """Return an answer of the witness: granted, except for these fields."""
+    full = {
+        "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
+    } | changes  # fmt: skip
+    return WitnessAnswer(**full)  # type: ignore[arg-type]  # of several types
+
+
 class Lease:
     """The lease of `a`, with a clock."""
 
@@ -50,10 +58,7 @@ class Lease:
 
     def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
         """Answer a request: granted, unless the test says otherwise."""
-        full = {
-            "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
-        } | answer  # fmt: skip
-        return self.lease.answered(request, WitnessAnswer(**full))  # type: ignore[arg-type]  # of several types
+        return self.lease.answered(request, answer_of(**answer))
 
     def active(self) -> bool:
         """Whether it is active now."""
@@ -197,6 +202,38 @@ def test_it_answers_alone_only_after_the_removal() -> None:
     assert lease.lease.may_answer(lease.now, acknowledged=False)
 
 
+def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None:
+    """The removal is requested at once, and again in each round until the witness answers."""
+    lease = active_lease()
+    assert lease.later(0.3).operations(waiting_since=0.0) == ["renew", "remove"]
+    assert lease.later(0.1).operations(waiting_since=0.0) == []
+    assert lease.later(0.2).operations(waiting_since=0.0) == ["renew", "remove"]
+    assert lease.later(0.05).operations() == []
+    lease.answered(lease.later(0.25).request("renew"), in_sync=ALONE)
+    assert lease.later(0.1).operations(waiting_since=0.0) == []
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+
+
+def test_a_change_that_waits_is_noticed_between_two_rounds() -> None:
+    """A takeover does not take one more round."""
+    lease = active_lease().later(0.3)
+    assert lease.operations(waiting_since=lease.now) == ["renew"]
+    assert lease.later(0.1).operations(waiting_since=0.0) == ["remove"]
+    assert Lease().later(EXPIRY + 0.1).operations(waiting_since=0.0) == ["claim"], "only while active"
+
+
+def test_it_claims_when_its_promise_ends_and_ten_times_a_second() -> None:
+    """The robot has no appliance in that time."""
+    lease = Lease().later(EXPIRY)
+    lease.lease.received(lease.now, PromiseRequest(1, "theirs", 7))
+    end = lease.now + EXPIRY
+    while lease.operations() == ["look"]:
+        lease.now = lease.lease.next_event(lease.now)
+    assert lease.now == pytest.approx(end)
+    lease.now = lease.lease.next_event(lease.now)
+    assert lease.now == pytest.approx(end + 0.1) and lease.operations() == ["claim"]
+
+
 def test_it_waits_for_the_standby_before_it_is_added() -> None:
     """An older answer does not change that."""
     lease = active_lease().later(0.3)
@@ -238,6 +275,16 @@ def test_a_late_order_does_not_end_a_later_promise() -> None:
     _, order = in_a_switchover()
     standby = Lease().later(EXPIRY)
     standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
+    assert list(standby.lease.received(standby.now, order)) == []
+    assert standby.later(0.3).operations() == ["look"]
+
+
+def test_a_late_request_does_not_make_a_late_order_valid() -> None:
+    """The last promise counts, and a request that was overtaken is not the last."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    for number in (order.number + 1, order.number):
+        standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, number))
     assert list(standby.lease.received(standby.now, order)) == []
     assert standby.later(0.3).operations() == ["look"]
 
