@@ -80,10 +80,11 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
         membership = load_membership(config.with_name(LINK_FILE))
         pair = None
         if membership is not None:
+            taken_over = not lifeline.activated.is_set()
             api = await stand_by(settings, membership, lifeline, lease, stopping)
             if lifeline.epoch is None:
                 return
-            pair = Pair(membership, lease, lifeline.epoch, api)
+            pair = Pair(membership, lease, lifeline.epoch, api, taken_over)
         control = await _start(settings, lifeline, compiler, tunnels, pair)
     except (
         PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, MembershipError, OSError

@@ -39,13 +39,15 @@ _log = structlog.get_logger()
 class Pair(NamedTuple):
     """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
 
-    `api` is the link to the api, if it was opened while this appliance stood by.
+    `api` is the link to the api, if it was opened while this appliance stood by. `taken_over`: this process stood by
+    before, so the epoch is new.
     """
 
     membership: Membership
     lease: LeaseClient
     epoch: int
     api: Channel | None
+    taken_over: bool
 
 
 def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
@@ -59,6 +61,7 @@ def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -
         store.database,
         pair.epoch,
         wait=settings.availability.wait,
+        taken_over=pair.taken_over,
         folder=settings.state / "control",
     )
 
@@ -109,9 +112,14 @@ class Replication:
         epoch: int,
         *,
         wait: Literal["standby", "none"],
+        taken_over: bool,
         folder: Path,
     ) -> None:
-        """`folder` is closed to other users: it gets the certificate and the key of the link."""
+        """`folder` is closed to other users: it gets the certificate and the key of the link.
+
+        After a takeover the earlier active appliance is away or still restarting, and the first answers would wait for
+        it in vain. So its removal is requested at once (`taken_over`).
+        """
         self._membership = membership
         self._lease = lease
         self._database = database
@@ -126,8 +134,10 @@ class Replication:
         )
         self._permission = 0
         self._trouble_since: float | None = None
+        self._absent = taken_over and wait == "standby"
         self._reported: messages.ReplicationReported | None = None
         lease.listen(self._lease_changed)
+        self._report()
 
     async def run(self) -> None:
         """Serve the standby until cancelled. Raises `OSError` if the port is in use."""
@@ -210,8 +220,11 @@ class Replication:
     def _report(self) -> None:
         """Report the replication to the lease, if it has changed."""
         lag = self._sender.lag()
+        self._absent = self._absent and not (lag.connected or self._sender.alone)
         waiting = lag.waiting_since
-        if waiting is not None:
+        if self._absent:
+            waiting = 0.0
+        elif waiting is not None:
             waiting = boot_time() - (asyncio.get_running_loop().time() - waiting)
         report = messages.ReplicationReported(
             permission=self._permission,

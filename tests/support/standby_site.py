@@ -97,10 +97,10 @@ class StandbySite:
         self.witness = Process(self.robot, self.command("serve"), env=dict(os.environ), label="witness")
 
     def start(self, name: str) -> Process:
-        """Start an appliance; return when it is ready to be active, and its process."""
+        """Start an appliance; return when it could take over or is active, and its process."""
         one = self.appliances[name]
         one.process = Process(one.host, self._up(one), env=dict(os.environ), label=f"rosrv up {name}")
-        one.process.wait_for(event="standby", timeout=2 * LIMIT)
+        one.process.wait_for(lambda event: event.get("event") in {"standby", "ready"}, timeout=2 * LIMIT)
         return one.process
 
     def _up(self, one: Appliance) -> list[str]:

@@ -44,7 +44,8 @@ class ReplicationReported(Message):
     """Control reports the replication after each change, and every 0.2 s while a change waits.
 
     `permission` is the last one that control used. `caught_up`: control waits for the standby again, which has all
-    changes. `waiting_since` is the time (CLOCK_BOOTTIME) of the oldest answer that waits for the standby.
+    changes. `waiting_since` is the time (CLOCK_BOOTTIME) of the oldest answer that waits for the standby; it is 0
+    after a takeover, until the standby connects or is removed.
     """
 
     permission: int
