@@ -9,7 +9,9 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,7 +29,8 @@ from tests.support.waiting import eventually
 
 ROBOT, FIXED, OCU = "10.79.0.10", "10.79.0.100", "10.79.0.20"
 ADDRESSES = {"a": "10.79.0.2", "b": "10.79.0.3"}
-MASTER = f"http://{FIXED}:11311"
+MASTER_PORT = 11311
+MASTER = f"http://{FIXED}:{MASTER_PORT}"
 PORTS = ["11311", "19001-26000"]
 
 
@@ -64,6 +67,7 @@ class StandbySite:
         self.settings.write_text(json.dumps(settings))
         self.settings.chmod(0o600)
         shutil.copy(str(witness.__file__), home / "witness.py")
+        (home / "boot").write_text(secrets.token_hex(8))
         self.lease = witness.LeaseFile(str(home / "lease"), ("a", "b"))
         self.witness: Process | None = None
         self.appliances: dict[str, Appliance] = {}
@@ -80,21 +84,31 @@ class StandbySite:
 
     def command(self, *words: str) -> list[str]:
         """Return a command of the witness, as on a robot without the product."""
-        return [
-            sys.executable,
-            "-I",
-            "-S",
-            str(self.home / "witness.py"),
-            *words,
-            "--settings",
-            str(self.settings),
-        ]
+        program = (
+            f"import sys; sys.path.insert(0, {str(self.home)!r}); import witness;"
+            f" witness.BOOT_ID = {str(self.home / 'boot')!r}; sys.exit(witness.main(sys.argv[1:]))"
+        )
+        return [sys.executable, "-I", "-S", "-c", program, *words, "--settings", str(self.settings)]
 
     def start_witness(self) -> None:
         """Start the witness; at the first start with a lease of which `a` is in sync."""
         if not (self.home / "lease").exists():
             self.lease.write(LeaseRecord(1, "", ("a",), ""))
         self.witness = Process(self.robot, self.command("serve"), env=dict(os.environ), label="witness")
+        self.witness.wait_for_error("the witness answers at")
+
+    def stop_witness(self) -> None:
+        """Kill the witness; its rules stay."""
+        assert self.witness is not None
+        self.witness.stop(with_signal=signal.SIGKILL)
+
+    def boot_robot(self) -> None:
+        """Start the witness as after a boot of the robot: without its rules at first, then shut, with a new boot."""
+        for words in (["remove"], ["shut"]):
+            with Process(self.robot, self.command(*words), env=dict(os.environ), label=words[0]) as done:
+                assert done.wait() == 0, done.story()
+        (self.home / "boot").write_text(secrets.token_hex(8))
+        self.start_witness()
 
     def start(self, name: str) -> Process:
         """Start an appliance; return when it could take over or is active, and its process."""
@@ -123,11 +137,69 @@ class StandbySite:
 
     def cut(self, name: str) -> None:
         """Cut the power of an appliance."""
-        namespace = self.lab.hosts[name].namespace
-        interfaces.set_link(namespace, INTERFACE, up=False)
-        for pid in namespace.processes():
+        interfaces.set_link(self.lab.hosts[name].namespace, INTERFACE, up=False)
+        self.signal(name, signal.SIGKILL)
+
+    def restore(self, name: str) -> None:
+        """Switch an appliance on again after a cut."""
+        one = self.appliances[name]
+        if one.process is not None:
+            one.process.stop()
+        interfaces.set_link(self.lab.hosts[name].namespace, INTERFACE, up=True)
+        self.start(name)
+
+    def pair(self) -> tuple[str, str]:
+        """Return the names of the active and the passive appliance."""
+        holder = self.holder()
+        return holder, {"a": "b", "b": "a"}[holder]
+
+    def until_active(self, name: str) -> None:
+        """Wait until nodes may connect to this appliance."""
+        one = self.appliances[name].process
+        assert one is not None
+        one.wait_for(event="ready", timeout=2 * LIMIT)
+
+    def until_taken_over(self, name: str) -> None:
+        """Wait until this appliance has the lease."""
+        eventually(lambda: self.holder() == name, self.story)
+
+    def pids(self, name: str, role: str = "") -> list[int]:
+        """Return the processes of an appliance; with a role, only those of that role."""
+        one = self.appliances[name].process
+        assert one is not None
+        title = b"/usr/bin/rosmaster\0" if role == "rosmaster" else f"rosrv: {role}".encode()
+        found, left = [], [one.pid]
+        while left:
+            pid = left.pop()
+            with contextlib.suppress(OSError):
+                left += map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+                if not role or title in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    found.append(pid)
+        return found
+
+    def signal(self, name: str, number: int) -> None:
+        """Send a signal to all processes of an appliance."""
+        for pid in self.pids(name):
             with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+                os.kill(pid, number)
+
+    @contextlib.contextmanager
+    def without_link(self, here: str, there: str) -> Iterator[None]:
+        """Lose all packets between two addresses while the block runs."""
+        self._switch(
+            "add table bridge lost",
+            "add chain bridge lost some { type filter hook forward priority 0 ; }",
+            f"add rule bridge lost some ip saddr {here} ip daddr {there} drop",
+            f"add rule bridge lost some ip saddr {there} ip daddr {here} drop",
+        )
+        try:
+            yield
+        finally:
+            self._switch("delete table bridge lost")
+
+    def _switch(self, *rules: str) -> None:
+        text = "\n".join(rules)
+        self.lab.switch.run(lambda: subprocess.run(["nft", "-f", "-"], input=text, text=True, check=True))
 
     def story(self) -> str:
         """Return the output of all."""

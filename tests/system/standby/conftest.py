@@ -1,0 +1,43 @@
+"""Two appliances and a robot with real nodes, which the tests of a file share."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.channel import admin
+from examples.landshark.lab import Lab
+from tests.support.appliance import OPEN_POLICY
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_program, need_root, needs
+from tests.support.standby_robot import StandbyRobot
+from tests.support.standby_site import StandbySite
+
+RULE = "seen() { event said() /map std_msgs/String '{}' { } }\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
+    """Both appliances are in sync; a policy, a specification and a token came from an operator."""
+    need_root()
+    need_program("nft", "nftables")
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    home: Path = tmp_path_factory.mktemp("standby")
+    with Lab("rosrv-standby") as lab, StandbySite(lab, home, monitors={}) as site:
+        site.start_witness()
+        site.start("a")
+        site.until_active("a")
+        one = site.appliances["a"]
+        one.ask(admin.PolicyLoad(OPEN_POLICY + "[Options]\ntakeover = granted\n"))
+        one.ask(admin.MonitorLoad({"seen.rv": RULE}))
+        one.ask(admin.TokenAdd("colleague", "viewer", 3600.0))
+        site.start("b")
+        site.until_both_in_sync()
+        yield site
+
+
+@pytest.fixture(scope="module")
+def robot(site: StandbySite) -> Iterator[StandbyRobot]:
+    """The robot with its nodes, which run through all tests of the file."""
+    with StandbyRobot(site) as robot:
+        yield robot

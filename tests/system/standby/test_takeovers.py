@@ -1,0 +1,172 @@
+"""What real nodes notice of failures of the active appliance, the witness and the network: a short pause only.
+
+All tests of the file use the same nodes. After each failure no node has ended, no answered change is lost, the robot
+admits one appliance, and what operators ordered is in force.
+"""
+
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from appliance.channel import admin
+from appliance.standby.witness import EXPIRY
+from tests.support.standby_robot import StandbyRobot
+from tests.support.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
+from tests.support.waiting import eventually
+
+ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
+
+
+def orders(site: StandbySite, name: str) -> list[Any]:
+    """Return what operators ordered: policies, specifications, tokens."""
+    one = site.appliances[name]
+    monitors = one.ask(admin.MonitorsWanted(True))
+    return [one.ask(admin.PolicyRevisions()), [found.name for found in monitors.monitors], one.ask(admin.TokenList())]
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
+    """Check before each test that the site is whole, and after it what the file promises."""
+    site.until_both_in_sync()
+    before = orders(site, site.pair()[0])
+    yield
+    site.until_both_in_sync()
+    robot.lost_nothing()
+    active, _ = site.pair()
+    assert robot.admitted() == {ADDRESSES[active]}
+    assert orders(site, active) == before
+
+
+def test_a_power_cut_of_the_active_appliance(site: StandbySite, robot: StandbyRobot) -> None:
+    """The standby takes over, also for new nodes and tools, and the other appliance comes back as its standby."""
+    active, passive = site.pair()
+    site.cut(active)
+    site.until_taken_over(passive)
+    robot.lost_nothing()
+    robot.serves_newcomers()
+    site.restore(active)
+    site.until_both_in_sync()
+    assert site.holder() == passive
+
+
+def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> None:
+    """No death of a process needs the other appliance, except perhaps that of the lease."""
+    for role in ROLES:
+        active, _ = site.pair()
+        for pid in site.pids(active, role):
+            os.kill(pid, signal.SIGKILL)
+        eventually(lambda name=active, title=role: site.pids(name, title), site.story)  # type: ignore[misc]
+        robot.lost_nothing()
+        site.until_both_in_sync()
+        assert role == "lease" or site.holder() == active, role
+
+
+def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, robot: StandbyRobot) -> None:
+    """Neither the robot nor any other host gets an answer to a request that arrived while it slept."""
+    active, passive = site.pair()
+    site.signal(active, signal.SIGSTOP)
+    requests = [request(site, active, method) for method in ("getParam", "setParam")]
+    try:
+        site.until_taken_over(passive)
+        robot.works()
+    finally:
+        site.signal(active, signal.SIGCONT)
+    assert [answer_to(one) for one in requests] == [b"", b""]
+    site.until_both_in_sync()
+    assert site.holder() == passive
+    assert site.appliances[active].ask(admin.StandbyWanted()).role == "standby"
+
+
+def request(site: StandbySite, name: str, method: str) -> socket.socket:
+    """Send a request to an appliance from a host that the robot does not fence."""
+    values = "".join(f"<param><value>{text}</value></param>" for text in ("/late", "/large", "late")[: 3 if method == "setParam" else 2])
+    body = f"<methodCall><methodName>{method}</methodName><params>{values}</params></methodCall>".encode()
+    host = site.lab.hosts.get("ocu") or site.lab.host("ocu", f"{OCU}/24")
+    sock = host.run(lambda: socket.create_connection((ADDRESSES[name], MASTER_PORT), 30))
+    sock.sendall(b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Type: text/xml\r\n" + b"Content-Length: %d\r\n\r\n" % len(body) + body)
+    return sock
+
+
+def answer_to(sock: socket.socket) -> bytes:
+    """Return the bytes of the answer; none if the connection ends without."""
+    with sock:
+        try:
+            return sock.recv(4096)
+        except ConnectionError:
+            return b""
+
+
+def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) -> None:
+    """The active one goes on alone, and takes the other back."""
+    active, passive = site.pair()
+    with site.without_link(ADDRESSES["a"], ADDRESSES["b"]):
+        eventually(lambda: site.in_sync() == {active}, site.story)
+        robot.lost_nothing()
+    site.until_both_in_sync()
+    assert site.pair() == (active, passive)
+
+
+def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
+    """The standby takes over, although it hears the active one."""
+    active, passive = site.pair()
+    with site.without_link(ADDRESSES[active], ROBOT):
+        site.until_taken_over(passive)
+        robot.lost_nothing()
+
+
+def test_the_death_of_the_witness(site: StandbySite, robot: StandbyRobot) -> None:
+    """Its rules stay, and the active appliance goes on by the promises of the other one."""
+    pair = site.pair()
+    site.stop_witness()
+    wait(3 * EXPIRY)
+    robot.lost_nothing()
+    site.start_witness()
+    wait(EXPIRY)
+    assert site.pair() == pair
+
+
+def test_flapping_links(site: StandbySite, robot: StandbyRobot) -> None:
+    """However often links come and go, the nodes lose nothing."""
+    for pause in (0.1, 0.4, 0.7, 1.3, 0.2, 1.0):
+        active, _ = site.pair()
+        for ends in ((ADDRESSES["a"], ADDRESSES["b"]), (ADDRESSES[active], ROBOT)):
+            with site.without_link(*ends):
+                wait(pause)
+    robot.lost_nothing()
+
+
+def test_a_boot_of_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
+    """The robot admits no appliance at first, then the holder again: no other can have had a grant."""
+    pair = site.pair()
+    robot.cut()
+    robot.boot()
+    assert site.pair() == pair
+
+
+@pytest.mark.parametrize("order", ["robot first", "appliances first"])
+def test_a_power_cut_of_all_three(site: StandbySite, robot: StandbyRobot, order: str) -> None:
+    """One appliance serves again, in each order of the starts; without the witness neither does."""
+    for name in ADDRESSES:
+        site.cut(name)
+    robot.cut()
+    if order == "robot first":
+        site.boot_robot()
+    for name in ADDRESSES:
+        site.restore(name)
+    if order == "appliances first":
+        wait(2 * EXPIRY)
+        roles = [one.ask(admin.StandbyWanted()).role for one in site.appliances.values()]
+        assert roles == ["standby", "standby"]
+    else:
+        site.stop_witness()
+    robot.boot()
+
+
+def wait(seconds: float) -> None:
+    """Let time pass in which nothing may happen."""
+    threading.Event().wait(seconds)
