@@ -93,7 +93,10 @@ class SupervisorMessages:
     def _relay_link(self, index: int, channel: Channel) -> None:
         ends = self._parts.endpoints
         ends.relay.attach(index, channel)
-        told = self._parts.core.graph.tell_everybody(lambda topic: ends.relay.carries(index, TOPIC, topic))
+        pair = self._base.pair
+        told = self._parts.core.graph.tell_everybody(
+            lambda topic: ends.relay.carries(index, TOPIC, topic), renewed=pair is not None and pair.taken_over
+        )
         ends.enactor.carry_out(told)
         self._parts.reminders.begin()
 

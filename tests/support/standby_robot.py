@@ -21,8 +21,9 @@ CLIENTS: tuple[Client, Client] = ("rospy", "roscpp")
 class StandbyRobot:
     """The nodes; a context manager."""
 
-    def __init__(self, site: StandbySite) -> None:
-        self.site = site
+    def __init__(self, site: StandbySite, *, rate: float = 10) -> None:
+        """Prepare the nodes; `rate` is the number of messages a second of each talker."""
+        self.site, self.rate = site, rate
         self.ros: RosSession = site.ros()
         self.listeners: list[Process] = []
         self.callers: list[Process] = []
@@ -31,7 +32,7 @@ class StandbyRobot:
         self.ros, self.listeners, self.callers = self.site.ros(), [], []
         ros = self.ros
         for here, there in (CLIENTS, CLIENTS[::-1]):
-            ros.talker(here, f"/from_{here}", name=f"talker_{here}")
+            ros.talker(here, f"/from_{here}", "--rate", str(self.rate), name=f"talker_{here}")
             self.listeners.append(ros.listener(there, f"/from_{here}", name=f"listener_{there}"))
             ros.service_server(here, f"/negate_{here}", name=f"server_{here}")
             self.callers.append(ros.service_client(there, f"/negate_{here}", name=f"caller_{there}"))

@@ -1,0 +1,260 @@
+"""Takeovers by a second appliance, as the robot's nodes see them, and the cost of a registration.
+
+    python -m benchmarks.standby cuts [--cuts 50] [--load 0] [--seed 1]
+    python -m benchmarks.standby switchovers [--cuts 10] [--load 0]
+    python -m benchmarks.standby registrations [--rounds 40] [--load 0]
+
+`cuts`: the power of the active appliance is cut at a random time; it comes back as the standby before the next cut.
+`switchovers`: an operator orders the standby to take over. For each, the table shows the longest time without a
+message, an answer of a service, and an answer of the Master API. It includes the usual time between two of them: 20 ms
+for topics and calls. Afterwards no node has ended and no answered change is missing, or the program fails.
+
+`registrations`: one node registers and unregisters a topic behind a single appliance, two appliances with
+`availability.wait: none`, and two with `standby`. They take turns, so that other load affects all; ratios are of
+medians. `--load` starts processes that keep the machine's cores busy.
+"""
+
+import argparse
+import contextlib
+import multiprocessing
+import random
+import statistics
+import tempfile
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from appliance.channel import admin
+from examples.landshark.lab import Lab
+from tests.support.appliance import Appliance
+from tests.support.processes import Process
+from tests.support.standby_robot import StandbyRobot
+from tests.support.standby_site import MASTER, StandbySite
+from tests.support.waiting import eventually
+
+_AFTER = 1.0  # seconds of service after the takeover that are also watched
+_RATE = 50  # messages a second
+_CALLS = 20  # registrations in each turn
+_SECONDS = 60.0  # until a takeover counts as failed
+
+
+class Successes:
+    """The times at which something worked, such as a message that arrived."""
+
+    def __init__(self) -> None:
+        self.times = [time.monotonic()]
+        self._new = threading.Condition()
+
+    def note(self) -> None:
+        """Note a success."""
+        with self._new:
+            self.times.append(time.monotonic())
+            self._new.notify_all()
+
+    def until_after(self, moment: float) -> None:
+        """Wait for a success after this time. Raises `TimeoutError`."""
+        with self._new:
+            if not self._new.wait_for(lambda: self.times[-1] > moment, _SECONDS):
+                raise TimeoutError(f"nothing worked for {_SECONDS:g} s")
+
+    def longest_pause(self) -> float:
+        """Return the longest time between two successes."""
+        return max(after - before for before, after in zip(self.times, self.times[1:], strict=False))
+
+
+class Watch:
+    """Watch topics, services and the Master API of a robot while the block runs."""
+
+    def __init__(self, robot: StandbyRobot) -> None:
+        self._robot = robot
+        self._ended = threading.Event()
+        self.found: dict[str, Successes] = {}
+        self._threads: list[threading.Thread] = []
+
+    def __enter__(self) -> dict[str, Successes]:
+        robot = self._robot
+        robot.registrar.send("time")
+        for listener in robot.listeners:
+            self._watch(f"topic to {listener.label.partition(' ')[0]}", _events(listener, "received"))
+        for caller in robot.callers:
+            self._watch(f"service from {caller.label.partition(' ')[0]}", _calls(robot, caller))
+        self._watch("Master API", _events(robot.registrar, "acknowledged"))
+        return self.found
+
+    def __exit__(self, *exc: object) -> None:
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+        self._robot.registrar.send("rest")
+
+    def _watch(self, name: str, once: Callable[[], None]) -> None:
+        successes = self.found[name] = Successes()
+
+        def work() -> None:
+            while not self._ended.is_set():
+                once()
+                successes.note()
+
+        thread = threading.Thread(target=work)
+        self._threads.append(thread)
+        thread.start()
+
+
+def _events(process: Process, event: str) -> Callable[[], None]:
+    """Return a function that waits for the next event of this name."""
+    mark = [process.mark()]
+
+    def once() -> None:
+        process.wait_for(event=event, since=mark[0], timeout=_SECONDS)
+        mark[0] = process.mark()
+
+    return once
+
+
+def _calls(robot: StandbyRobot, caller: Process) -> Callable[[], None]:
+    def once() -> None:
+        robot.call(caller)
+        time.sleep(1 / _RATE)
+
+    return once
+
+
+@contextlib.contextmanager
+def busy(number: int) -> Iterator[None]:
+    """Run processes that do nothing but compute."""
+    burning = [multiprocessing.Process(target=_burn, daemon=True) for _ in range(number)]
+    for one in burning:
+        one.start()
+    try:
+        yield
+    finally:
+        for one in burning:
+            one.kill()
+
+
+def _burn() -> None:
+    while True:
+        pass
+
+
+def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
+    """Print a table of takeovers."""
+    chance, pauses = random.Random(seed), dict[str, list[float]]()  # noqa: S311  not for secrets
+    with tempfile.TemporaryDirectory() as home, Lab("rosrv-bench") as lab, StandbySite(lab, Path(home)) as site:
+        site.start_witness()
+        site.start("a")
+        site.until_active("a")
+        site.start("b")
+        site.until_both_in_sync()
+        with StandbyRobot(site, rate=_RATE) as robot, busy(load):
+            for turn in range(number):
+                time.sleep(chance.uniform(0, 1))
+                found = one_takeover(site, robot, planned=planned)
+                for name, pause in found.items():
+                    pauses.setdefault(name, []).append(pause)
+                print(turn + 1, {name: round(pause, 2) for name, pause in found.items()}, flush=True)  # noqa: T201
+            robot.lost_nothing()
+    table = Table("seconds without", "least", "median", "most", title=f"{number} takeovers, load {load}")
+    pauses["any of them"] = [max(turn) for turn in zip(*pauses.values(), strict=True)]
+    for name, times in pauses.items():
+        table.add_row(name, *(f"{one:.2f}" for one in (min(times), statistics.median(times), max(times))))
+    Console().print(table)
+
+
+def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
+    """Return the longest pause of everything; then both appliances are in sync again."""
+    active, passive = site.pair()
+    with Watch(robot) as found:
+        if planned:
+            site.appliances[active].ask(admin.StandbyPromote())
+        else:
+            site.cut(active)
+        site.until_taken_over(passive)
+        taken = time.monotonic()
+        for successes in found.values():
+            successes.until_after(taken + _AFTER)
+    if not planned:
+        site.restore(active)
+    site.until_both_in_sync()
+    eventually(lambda: site.pids(active, "control"), site.story)
+    return {name: successes.longest_pause() for name, successes in found.items()}
+
+
+def registrations(rounds: int, load: int) -> None:
+    """Print a table of the times of registrations."""
+    kinds = {"single": None, "two, wait: none": "none", "two, wait: standby": "standby"}
+    times: dict[str, list[float]] = {kind: [] for kind in kinds}
+    with contextlib.ExitStack() as stack:
+        turns = {kind: stack.enter_context(_behind(wait)) for kind, wait in kinds.items()}
+        stack.enter_context(busy(load))
+        for turn in range(rounds + 1):
+            for kind, take_turn in turns.items():
+                found = take_turn()
+                times[kind] += found if turn else []  # the first turn opens connections
+    table = Table("appliances", "median", "90 %", "ratio", title=f"milliseconds of a registration, load {load}")
+    single = statistics.median(times["single"])
+    for kind, found in times.items():
+        middle = statistics.median(found)
+        late = statistics.quantiles(found, n=10)[8]
+        table.add_row(kind, f"{1e3 * middle:.2f}", f"{1e3 * late:.2f}", f"{middle / single:.2f}")
+    Console().print(table)
+
+
+@contextlib.contextmanager
+def _behind(wait: str | None) -> Iterator[Callable[[], list[float]]]:
+    """Start one or two appliances; yield a function that returns the times of some registrations."""
+    lab = Lab(f"rosrv-bench-{wait or 'single'}")
+    with tempfile.TemporaryDirectory() as home, lab:
+        if wait is None:
+            robot = lab.host("robot", "10.79.0.10/24")
+            with Appliance(lab.host("a", "10.79.0.2/24")) as one:
+                yield lambda: robot.run(lambda: _registered(one.master_uri))
+        else:
+            settings = f"availability:\n  wait: {wait}\n"
+            with StandbySite(lab, Path(home), settings=settings) as site:
+                site.start_witness()
+                site.start("a")
+                site.until_active("a")
+                site.start("b")
+                site.until_both_in_sync()
+                yield lambda: site.robot.run(lambda: _registered(MASTER))
+
+
+def _registered(master: str) -> list[float]:
+    """Register and unregister a topic; return the seconds of each call."""
+    times = []
+    with xmlrpc.client.ServerProxy(master) as proxy:
+        proxy.getPid("/bench")
+        for number in range(_CALLS):
+            method = proxy.unregisterPublisher if number % 2 else proxy.registerPublisher
+            kind = () if number % 2 else ("std_msgs/String",)
+            began = time.monotonic()
+            answer = method("/bench", "/bench/topic", *kind, "http://10.79.0.10:9/")
+            times.append(time.monotonic() - began)
+            if not isinstance(answer, list) or answer[0] != 1:
+                raise RuntimeError(f"a registration failed: {answer}")
+    return times
+
+
+def main() -> None:
+    """Run one of the measurements."""
+    arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    arguments.add_argument("what", choices=("cuts", "switchovers", "registrations"))
+    arguments.add_argument("--cuts", type=int, default=50, help="takeovers")
+    arguments.add_argument("--rounds", type=int, default=40, help="turns of each kind, with 20 calls each")
+    arguments.add_argument("--load", type=int, default=0, help="processes that compute")
+    arguments.add_argument("--seed", type=int, default=1)
+    given = arguments.parse_args()
+    if given.what == "registrations":
+        registrations(given.rounds, given.load)
+    else:
+        takeovers(given.cuts, given.load, given.seed, planned=given.what == "switchovers")
+
+
+if __name__ == "__main__":
+    main()
