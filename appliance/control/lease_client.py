@@ -22,6 +22,7 @@ class LeaseClient:
     def __init__(self) -> None:
         self.state: messages.LeaseState | None = None
         self._listeners: list[Callable[[messages.LeaseState], None]] = []
+        self._present = False
         self._link = Link(self._heard, self._lost)
         self._news = asyncio.Event()
         self._handing_over: asyncio.Future[str] | None = None
@@ -29,6 +30,13 @@ class LeaseClient:
     def attach(self, channel: Channel) -> None:
         """Use a new link."""
         self._link.attach(channel)
+        if self._present:
+            self.send(messages.ControlPresent())
+
+    def present(self) -> None:
+        """Report that this process stands by or serves."""
+        self._present = True
+        self.send(messages.ControlPresent())
 
     def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
         """Call `changed` with the last report, if there is one, and with each later report."""

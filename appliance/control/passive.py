@@ -73,6 +73,7 @@ class PassiveControl:
         stating = loop.create_task(self._rest.run())
         self._lifeline.hear(self._heard)
         self._lifeline.say(messages.Ready({"stands_by": True}))
+        self._lease.present()
         try:
             await until.wait()
         finally:

@@ -38,6 +38,7 @@ from appliance.control.spare_memory import SpareMemory
 from appliance.control.standby_orders import standby_source
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
+from appliance.control.takeover_record import TakeoverRecorder
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
@@ -109,9 +110,21 @@ async def _start(
     base = await make_foundation(settings, lifeline, compiler, tunnels, pair, restarted=restarted)
     parts = assemble(base)
     await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
+    recorder = None
     if pair is not None:
+        recorder = TakeoverRecorder(
+            base.trail,
+            base.audit,
+            base.store,
+            base.signing.signed,
+            name=pair.membership.name,
+            other=pair.membership.other,
+        )
+        await recorder.took_over(pair.epoch)
         parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
-    control = _Control(base, parts, make_operators(base, parts, standby_source(base, parts)))
+    control = _Control(
+        base, parts, make_operators(base, parts, standby_source(base, parts, recorder)), recorder
+    )
     await _restore(base, parts)
     await control.serve()
     await parts.reconciler.ready.wait()
@@ -122,7 +135,10 @@ async def _start(
 class _Control:
     """All parts of control, from the first served call to the end."""
 
-    def __init__(self, base: Foundation, parts: Parts, operators: Operators) -> None:
+    def __init__(
+        self, base: Foundation, parts: Parts, operators: Operators, recorder: TakeoverRecorder | None
+    ) -> None:
+        self._recorder = recorder
         self._base = base
         self._parts = parts
         self._operators = operators
@@ -162,6 +178,8 @@ class _Control:
         ]
         if base.replication is not None:
             work += [base.replication.run(), operators.standby.obey(base.replication.switchover_wanted)]
+        if self._recorder is not None:
+            work.append(self._recorder.follow())
         self._tasks += map(asyncio.get_running_loop().create_task, work)
 
     async def announce(self, *, restarted: bool) -> None:

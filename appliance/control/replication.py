@@ -141,6 +141,7 @@ class Replication:
 
     async def run(self) -> None:
         """Serve the standby until cancelled. Raises `OSError` if the port is in use."""
+        self._lease.present()
         with socket.create_server(("", self._membership.port), backlog=_BACKLOG) as listening:
             reports = asyncio.get_running_loop().create_task(self._report_always())
             try:

@@ -5,6 +5,8 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
+import structlog
+
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.channel.answers.standby_answers import StandbyState
@@ -14,8 +16,11 @@ from appliance.control.foundation import Foundation
 from appliance.control.inheritance import leave_state
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Replication
+from appliance.control.takeover_record import TakeoverRecorder
 from appliance.telemetry.audit_trail import AuditTrail
 
+_log = structlog.get_logger()
+_SEAL_SECONDS = 0.5  # the robot waits
 _STANDBY = "the standby"
 _SINGLE = "this appliance is not one of two; to add a standby, run `rosrv standby join` on both appliances"
 
@@ -75,15 +80,20 @@ class ActiveAppliance:
             raise
 
 
-def standby_source(base: Foundation, parts: Parts) -> StandbySource:
-    """Return the source of an appliance in service."""
+def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | None) -> StandbySource:
+    """Return the source of an appliance in service; `recorder` records its hand-over."""
     pair, replication, relay = base.pair, base.replication, parts.endpoints.relay
-    if pair is None or replication is None:
+    if pair is None or replication is None or recorder is None:
         return SingleAppliance()
 
     async def leaving() -> None:
         await leave_state(pair, base.store, relay)
         base.store.save_parameters(parts.core.parameters.tree)
+        try:
+            async with asyncio.timeout(_SEAL_SECONDS):
+                await recorder.handed_over(pair.epoch)
+        except TimeoutError:
+            _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
     return ActiveAppliance(replication, leaving, relay.pass_again)
 

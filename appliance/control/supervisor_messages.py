@@ -95,7 +95,8 @@ class SupervisorMessages:
         ends.relay.attach(index, channel)
         pair = self._base.pair
         told = self._parts.core.graph.tell_everybody(
-            lambda topic: ends.relay.carries(index, TOPIC, topic), renewed=pair is not None and pair.taken_over
+            lambda topic: ends.relay.carries(index, TOPIC, topic),
+            renewed=pair is not None and pair.taken_over,
         )
         ends.enactor.carry_out(told)
         self._parts.reminders.begin()

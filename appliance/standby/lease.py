@@ -95,6 +95,7 @@ class ApplianceLease:
         self.held: int | None = None
         self.answers_alone = False
         self.refusal = ""
+        self.ready = True  # False: this appliance could not serve, so it does not claim
         self._name = name
         self._other = other
         self._session = session
@@ -154,10 +155,11 @@ class ApplianceLease:
             return self._remove(now, waiting_since)
         self._next_round = now + RENEW_SECONDS
         if self.held is None:
-            if now >= self._promised_until:
+            if now >= self._promised_until and self.ready:
                 self._next_round = now + CLAIM_SECONDS
                 return (self._to_witness("claim", now),)
-            self._next_round = min(self._next_round, self._promised_until)
+            if now < self._promised_until:
+                self._next_round = min(self._next_round, self._promised_until)
             return (self._to_witness("look", now),)
         if self._switching_until is not None:
             if now < self._switching_until:

@@ -3,6 +3,8 @@
 The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
 the supervisor, which ends the processes that serve the robot when no further one arrives: so the appliance becomes
 passive also if this process hangs or dies. The greatest epoch is on the disk before it is used.
+
+This appliance claims only while its control is present. If control is away for long, the other appliance takes over.
 """
 
 import asyncio
@@ -34,6 +36,7 @@ from appliance.standby.witness_link import WitnessChannel
 
 EPOCH = "epoch"
 _CONTROL_SECONDS = 1.0
+_AWAY_SECONDS = 10.0  # a killed control is back after a second
 _LARGEST = 2048
 _BATCH = 64  # datagrams between two ticks
 
@@ -75,6 +78,8 @@ class LeaseProcess:
         )
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._report = messages.ReplicationReported(0, False, None)
+        self._present = False
+        self._absent_since = boot_time()
         self._permission = 0
         self._alone = False
         self._held = 0.0
@@ -114,6 +119,10 @@ class LeaseProcess:
                 self._permission += 1
                 current = False
         self._alone = lease.answers_alone
+        lease.ready = self._present
+        if not self._present and now - self._absent_since > _AWAY_SECONDS and lease.is_active(now):
+            with contextlib.suppress(LeaseError):  # the other appliance is not ready, either
+                self._after(lease.switch_over(now))
         caught_up = current and report.caught_up
         self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
 
@@ -193,6 +202,8 @@ class LeaseProcess:
 
     def _control_linked(self) -> None:
         """A new control waits for the standby until it gets a new permission."""
+        if self._present:
+            self._present, self._absent_since = False, boot_time()
         self._report = messages.ReplicationReported(self._permission, False, None)
         self._told = None
         self._wake.set()
@@ -203,6 +214,8 @@ class LeaseProcess:
                 self._report = message
             case messages.EpochSeen(epoch) if epoch <= HIGHEST:
                 self._lease.follow(epoch)
+            case messages.ControlPresent():
+                self._present = True
             case messages.HandOverWanted():
                 self._hand_over()
             case _:

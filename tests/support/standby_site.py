@@ -7,6 +7,7 @@ link down, as a power cut does.
 import contextlib
 import json
 import os
+import secrets
 import shutil
 import signal
 import subprocess

@@ -59,8 +59,12 @@ class EpochSeen(Message):
     epoch: _Epoch
 
 
+class ControlPresent(Message):
+    """Control stands by or serves, so this appliance may be active. A new link begins without this."""
+
+
 class HandOverWanted(Message):
     """Control has stored everything on the standby, and wants it to take over."""
 
 
-LeaseLink = LeaseState | HandOverAnswered | ReplicationReported | EpochSeen | HandOverWanted
+LeaseLink = LeaseState | HandOverAnswered | ReplicationReported | EpochSeen | ControlPresent | HandOverWanted

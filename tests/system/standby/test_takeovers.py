@@ -26,7 +26,11 @@ def orders(site: StandbySite, name: str) -> list[Any]:
     """Return what operators ordered: policies, specifications, tokens."""
     one = site.appliances[name]
     monitors = one.ask(admin.MonitorsWanted(True))
-    return [one.ask(admin.PolicyRevisions()), [found.name for found in monitors.monitors], one.ask(admin.TokenList())]
+    return [
+        one.ask(admin.PolicyRevisions()),
+        [found.name for found in monitors.monitors],
+        one.ask(admin.TokenList()),
+    ]
 
 
 @pytest.fixture(autouse=True)
@@ -84,11 +88,18 @@ def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, 
 
 def request(site: StandbySite, name: str, method: str) -> socket.socket:
     """Send a request to an appliance from a host that the robot does not fence."""
-    values = "".join(f"<param><value>{text}</value></param>" for text in ("/late", "/large", "late")[: 3 if method == "setParam" else 2])
+    values = "".join(
+        f"<param><value>{text}</value></param>"
+        for text in ("/late", "/large", "late")[: 3 if method == "setParam" else 2]
+    )
     body = f"<methodCall><methodName>{method}</methodName><params>{values}</params></methodCall>".encode()
     host = site.lab.hosts.get("ocu") or site.lab.host("ocu", f"{OCU}/24")
     sock = host.run(lambda: socket.create_connection((ADDRESSES[name], MASTER_PORT), 30))
-    sock.sendall(b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Type: text/xml\r\n" + b"Content-Length: %d\r\n\r\n" % len(body) + body)
+    sock.sendall(
+        b"POST /RPC2 HTTP/1.1\r\nHost: x\r\nContent-Type: text/xml\r\n"
+        + b"Content-Length: %d\r\n\r\n" % len(body)
+        + body
+    )
     return sock
 
 

@@ -350,3 +350,12 @@ def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
     assert restarted.read(datagram) is None
     assert channel.read(datagram) is not None
     assert channel.read(datagram) is None
+
+
+def test_an_appliance_that_could_not_serve_does_not_claim() -> None:
+    """It asks for the lease's state, and claims once its control is present."""
+    lease = Lease().later(EXPIRY)
+    lease.lease.ready = False
+    assert lease.operations() == ["look"]
+    lease.lease.ready = True
+    assert lease.later(1.0).operations() == ["claim"]
