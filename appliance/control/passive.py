@@ -6,6 +6,7 @@ gives all other orders to the active appliance.
 
 import asyncio
 import time
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -17,11 +18,11 @@ from appliance.configuration.settings import Settings
 from appliance.control.admin_socket import AdminServer
 from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
-from appliance.control.replication import state_of
+from appliance.control.replication import Pair, state_of
 from appliance.control.standby_orders import StandbyAdministration
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.standby.link_certificates import replication_context
-from appliance.standby.membership import Membership
+from appliance.standby.membership import Membership, load_membership
 from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_receiver import ReplicationReceiver
@@ -147,25 +148,27 @@ class PassiveControl:
         return True
 
 
-async def stand_by(
-    settings: Settings,
-    membership: Membership,
-    lifeline: ControlLifeline,
-    lease: LeaseClient,
-    stopping: asyncio.Event,
-) -> Channel | None:
-    """Stand by until this appliance is activated (`lifeline.epoch`) or stopped; return the link to the api."""
-    if lifeline.activated.is_set() or stopping.is_set():
+async def until_activated(
+    link: Path, settings: Settings, lifeline: ControlLifeline, lease: LeaseClient, stopping: asyncio.Event
+) -> Pair | None:
+    """Stand by until this appliance is activated or stopped. Return None if it is stopped, or not one of two.
+
+    `link` is the file with the membership. Raises `MembershipError`, `StoreError`, `OSError`.
+    """
+    membership = load_membership(link)
+    if membership is None:
         return None
-    passive = PassiveControl(settings, membership, lifeline, lease)
-    ended = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    waits = [loop.create_task(event.wait()) for event in (lifeline.activated, stopping)]
-    for wait in waits:
-        wait.add_done_callback(lambda _task: ended.set())
-    try:
-        await passive.run(ended)
-    finally:
+    taken_over, api = not lifeline.activated.is_set(), None
+    if taken_over and not stopping.is_set():
+        passive = PassiveControl(settings, membership, lifeline, lease)
+        ended, loop = asyncio.Event(), asyncio.get_running_loop()
+        waits = [loop.create_task(event.wait()) for event in (lifeline.activated, stopping)]
         for wait in waits:
-            wait.cancel()
-    return passive.api
+            wait.add_done_callback(lambda _task: ended.set())
+        try:
+            await passive.run(ended)
+        finally:
+            for wait in waits:
+                wait.cancel()
+        api = passive.api
+    return None if lifeline.epoch is None else Pair(membership, lease, lifeline.epoch, api, taken_over)

@@ -27,15 +27,14 @@ from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
 from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
-from appliance.control.inheritance import inherited_state
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
-from appliance.control.passive import stand_by
+from appliance.control.passive import until_activated
 from appliance.control.policies import PolicyRefusedError
 from appliance.control.replication import Pair
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import SpareMemory
-from appliance.control.standby_orders import standby_source
+from appliance.control.standby_orders import begin_epoch, standby_source
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.control.takeover_record import TakeoverRecorder
@@ -45,7 +44,7 @@ from appliance.master.graph.registry import Life
 from appliance.master.reconcile.enactor import restore
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.specifications.specification_files import SpecificationsRefusedError
-from appliance.standby.membership import LINK_FILE, MembershipError, load_membership
+from appliance.standby.membership import LINK_FILE, MembershipError
 from appliance.store.writer_thread import StoreError
 from roswire.uris import node_uri
 
@@ -78,14 +77,9 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     lifeline.attach()
     try:
         await lifeline.restored.wait()
-        membership = load_membership(config.with_name(LINK_FILE))
-        pair = None
-        if membership is not None:
-            taken_over = not lifeline.activated.is_set()
-            api = await stand_by(settings, membership, lifeline, lease, stopping)
-            if lifeline.epoch is None:
-                return
-            pair = Pair(membership, lease, lifeline.epoch, api, taken_over)
+        pair = await until_activated(config.with_name(LINK_FILE), settings, lifeline, lease, stopping)
+        if stopping.is_set():
+            return
         control = await _start(settings, lifeline, compiler, tunnels, pair)
     except (
         PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, MembershipError, OSError
@@ -110,18 +104,7 @@ async def _start(
     base = await make_foundation(settings, lifeline, compiler, tunnels, pair, restarted=restarted)
     parts = assemble(base)
     await parts.monitors.start(restarted=restarted, taken_over=pair is not None)
-    recorder = None
-    if pair is not None:
-        recorder = TakeoverRecorder(
-            base.trail,
-            base.audit,
-            base.store,
-            base.signing.signed,
-            name=pair.membership.name,
-            other=pair.membership.other,
-        )
-        await recorder.took_over(pair.epoch)
-        parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
+    recorder = await begin_epoch(base, parts)
     control = _Control(
         base, parts, make_operators(base, parts, standby_source(base, parts, recorder)), recorder
     )

@@ -13,7 +13,7 @@ from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
 from appliance.control.foundation import Foundation
-from appliance.control.inheritance import leave_state
+from appliance.control.inheritance import inherited_state, leave_state
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Replication
 from appliance.control.takeover_record import TakeoverRecorder
@@ -78,6 +78,23 @@ class ActiveAppliance:
         except HandOverError:
             self._staying()
             raise
+
+
+async def begin_epoch(base: Foundation, parts: Parts) -> TakeoverRecorder | None:
+    """Record that this appliance is active, and give its relays the state of the other one's monitors.
+
+    Return None on a single appliance.
+    """
+    pair = base.pair
+    if pair is None:
+        return None
+    name, other = pair.membership.name, pair.membership.other
+    recorder = TakeoverRecorder(
+        base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
+    )
+    await recorder.took_over(pair.epoch)
+    parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
+    return recorder
 
 
 def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | None) -> StandbySource:
