@@ -344,7 +344,7 @@ def builder(*, clock: bool = False) -> Iterator[Engine]:
 
 def project(directory: Path) -> Path:
     """Make a user's directory: the compose files and the three folders to edit."""
-    for name in ("compose.yaml", "compose.host.yaml"):
+    for name in ("compose.yaml", "compose.host.yaml", "compose.standby.yaml"):
         shutil.copy(ROOT / name, directory)
     for name in ("policies", "monitors"):
         shutil.copytree(ROOT / name, directory / name)

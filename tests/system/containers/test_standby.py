@@ -1,0 +1,46 @@
+"""Test compose.standby.yaml: two appliances in containers; one is killed while the operator drives."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.docker import Compose, project
+from tests.support.waiting import eventually
+from tests.system.containers.conftest import Site
+
+pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
+_FILE = "compose.standby.yaml"
+
+
+@pytest.fixture
+def pair(site: Site, tmp_path: Path) -> Iterator[Compose]:
+    """Run both appliances, the robot and its operator, as the head of the file says."""
+    compose = site.engine.compose(project(tmp_path), "pair", _FILE)
+    try:
+        compose("up", "--detach", "--no-build")
+        for name in ("a", "b"):
+            compose.wait_healthy(name)
+        yield compose
+    finally:
+        compose("down", "--volumes", "--timeout", "5")
+
+
+def test_the_standby_takes_over_from_a_killed_container(pair: Compose) -> None:
+    """The operator loses the robot for a moment; every node goes on in its container."""
+    pair.wait_for_log("ocu", '"position"', timeout=180)
+    eventually(
+        lambda: (
+            json.loads(pair.exec("a", "rosrv", "standby", "status", "--json", check=False).stdout or "{}")
+            .get("other", {})
+            .get("in_sync")
+        ),
+        pair.story,
+    )
+    nodes = {name: pair.container(name) for name in ("landshark", "ocu")}
+    pair("kill", "a")
+    pair.wait_for_log("ocu", '"regained"', timeout=120)
+    status = json.loads(pair.exec("b", "rosrv", "standby", "status", "--json", check=False).stdout)
+    assert status["role"] == "active"
+    assert {name: pair.container(name) for name in nodes} == nodes
