@@ -35,20 +35,19 @@ def node(lab: Lab) -> Host:
     return lab.host("node", "10.77.0.30/24", "fd77::30/64")
 
 
-def settings(tmp_path: Path, **others: str) -> IsolationSettings:
+def settings(tmp_path: Path, name: str | None = None) -> IsolationSettings:
     """Return settings with a name for this test only."""
     return IsolationSettings(
         ports=(PortRange.one(MASTER), PortRange(FIRST, LAST)),
-        name=f"riso{os.getpid()}",
+        name=name or f"riso{os.getpid()}",
         directory=tmp_path,
-        **others,
     )
 
 
 @contextlib.contextmanager
-def isolated(bare: Host, tmp_path: Path, **others: str) -> Iterator[Isolation]:
+def isolated(bare: Host, tmp_path: Path) -> Iterator[Isolation]:
     """Set up the isolation for the length of a block."""
-    isolation = Isolation(bare.namespace, settings(tmp_path, **others))
+    isolation = Isolation(bare.namespace, settings(tmp_path))
     isolation.up()
     try:
         yield isolation

@@ -24,7 +24,7 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 def members(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pair]]:
     """Yield both appliances, without an epoch."""
     made, _settings = memberships(tmp_path_factory.mktemp("members"))
-    yield {name: Pair(one, LeaseClient(), 0, None) for name, one in made.items()}
+    yield {name: Pair(one, LeaseClient(), 0, None, taken_over=True) for name, one in made.items()}
 
 
 class Pairs:
