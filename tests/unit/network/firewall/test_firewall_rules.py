@@ -18,6 +18,7 @@ from appliance.network.firewall.firewall_rules import (
     PacketVerdict,
     PortRange,
     RateLimit,
+    StandbyAccess,
     appliance_rules,
     family_of,
     inner_port,
@@ -301,6 +302,26 @@ CONDITIONS: dict[str, tuple[PacketRule, Any]] = {
     "unknown": (OUT, True), "answered": (OUT, True), "translated": (OUT, True), "to": (NAT, "10.0.0.2"),
 }  # fmt: skip
 """A value of each condition, and a rule that may have it."""
+
+
+def test_replication_and_lease_are_for_the_other_appliance() -> None:
+    """Only it connects to the replication; only it and the witness send datagrams; all others are refused."""
+    access = StandbyAccess("10.0.0.3", "10.0.0.10", 7412)
+    rules = appliance_rules(
+        FirewallSettings(control_uid=1, rosmaster_uid=2, standby=access, new_connections=None)
+    )
+    ours = [
+        rule
+        for rule in rules
+        if PortRange.one(7412) in (rule.tcp_ports, rule.udp_ports) and rule.chain is Chain.IN
+    ]
+    assert [(rule.verdict, rule.source, rule.udp_ports is not None) for rule in ours] == [
+        (PacketVerdict.RETURN, "10.0.0.3", False),
+        (PacketVerdict.RESET, None, False),
+        (PacketVerdict.RETURN, "10.0.0.3", True),
+        (PacketVerdict.RETURN, "10.0.0.10", True),
+        (PacketVerdict.DROP, None, True),
+    ]
 
 
 @pytest.mark.parametrize("name", [one.name for one in fields(PacketRule)])
