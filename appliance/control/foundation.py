@@ -11,6 +11,7 @@ import structlog
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.configuration.settings import Settings
+from appliance.control.host_authority import HostAuthority, make_host_authority
 from appliance.control.host_blocks import BlockTable
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.open_audit import open_audit
@@ -20,7 +21,6 @@ from appliance.control.replication import Pair, Replication, make_replication
 from appliance.control.robot import robot_addresses
 from appliance.control.signer_requests import SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
-from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
@@ -72,7 +72,7 @@ class Foundation:
     lifeline: ControlLifeline
     compiler: SpecificationCompiler
     signing: SignerRequests
-    authority: Authority
+    host_authority: HostAuthority
     audit: AuditLog
     trail: AuditTrail
     plan: RecordingPlan
@@ -112,7 +112,6 @@ async def make_foundation(
     """
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
-    authority = Authority(signing.link)
     audit.set(open_audit(settings, signing, lifeline.log_held(), lambda host: _class_of(quota_class, host)))
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
@@ -129,7 +128,12 @@ async def make_foundation(
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))
-    tunnels.set(Tunnels(table, trail, authority, listen=settings.listen_address, say=lifeline.say))
+    host_authority = make_host_authority(
+        settings, signing.link, store, table, pair=pair, replication=replication
+    )
+    tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
+    if pair is not None:
+        pair.tunnels.hand_to(tunnels())
     await tunnels().start()
     policies = Policies(
         settings.policy,
@@ -150,7 +154,7 @@ async def make_foundation(
         lifeline=lifeline,
         compiler=compiler,
         signing=signing,
-        authority=authority,
+        host_authority=host_authority,
         audit=audit(),
         trail=trail,
         plan=plan,

@@ -45,9 +45,10 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     certification = Certification(
         base.store,
         trail,
-        base.authority,
+        base.host_authority.authority,
         base.table,
         base.tunnels,
+        appliances=base.host_authority.appliances,
         master_port=settings.listen_address[1],
         rest=rest_address(settings),
         changed=base.policies.hosts_changed,

@@ -5,6 +5,7 @@ gives all other orders to the active appliance.
 """
 
 import asyncio
+import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,9 @@ from appliance.configuration.settings import Settings
 from appliance.control.admin_socket import AdminServer
 from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
-from appliance.control.replication import Pair, state_of
+from appliance.control.replication import Pair, host_endpoint, state_of
 from appliance.control.standby_orders import StandbyAdministration
+from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership, load_membership
@@ -40,7 +42,11 @@ class PassiveControl:
     """Control of a standby. `folder` is closed to other users: it gets the certificate and the key of the link."""
 
     def __init__(
-        self, settings: Settings, membership: Membership, lifeline: ControlLifeline, lease: LeaseClient
+        self,
+        settings: Settings,
+        membership: Membership,
+        lifeline: ControlLifeline,
+        lease: LeaseClient,
     ) -> None:
         """Open the replica. Raises `StoreError`."""
         self._settings = settings
@@ -54,7 +60,11 @@ class PassiveControl:
             SCHEMA,
             failed=lambda reason: _log.error("state is not written", reason=reason),
         )
-        self._receiver = ReplicationReceiver(self._replica, self._accepts)
+        self.tunnels = StandbyTunnels()
+        endpoint = host_endpoint(settings, membership)
+        self._receiver = ReplicationReceiver(
+            self._replica, self._accepts, lambda: self.tunnels.introduction(endpoint, self._rest.pin)
+        )
         self._epoch = 0
         self._connected = False
         self._away_since = time.monotonic()
@@ -67,12 +77,13 @@ class PassiveControl:
     async def run(self, until: asyncio.Event) -> None:
         """Stand by until the event is set. Then the state file is closed and consistent."""
         loop = asyncio.get_running_loop()
-        following = loop.create_task(self._follow())
+        tasks = [loop.create_task(self._follow()), loop.create_task(self._prepare_tunnels())]
         server = await AdminServer(StandbyAdministration(self, orders=True)).start(
             self._lifeline.sockets[_ADMIN].dup()
         )
         stating = loop.create_task(self._rest.run())
         self._lifeline.hear(self._heard)
+        active = self._lifeline.hear_tunnels(self.tunnels.answered)
         self._lifeline.say(messages.Ready({"stands_by": True}))
         self._lease.present()
         try:
@@ -80,10 +91,12 @@ class PassiveControl:
         finally:
             server.close()
             self._lifeline.pause()
+            self._lifeline.hear_tunnels(active)
             self.api = self._rest.release()
-            for task in (following, stating):
+            self.tunnels.pin = self._rest.pin
+            for task in (*tasks, stating):
                 task.cancel()
-            await asyncio.wait([following, stating])
+            await asyncio.wait([*tasks, stating])
             await asyncio.to_thread(self._replica.close)
 
     def state(self) -> StandbyState:
@@ -114,9 +127,11 @@ class PassiveControl:
             ) from error
 
     def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
-        """Serve the api; leave the other messages of the supervisor to the active control."""
+        """Serve the api and the process for charon; leave the supervisor's other messages to the active control."""
         if isinstance(message, messages.LinkOpened) and message.role == "api":
             self._rest.attach(self._lifeline.api_channel(descriptors[0]))
+        elif isinstance(message, messages.LinkOpened) and message.role == "charon":
+            self.tunnels.attach(Channel(socket.socket(fileno=descriptors[0]), messages.TunnelLink))
         else:
             self._lifeline.queue(message, descriptors)
 
@@ -135,6 +150,13 @@ class PassiveControl:
                 if self._connected:
                     self._connected, self._away_since = False, time.monotonic()
             await asyncio.sleep(_AGAIN_SECONDS)
+
+    async def _prepare_tunnels(self) -> None:
+        """Prepare the tunnels as soon as the active appliance has an enrolled host."""
+        while not await asyncio.to_thread(self._replica.has_hosts):
+            await asyncio.sleep(_AGAIN_SECONDS)
+        pool = self._settings.ipsec.pool
+        self._lifeline.say(messages.TunnelsWanted(str(pool), str(pool.network_address + 1)))
 
     def _accepts(self, epoch: int) -> bool:
         """Whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
@@ -158,7 +180,7 @@ async def until_activated(
     membership = load_membership(link)
     if membership is None:
         return None
-    taken_over, api = not lifeline.activated.is_set(), None
+    taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
     if taken_over and not stopping.is_set():
         passive = PassiveControl(settings, membership, lifeline, lease)
         ended, loop = asyncio.Event(), asyncio.get_running_loop()
@@ -170,5 +192,7 @@ async def until_activated(
         finally:
             for wait in waits:
                 wait.cancel()
-        api = passive.api
-    return None if lifeline.epoch is None else Pair(membership, lease, lifeline.epoch, api, taken_over)
+        api, tunnels = passive.api, passive.tunnels
+    if lifeline.epoch is None:
+        return None
+    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels)

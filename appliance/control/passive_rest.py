@@ -12,7 +12,7 @@ import structlog
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.messages.api import RequestAnswered, RequestMade, TokenKept, TokensStated
+from appliance.channel.messages.api import RequestAnswered, RequestMade, RestServed, TokenKept, TokensStated
 from appliance.control.admin_socket import RequestHandler
 from appliance.control.rest_proof import RequestAuthenticator, UnprovenError
 from appliance.control.token_orders import kept_by_api
@@ -55,13 +55,14 @@ class ReplicatedTokens:
 
 
 class PassiveRest:
-    """The link to the api of a standby."""
+    """The link to the api of a standby; `pin` is the pin of its key, empty if it is not known."""
 
     def __init__(self, administration: RequestHandler, tokens: ReplicatedTokens) -> None:
         self._administration = administration
         self._tokens = tokens
         self._askers = RequestAuthenticator(tokens, require_proof=False)
         self._link = Link(self._received)
+        self.pin = ""
         self._serving: set[asyncio.Task[None]] = set()
 
     def attach(self, channel: Channel) -> None:
@@ -84,6 +85,8 @@ class PassiveRest:
             await asyncio.sleep(_READ_SECONDS)
 
     def _received(self, message: Any) -> None:
+        if isinstance(message, RestServed):
+            self.pin = message.pin
         if not isinstance(message, RequestMade):
             return  # the standby records no calls: the active appliance records its own
         if len(self._serving) >= _MOST_WAITING:

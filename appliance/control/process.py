@@ -72,7 +72,11 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     stopping, tunnels, lease = asyncio.Event(), Current[Tunnels](), LeaseClient()
     compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
     lifeline = ControlLifeline(
-        lifeline_fd, stopping, lambda answer: tunnels().answered(answer), compiler.attach, lease.attach
+        lifeline_fd,
+        stopping,
+        lambda answer: tunnels().answered(answer) if tunnels else None,
+        compiler.attach,
+        lease.attach,
     )
     lifeline.attach()
     try:
@@ -146,6 +150,7 @@ class _Control:
             self._admin = await AdminServer(operators.administration).start(sockets[_ADMIN].dup())
         if base.pair is not None and base.pair.api is not None:
             operators.rest.attach(base.pair.api)
+            operators.certification.served_by(base.pair.tunnels.pin)  # the api has stated it already
         base.lifeline.hear(self._messages.heard)
         work: list[Coroutine[Any, Any, None]] = [
             parts.reconciler.run(),

@@ -10,8 +10,9 @@
 import asyncio
 import socket
 import time
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import structlog
 
@@ -20,10 +21,11 @@ from appliance.channel.answers.standby_answers import OtherAppliance, StandbySta
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.lease_client import HandOverError, LeaseClient
+from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership
 from appliance.standby.process import boot_time
-from appliance.standby.replication_frames import ReplicationError
+from appliance.standby.replication_frames import Introduction, ReplicationError
 from appliance.standby.replication_sender import ReplicationSender
 from appliance.standby.replication_transport import ReplicationListener
 from appliance.store.state_file import StateStore
@@ -39,8 +41,8 @@ _log = structlog.get_logger()
 class Pair(NamedTuple):
     """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
 
-    `api` is the link to the api, if it was opened while this appliance stood by. `taken_over`: this process stood by
-    before, so the epoch is new.
+    `api` is the link to the api, and `tunnels` has the link to the process for charon, if they were opened while this
+    appliance stood by. `taken_over`: this process stood by before, so the epoch is new.
     """
 
     membership: Membership
@@ -48,6 +50,7 @@ class Pair(NamedTuple):
     epoch: int
     api: Channel | None
     taken_over: bool
+    tunnels: StandbyTunnels
 
 
 def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
@@ -98,6 +101,11 @@ def state_of(
     )
 
 
+def host_endpoint(settings: Settings, membership: Membership) -> str:
+    """Return the address or name at which hosts open their tunnels to this one of two appliances."""
+    return settings.ipsec.endpoint or membership.address
+
+
 class Replication:
     """The replication of an active appliance. Create it before the first change that the standby needs.
 
@@ -135,9 +143,20 @@ class Replication:
         self._permission = 0
         self._trouble_since: float | None = None
         self._absent = taken_over and wait == "standby"
+        self._tasks: set[asyncio.Task[None]] = set()
         self._reported: messages.ReplicationReported | None = None
         lease.listen(self._lease_changed)
         self._report()
+
+    def on_introduction(self, introduced: Callable[[Introduction], Coroutine[Any, Any, None]]) -> None:
+        """Call this for each introduction of the standby."""
+
+        def start(introduction: Introduction) -> None:
+            task = asyncio.get_running_loop().create_task(introduced(introduction))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        self._sender.on_introduction(start)
 
     async def run(self) -> None:
         """Serve the standby until cancelled. Raises `OSError` if the port is in use."""

@@ -19,6 +19,9 @@ ROUTES_AT_ONCE = 32  # the most open route queries; unknown hosts cause them, an
 Heard = Callable[[Any, tuple[int, ...]], None]
 """Handle a message of the supervisor and its descriptors."""
 
+Enclosed = Callable[[messages.TunnelsEnclosed], object]
+"""Take the supervisor's answer to `TunnelsWanted`."""
+
 _log = structlog.get_logger()
 
 
@@ -49,7 +52,7 @@ class ControlLifeline:
         self,
         descriptor: int,
         stopping: asyncio.Event,
-        enclosed: Callable[[messages.TunnelsEnclosed], None],
+        enclosed: Enclosed,
         compiler: Callable[[Channel], None],
         lease: Callable[[Channel], None],
     ) -> None:
@@ -80,6 +83,11 @@ class ControlLifeline:
         early, self._early, self._heard = self._early, {}, heard
         for said in early.values():
             heard(*said)
+
+    def hear_tunnels(self, enclosed: Enclosed) -> Enclosed:
+        """Pass the supervisor's answers about tunnels to another function; return the earlier one."""
+        before, self._enclosed = self._enclosed, enclosed
+        return before
 
     def pause(self) -> None:
         """Queue messages again until `hear` is called."""

@@ -26,9 +26,9 @@ class Authority:
     def __init__(self, signer: Link) -> None:
         self._signer = signer
 
-    async def certificate(self) -> bytes:
-        """Return the authority's own certificate, in PEM."""
-        return (await self._ask(messages.AuthorityRequest, messages.AuthorityStated)).certificate
+    async def stated(self) -> messages.AuthorityStated:
+        """Return the certificate of the authority whose key the signer has."""
+        return await self._ask(messages.AuthorityRequest, messages.AuthorityStated)
 
     async def issue(
         self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""

@@ -16,10 +16,12 @@ from typing import Any
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
-from appliance.hosts.certificate_requests import Authority, AuthorityError
+from appliance.hosts.appliance_table import ApplianceTable
+from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.rest_address import RestAddress
+from appliance.hosts.shared_authority import SharedAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.hosts.view import soon
 from appliance.store.state_file import StateStore
@@ -39,10 +41,11 @@ class Certification:
         self,
         store: StateStore,
         trail: AuditTrail,
-        authority: Authority,
+        authority: SharedAuthority,
         table: HostTable,
         tunnels: Tunnels,
         *,
+        appliances: ApplianceTable,
         master_port: int,
         rest: RestAddress,
         changed: Callable[[], int],
@@ -56,6 +59,7 @@ class Certification:
         self.changing = asyncio.Lock()
         self.changed = changed
         self._authority = authority
+        self._appliances = appliances
         self._master_port = master_port
         self._revocations: Counter[str] = Counter()  # revocations by name, since this process started
         self._warned: set[str] = set()  # serial numbers of certificates whose end was announced
@@ -65,6 +69,7 @@ class Certification:
     def served_by(self, pin: str) -> None:
         """Store the pin by which hosts recognise the api."""
         self.pin = pin
+        self._appliances.is_served(pin)
         self._served.set()
 
     def revoked(self, name: str) -> None:
@@ -78,6 +83,13 @@ class Certification:
         yield
         if self._revocations[name] != before:
             raise HostForbiddenError(f"{name} was revoked in the meantime")
+
+    async def require_authority(self) -> None:
+        """Raise `HostRefusedError`, with the remedy, if this appliance does not have the authority's key."""
+        try:
+            await self._authority.require_key()
+        except AuthorityError as error:
+            raise HostRefusedError(str(error), ours=True) from error
 
     async def issue(
         self, name: str, request: str, days: float, *, proof: bytes = b"", former: bytes = b""
@@ -128,12 +140,14 @@ class Certification:
         If charon does not confirm in time, the kit has a warning. `kept` are the options stored with the host's token.
         Raises `HostRefusedError`, `StoreError`.
         """
+        taken = (
+            await self.tunnels.until_taken()
+        )  # the list of revoked certificates is signed and stored by then
         try:
             await self.store.settled()
         except StoreError as error:
             stands = f"{name} is enrolled until then and has no kit: rosrv host kit {name}, or revoke it"
             raise StoreError(f"{error}; {stands}") from error
-        taken = await self.tunnels.until_taken()
         warning = None if taken else "charon has not loaded it yet; see `rosrv status` and the log"
         return await self.kit(name, warning, kept)
 
@@ -142,7 +156,13 @@ class Certification:
         if self.rest.inner_port is not None and not await self.until_served():
             warning = warning or "REST is not running: the kit cannot renew its certificate automatically"
         authority = await self.authority_certificate()
-        own, rest = self.table.own_address, self.rest
+        await self._appliances.until_introduced()
+        own, rest, other = self.table.own_address, self.rest, self._appliances.other
+        if self._appliances.paired and other is None:
+            warning = warning or (
+                "the other appliance has not connected yet, so the kit has this one only: later, rosrv host kit"
+                f" {name}"
+            )
         row, certificate = self.table.rows[name], self.table.certificates.get(name)
         if certificate is None or not certificate.certificate:
             raise HostRefusedError(f"the certificate of {name} is not stored here: rosrv host kit {name}")
@@ -154,12 +174,13 @@ class Certification:
             master=f"http://{own}:{self._master_port}",
             rest_url=f"https://{own}:{rest.inner_port}" if rest.inner_port is not None else "",
             rest_trouble=rest.trouble,
-            pin=self.pin,
+            pin=";".join(filter(None, [self.pin, other.pin if other is not None else ""])),
             warning=warning,
             serial=row.serial,
             expires=row.expires,
             certificate=certificate.certificate,
             authority=authority.decode(),
+            second=other.endpoint if other is not None else "",
             kept=kept or {},
         )
 

@@ -98,6 +98,8 @@ class HostSelfService:
         """Replace a host's certificate by the next one, which the host has installed. Raises `HostRefusedError`."""
         name = request.name
         before = self._in_its_tunnel(name, request.peer).serial
+        # Without the authority's key the previous certificate could not be put on the list of revoked certificates.
+        await self._certification.require_authority()
         row = self._table.take_next(name)
         if row is None:
             raise HostRefusedError(f"{name} has no renewed certificate waiting: renew first")

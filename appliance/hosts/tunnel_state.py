@@ -20,17 +20,18 @@ import structlog
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.hosts.certificate_requests import Authority, AuthorityError
+from appliance.hosts.appliance_table import CERTIFICATE_DAYS, ApplianceTable
+from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostRefusedError, HostTable
+from appliance.hosts.shared_authority import SharedAuthority
 from appliance.policy.model import Address
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
-_APPLIANCE_DAYS = 90.0
 _OPEN_SECONDS = 20.0
 _TAKEN_SECONDS = 10.0
 _RESTATE_SECONDS = 3600.0
-_AGAIN_SECONDS = 5.0
+_AGAIN_SECONDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # the signer may just be starting
 _JUST_AFTER_SECONDS = 0.1
 _SIGNED_SECONDS = 60.0
 
@@ -41,7 +42,7 @@ class SignedRevocations:
     It is signed again when it is requested and the table of hosts has changed or a new minute has begun.
     """
 
-    def __init__(self, table: HostTable, authority: Authority) -> None:
+    def __init__(self, table: HostTable, authority: SharedAuthority) -> None:
         self._table = table
         self._authority = authority
         self._one_at_a_time = asyncio.Lock()
@@ -66,7 +67,8 @@ class Tunnels:
         self,
         table: HostTable,
         trail: AuditTrail,
-        authority: Authority,
+        authority: SharedAuthority,
+        appliances: ApplianceTable,
         *,
         listen: tuple[str, int],
         say: Callable[[messages.Message], None],
@@ -74,6 +76,7 @@ class Tunnels:
         self._table = table
         self._trail = trail
         self._authority = authority
+        self._appliances = appliances
         self._listen = listen
         self._say = say
         self.revocations = SignedRevocations(table, authority)
@@ -94,6 +97,7 @@ class Tunnels:
         self._stated: dict[int, int] = {}  # by unconfirmed statement: the last change that it includes
         self._taken_changes = 0
         self._tasks: set[asyncio.Task[None]] = set()
+        self._failures = 0  # of the authority, one after the other
 
     # --- the supervisor ---
 
@@ -111,6 +115,11 @@ class Tunnels:
     def obstacle(self) -> str:
         """Return why no tunnels are open."""
         return self._enclosed.reason if self._enclosed else "the supervisor has not answered yet"
+
+    @property
+    def waits(self) -> str:
+        """Return what waits for the key of the hosts' authority; empty if it is here."""
+        return self._authority.waits
 
     @property
     def addresses(self) -> dict[str, Address]:
@@ -155,10 +164,12 @@ class Tunnels:
 
     # --- the process that runs charon ---
 
-    def attach(self, link: Channel) -> None:
-        """Serve a new process for charon; the process first requests its certificate."""
+    def attach(self, link: Channel, needed: messages.CertificateNeeded | None = None) -> None:
+        """Serve a new process for charon; the process first requests its certificate, unless it already `needed` it."""
         self._certificate = self.charon = None
         self._link.attach(link)
+        if needed is not None:
+            self._spawn(needed)
 
     def state_anew(self) -> None:
         """Send charon its whole configuration soon."""
@@ -177,9 +188,10 @@ class Tunnels:
             self._dirty.clear()
             try:
                 await self._state()
+                self._failures = 0
             except AuthorityError as error:
                 _log.warning("charon is updated later", reason=str(error))
-                asyncio.get_running_loop().call_later(_AGAIN_SECONDS, self._dirty.set)
+                asyncio.get_running_loop().call_later(self._again(), self._dirty.set)
 
     def _until_it_changes(self) -> float:
         """Return the seconds until the next certificate ends, at most an hour. charon does not close its tunnel."""
@@ -220,8 +232,8 @@ class Tunnels:
 
     def _received(self, message: object) -> None:
         match message:
-            case messages.CertificateNeeded(request):
-                self._spawn(request)
+            case messages.CertificateNeeded():
+                self._spawn(message)
             case messages.CharonStarted():
                 self.charon = message
             case messages.TunnelChanged(name, up, remote):
@@ -238,23 +250,39 @@ class Tunnels:
                         self._taken_changes = self._stated.pop(number)
                 self._wake.set()
 
-    def _spawn(self, request: bytes) -> None:
-        task = asyncio.get_running_loop().create_task(self._certify(request))
+    def _spawn(self, needed: messages.CertificateNeeded) -> None:
+        task = asyncio.get_running_loop().create_task(self._certify(needed))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _certify(self, request: bytes) -> None:
+    async def _certify(self, needed: messages.CertificateNeeded) -> None:
         link = self._link.channel
         while link is self._link.channel:
             try:
-                made = await self._authority.issue(request, messages.APPLIANCE_NAME, _APPLIANCE_DAYS)
+                certificate = await self._own_certificate(needed)
             except AuthorityError as error:
                 _log.warning("charon waits for its certificate", reason=str(error))
-                await asyncio.sleep(_AGAIN_SECONDS)
+                await asyncio.sleep(self._again())
                 continue
-            self._certificate = made.certificate
+            self._certificate = certificate
             self._dirty.set()
             return
+
+    def _again(self) -> float:
+        """Return the seconds until the authority is asked again."""
+        self._failures += 1
+        return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
+
+    async def _own_certificate(self, needed: messages.CertificateNeeded) -> bytes:
+        """Return a new certificate; without the authority's key, the one that the other appliance issued before."""
+        obstacle = await self._authority.obstacle()
+        kept = self._appliances.certificate(needed.key) if obstacle else b""
+        if kept:
+            self._appliances.note_own(needed.key)
+            return kept
+        made = await self._authority.issue(needed.request, messages.APPLIANCE_NAME, CERTIFICATE_DAYS)
+        self._appliances.certified(needed.key, made)
+        return made.certificate
 
     def _lost(self, _reason: str) -> None:
         self._certificate = self.charon = None

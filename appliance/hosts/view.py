@@ -159,6 +159,8 @@ class HostView:
             )
         if self._table.declared.error:
             found.append(self._table.declared.error)
+        if self._tunnels.waits:
+            found.append(self._tunnels.waits)
         return found
 
 

@@ -50,6 +50,11 @@ def read_passphrase(descriptor: int) -> bytes:
     return line
 
 
+def is_encrypted(data: bytes) -> bool:
+    """Whether a private key in PEM is encrypted."""
+    return data.lstrip().startswith(_ENCRYPTED)
+
+
 def write_key(path: Path, key: Key, passphrase: bytes | None) -> None:
     """Write a key to a file that only its owner can read."""
     encryption = NoEncryption() if passphrase is None else BestAvailableEncryption(passphrase)
@@ -65,7 +70,7 @@ def load_key(path: Path, certificate_file: str, kind: Kind, passphrase: bytes | 
         )
     require_private(path)
     data = path.read_bytes()
-    encrypted = data.lstrip().startswith(_ENCRYPTED)
+    encrypted = is_encrypted(data)
     key = _decoded(path, data, passphrase if encrypted else None, encrypted=encrypted)
     found = _kind(path, key)
     if found != kind:

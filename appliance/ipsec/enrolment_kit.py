@@ -15,8 +15,9 @@ from appliance.channel.answers.host_answers import KitParts
 from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
-CONNECTION = "rosrv"
-_SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
+CONNECTION, SECOND = "rosrv", "rosrv-2"  # the scripts find both by the beginning of these names
+_SCRIPTS = {script: script for script in ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")}
+_OF_TWO = {"keep.sh": "keep_either.sh"}
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,19 @@ class Kit:
     """The parts of a kit.
 
     `endpoint` is the address or name by which the host reaches the appliance; `protect` is an nftables file. `key` is
-    None if the host made its own key.
+    None if the host made its own key. `host.second` is the address of the other appliance of two.
     """
 
     host: KitParts
     endpoint: str
     protect: str
     key: str | None
+
+    @property
+    def remotes(self) -> dict[str, str]:
+        """Return the appliances' addresses by the name of their connection."""
+        other = {SECOND: self.host.second} if self.host.second not in ("", self.endpoint) else {}
+        return {CONNECTION: self.endpoint} | other
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
@@ -45,12 +52,18 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
     if kit.key is not None:
         found.append(("swanctl/private/rosrv.key", kit.key, 0o600))
     values = {"name": host.name, "address": host.address, "appliance": host.appliance, "master": host.master}
-    values |= {"endpoint": kit.endpoint, "connection": CONNECTION, "child": CHILD}
+    values |= {
+        "endpoint": " or ".join(kit.remotes.values()),
+        "connections": " ".join(kit.remotes),
+        "child": CHILD,
+    }
+    values["ping"] = "iputils-ping" if len(kit.remotes) > 1 else ""
     renews = bool(host.rest_url and host.pin)
     values |= {"rest": host.rest_url if renews else "", "pin": host.pin if renews else ""}
     values |= {"ike": ", ".join(IKE_PROPOSALS), "esp": ", ".join(ESP_PROPOSALS)}
-    for script in _SCRIPTS:
-        found.append((script, filled(script, values), 0o644 if script == "README" else 0o755))
+    sources = _SCRIPTS | (_OF_TWO if len(kit.remotes) > 1 else {})
+    for script, source in sources.items():
+        found.append((script, filled(source, values), 0o644 if script == "README" else 0o755))
     return found
 
 
@@ -73,13 +86,24 @@ def archive(kit: Kit) -> bytes:
 
 
 def swanctl_conf(kit: Kit) -> str:
-    """Return the host's tunnel in swanctl's format."""
+    """Return the host's tunnel in swanctl's format, to each of two appliances if there are two."""
+    # charon opens the tunnel to a single appliance. With two, keep_either.sh opens the one that answers: if charon also
+    # did, both tunnels could be open at the same time.
+    alone = len(kit.remotes) == 1
+    start, dpd = ("start", "restart") if alone else ("none", "clear")
+    connections = "".join(_connection(kit, name, remote, start, dpd) for name, remote in kit.remotes.items())
     return f"""\
 # The tunnel of {kit.host.name} to the ROSRV appliance. Made by `rosrv host add`.
 connections {{
-  {CONNECTION} {{
+{connections}}}
+"""
+
+
+def _connection(kit: Kit, name: str, remote: str, start: str, dpd: str) -> str:
+    return f"""\
+  {name} {{
     version = 2
-    remote_addrs = {kit.endpoint}
+    remote_addrs = {remote}
     vips = 0.0.0.0
     proposals = {", ".join(IKE_PROPOSALS)}
     encap = yes
@@ -102,13 +126,12 @@ connections {{
         local_ts = dynamic
         remote_ts = {kit.host.appliance}/32
         esp_proposals = {", ".join(ESP_PROPOSALS)}
-        start_action = start
-        close_action = start
-        dpd_action = restart
+        start_action = {start}
+        close_action = {start}
+        dpd_action = {dpd}
       }}
     }}
   }}
-}}
 """
 
 

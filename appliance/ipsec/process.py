@@ -34,7 +34,7 @@ from appliance.ipsec.charon import PROGRAM, CharonError, ViciClient
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.refusals import Refusal, RefusalParser
-from appliance.ipsec.requests import make_key, signing_request
+from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.ipsec.strongswan import configuration
 
 KEY_FILE = "appliance.key"
@@ -101,7 +101,8 @@ class TunnelProcess:
             self._changed.set()
 
     def _ask(self) -> None:
-        self._tell(messages.CertificateNeeded(signing_request(self._key, messages.APPLIANCE_NAME)))
+        request = signing_request(self._key, messages.APPLIANCE_NAME)
+        self._tell(messages.CertificateNeeded(request, fingerprint(self._key)))
 
     def _tell(self, message: messages.Message) -> None:
         self._child.tell(message)

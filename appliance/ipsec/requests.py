@@ -1,5 +1,7 @@
 """Make a key and its signing request. No I/O."""
 
+import hashlib
+
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -7,6 +9,7 @@ from cryptography.hazmat.primitives.serialization import (
     Encoding,
     NoEncryption,
     PrivateFormat,
+    PublicFormat,
     load_pem_private_key,
 )
 from cryptography.x509.oid import NameOID
@@ -26,3 +29,9 @@ def signing_request(key: bytes, name: str) -> bytes:
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     request = x509.CertificateSigningRequestBuilder().subject_name(subject).sign(private, hashes.SHA384())
     return request.public_bytes(Encoding.PEM)
+
+
+def fingerprint(key: bytes) -> str:
+    """Return the SHA-256 (hexadecimal) of the public key that belongs to a private key (PEM)."""
+    public = load_pem_private_key(key, password=None).public_key()
+    return hashlib.sha256(public.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).hexdigest()

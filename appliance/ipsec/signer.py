@@ -36,6 +36,7 @@ from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
+from appliance.ipsec.sealed_authority import open_authority
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, newest_signing
 
 KEY_FILE = "audit.key"
@@ -98,9 +99,12 @@ class Signer:
         key: Ed25519PrivateKey,
         authority: CertificateAuthority,
         kept: RetentionLimits,
+        *,
+        trouble: str = "",
     ) -> None:
         self._child = Child(lifeline, messages.SignerLink, said=self._control_said)
         self._authority = authority
+        self._trouble = trouble
         clock = AgeClock(directory / "age", lambda: newest_signing(directory))
         self._signed = CheckpointMemory(directory, clock)
         self._removals = RemovalApprover(self._signed, kept, clock)
@@ -125,7 +129,7 @@ class Signer:
             case messages.RemovalWanted(number, checkpoint, newest):
                 return self._approve_removal(number, checkpoint, newest)
             case messages.AuthorityRequest(number):
-                return messages.AuthorityStated(number, self._authority.certificate)
+                return messages.AuthorityStated(number, self._authority.certificate, self._trouble)
             case messages.CertificateWanted():
                 return self._issue(message)
             case messages.RevocationsRequest(number, revoked):
@@ -182,8 +186,9 @@ def serve(
     try:
         os.umask(0o077)
         secret = read_passphrase(passphrase) if passphrase is not None else None
-        key, authority = load_or_create_key(directory), CertificateAuthority(directory, kind, secret)
+        key = load_or_create_key(directory)
+        authority, trouble = open_authority(directory, kind, secret)
     except (SignerKeyError, OSError) as error:
         lifeline.send(messages.Failed(f"the signer cannot use its key: {error}"))
         sys.exit(1)
-    asyncio.run(Signer(lifeline, directory, key, authority, kept).run())
+    asyncio.run(Signer(lifeline, directory, key, authority, kept, trouble=trouble).run())

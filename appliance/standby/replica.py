@@ -74,6 +74,12 @@ class Replica:
                 self._roll_back()
                 raise
 
+    def has_hosts(self) -> bool:
+        """Whether a host is enrolled that may open a tunnel. Raises `StoreError`."""
+        with self._lock, self._explained():
+            query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
+            return bool(self._connection.execute(query).fetchone()[0])
+
     def abandon_snapshot(self) -> None:
         """Return to the state before an incomplete snapshot."""
         with self._lock:

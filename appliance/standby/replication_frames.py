@@ -1,8 +1,8 @@
 """The messages between an active appliance and its standby, and the frames that carry them.
 
 A frame is a length (4 bytes) and one message as MessagePack. The standby sends `Stored`: first its position, then one
-for each message that it received. The active appliance sends `Changes` after that position, at least one a second, or a
-snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
+for each message that it received; between them, it sends an `Introduction` every hour. The active appliance sends
+`Changes` after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
 
+from appliance.channel.messages import Fingerprint
 from appliance.store.changes import Change, Put
 
 LARGEST_FRAME = 128 << 20  # more than a parameter tree, the largest value of the state
@@ -39,6 +40,19 @@ class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
 
 class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switchover"):
     """An operator of the standby wants it to take over."""
+
+
+class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introduction"):
+    """The standby asks for a certificate for its own tunnel key, with a signing request (PEM).
+
+    `key` is the fingerprint of the key, `endpoint` the address or name at which hosts reach the standby, and `pin` the
+    pin of its REST server (empty: REST is off). Hosts' files contain the last two.
+    """
+
+    request: Annotated[bytes, msgspec.Meta(max_length=16 << 10)]
+    key: Fingerprint
+    endpoint: Annotated[str, msgspec.Meta(pattern=r"^[0-9A-Za-z.:-]{1,253}\Z")]
+    pin: Annotated[str, msgspec.Meta(pattern=r"^(sha256//[A-Za-z0-9+/]{43}=)?\Z")]
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
@@ -86,7 +100,7 @@ class SnapshotEnd(msgspec.Struct, frozen=True, array_like=True, tag="end"):
 
 
 FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused
-FromStandby = Stored | Refused | SwitchoverWanted
+FromStandby = Stored | Introduction | Refused | SwitchoverWanted
 
 
 def reason_of(error: Exception) -> Refused:

@@ -7,6 +7,7 @@ from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import (
     Changes,
     FromActive,
+    Introduction,
     Refused,
     ReplicationError,
     ReplicationLink,
@@ -16,16 +17,27 @@ from appliance.standby.replication_frames import (
 )
 from appliance.store.writer_thread import StoreError
 
+_INTRODUCED_SECONDS = 3600.0
 _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 
 class ReplicationReceiver:
-    """The standby's end; `accepts` decides whether an appliance of this epoch may be the active one."""
+    """The standby's end; `accepts` decides whether an appliance of this epoch may be the active one.
 
-    def __init__(self, replica: Replica, accepts: Callable[[int], bool]) -> None:
+    `introduction()` returns this appliance's introduction, or None while it has none.
+    """
+
+    def __init__(
+        self,
+        replica: Replica,
+        accepts: Callable[[int], bool],
+        introduction: Callable[[], Introduction | None] = lambda: None,
+    ) -> None:
         self._replica = replica
         self._accepts = accepts
         self._link: ReplicationLink[FromActive] | None = None
+        self._introduction = introduction
+        self._introduced = 0.0  # when, by the clock of the event loop
 
     async def want_switchover(self) -> None:
         """Ask the active appliance to hand over. Raises `ReplicationError` if it is not connected."""
@@ -36,10 +48,12 @@ class ReplicationReceiver:
     async def follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Take changes until the link ends. Raises `ReplicationError`, and `StoreError` if the disk is full."""
         link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
+        self._introduced = -_INTRODUCED_SECONDS
         try:
             await link.send(self._replica.position)
             self._link = link
             while True:
+                await self._introduce(link)
                 message = await link.receive(_SILENCE_SECONDS)
                 if isinstance(message, Refused):
                     raise ReplicationError(f"the active appliance refuses: {message.reason}")
@@ -54,6 +68,12 @@ class ReplicationReceiver:
             self._link = None
             await link.close()
             await asyncio.to_thread(self._replica.abandon_snapshot)
+
+    async def _introduce(self, link: ReplicationLink[FromActive]) -> None:
+        now, introduction = asyncio.get_running_loop().time(), self._introduction()
+        if introduction is not None and now >= self._introduced + _INTRODUCED_SECONDS:
+            self._introduced = now
+            await link.send(introduction)
 
     def _require_accepted(self, message: FromActive) -> None:
         if isinstance(message, Changes | SnapshotBegin) and not self._accepts(message.epoch):

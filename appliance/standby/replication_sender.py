@@ -25,6 +25,7 @@ from appliance.standby.replication_frames import (
     LARGEST_FRAME,
     EncodedChanges,
     FromStandby,
+    Introduction,
     Refused,
     ReplicationError,
     ReplicationLink,
@@ -100,6 +101,7 @@ class ReplicationSender:
         self._link: asyncio.Task[None] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
         self.alone = False
+        self._introduced: Callable[[Introduction], None] = lambda _introduction: None
 
     async def acknowledged(self, number: int) -> None:
         """Wait until this appliance and the standby have all changes up to this number on their disks.
@@ -117,6 +119,10 @@ class ReplicationSender:
                 await waiter
             finally:
                 del self._waiting[waiter]
+
+    def on_introduction(self, introduced: Callable[[Introduction], None]) -> None:
+        """Call this for each introduction of the standby."""
+        self._introduced = introduced
 
     def answer_alone(self) -> None:
         """Answer without the standby until it has all changes: the witness has removed it from the in-sync set."""
@@ -220,6 +226,9 @@ class ReplicationSender:
                 raise ReplicationError(f"the standby refuses: {message.reason}")
             if isinstance(message, SwitchoverWanted):
                 self._switchover_wanted()
+                continue
+            if isinstance(message, Introduction):
+                self._introduced(message)
                 continue
             self._unanswered -= 1
             self._answered.set()

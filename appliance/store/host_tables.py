@@ -28,6 +28,13 @@ CREATE TABLE IF NOT EXISTS revocation (
 CREATE TABLE IF NOT EXISTS host_block (
     address TEXT PRIMARY KEY, since REAL NOT NULL, ends INTEGER, who TEXT NOT NULL, note TEXT NOT NULL
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS authority (
+    id INTEGER PRIMARY KEY CHECK (id = 1), certificate TEXT NOT NULL, revocations TEXT NOT NULL, signed REAL NOT NULL
+);
+CREATE TABLE IF NOT EXISTS appliance (
+    key TEXT PRIMARY KEY, endpoint TEXT NOT NULL, pin TEXT NOT NULL, certificate TEXT NOT NULL, serial TEXT NOT NULL,
+    expires REAL NOT NULL
+) WITHOUT ROWID;
 """
 _LONGEST_SECONDS = 398 * 86_400.0  # the longest life of a certificate that the authority makes
 
@@ -107,6 +114,31 @@ class HostBlockRow(NamedTuple):
     ends: int | None
     who: str
     note: str
+
+
+class AuthorityRow(NamedTuple):
+    """The certificate (PEM) of the hosts' authority, and its last list of revoked certificates (PEM).
+
+    `signed` is when the list was signed, in seconds since the epoch; 0 if there is no list yet.
+    """
+
+    certificate: str
+    revocations: str
+    signed: float
+
+
+class ApplianceRow(NamedTuple):
+    """One of two appliances: the fingerprint of its tunnel key, and the certificate (PEM) for it.
+
+    `endpoint` is the address at which hosts reach it, and `pin` the pin of its REST server.
+    """
+
+    key: str
+    endpoint: str
+    pin: str
+    certificate: str
+    serial: str
+    expires: float
 
 
 class HostTables:
@@ -189,3 +221,24 @@ class HostTables:
     def blocks(self) -> list[HostBlockRow]:
         """Return the blocked hosts, the earliest block first."""
         return [HostBlockRow(*row) for row in self._database.query("SELECT * FROM host_block ORDER BY since")]
+
+    def save_authority(self, row: AuthorityRow) -> None:
+        """Store the certificate and the list of the authority."""
+        self._database.put("authority", 1, *row)
+
+    def authority(self) -> AuthorityRow | None:
+        """Return the authority; None before the first start."""
+        rows = self._database.query("SELECT certificate, revocations, signed FROM authority")
+        return AuthorityRow(*rows[0]) if rows else None
+
+    def save_appliance(self, row: ApplianceRow) -> None:
+        """Store one of two appliances."""
+        self._database.put("appliance", *row)
+
+    def forget_appliance(self, key: str) -> None:
+        """Remove an appliance."""
+        self._database.delete("appliance", key=key)
+
+    def appliances(self) -> list[ApplianceRow]:
+        """Return both appliances; none if this is a single appliance."""
+        return [ApplianceRow(*row) for row in self._database.query("SELECT * FROM appliance")]

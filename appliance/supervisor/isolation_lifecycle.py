@@ -103,6 +103,9 @@ class NoIsolation:
             " use isolation netns or container"
         )
 
+    def clear_tunnels(self) -> None:
+        """Remove the IPsec states and policies that an ended charon left. Raises `NetworkError`, `LeftoversError`."""
+
     def route_to(self, host: str) -> str | None:  # noqa: ARG002  the same everywhere
         """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
         return None
@@ -234,6 +237,13 @@ class ContainerIsolation(NoIsolation):
                 interfaces.add_address(self._namespace, "lo", own)
             self._own = own
             return esp
+
+    def clear_tunnels(self) -> None:
+        """Remove what an ended charon left; its addresses stay closed to clear text."""
+        with self._standing():
+            if self._own is not None:
+                address = self._own.partition("/")[0]
+                self._namespace.run(lambda: clear_leftovers(address))
 
     def endpoint(self) -> PublicAddress:
         """Return the container's only address. Among several, it is unknown which address outside hosts reach."""

@@ -92,6 +92,15 @@ class IsolationWatchdog:
         log.info("addresses are taken through tunnels only", pool=pool, esp=esp)
         return messages.TunnelsEnclosed(esp)
 
+    async def clear_tunnels(self, passive: Callable[[], bool]) -> None:
+        """Remove what an ended charon left in the kernel, while this appliance is passive and runs no other charon."""
+        try:
+            async with self._one_at_a_time:
+                if passive():
+                    await in_thread(self.isolation.clear_tunnels)
+        except Exception as error:  # noqa: BLE001  see the invariant
+            log.error("tunnel state may remain", error=_words(error))
+
     async def route_to(self, host: str) -> str | None:
         """Return the machine's address by which `host` reaches the appliance; None: the address that `host` used."""
         try:

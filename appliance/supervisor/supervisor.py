@@ -563,7 +563,9 @@ class Supervisor:
             return
         if slot.pardoned:
             slot.pardoned = False
-            if not slot.role.on_demand:
+            if slot.role.name == "charon":
+                self._spawn(self._watchdog.clear_tunnels(lambda: not self._lease.active))
+            if not slot.role.on_demand or slot.wanted:
                 self.start(slot)
             return
         log.error(

@@ -23,7 +23,7 @@ KERNEL = "linux-image-cloud-amd64"
 GIGABYTES = 4  # the file is sparse
 # Packages that a booted machine needs besides those in packages.txt. It has no network, so it needs curl as well, which
 # a kit would install.
-_MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl")
+_MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl", "iputils-ping")
 _COMPILERS = ("gcc", "g++", "pkg-config")  # and every -dev package: nodes in the machine use rospy
 # parts of the environment that are large and only for other tests
 _NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")

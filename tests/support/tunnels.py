@@ -7,6 +7,7 @@ The kit's own `join.sh` needs a machine with systemd; here the same strongSwan i
 """
 
 import os
+import re
 import signal
 import subprocess
 from collections.abc import Sequence
@@ -22,9 +23,7 @@ from tests.support.requirements import need_program
 _CONFIGURATION = """\
 charon-systemd {{
   load = {plugins}
-  retransmit_tries = 2
-  retransmit_timeout = 1.0
-  retransmit_base = 1.2
+  {retransmission}
   plugins {{
     vici {{
       socket = unix://{directory}/vici.sock
@@ -41,6 +40,8 @@ charon-systemd {{
 }}
 """
 
+_QUICK = "retransmit_tries = 2\n  retransmit_timeout = 1.0\n  retransmit_base = 1.2"
+
 
 def need_strongswan() -> None:
     """Require charon and swanctl."""
@@ -51,10 +52,16 @@ def need_strongswan() -> None:
 class JoinedHost:
     """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
 
-    def __init__(self, host: Host, kit: Path, directory: Path, *, log: str = "") -> None:
-        """Unpack the kit into `directory`, which must be new; `log` is added to charon's log settings (`chd = 4`)."""
+    def __init__(
+        self, host: Host, kit: Path, directory: Path, *, log: str = "", retransmission: str = _QUICK
+    ) -> None:
+        """Unpack the kit into `directory`, which must be new; `log` is added to charon's log settings (`chd = 4`).
+
+        With an empty `retransmission`, charon has strongSwan's own settings.
+        """
         self.outer = host
         self.log = log
+        self.retransmission = retransmission
         self.directory = directory
         directory.mkdir()
         subprocess.run(["tar", "-xzf", str(kit), "-C", str(directory)], check=True)
@@ -73,7 +80,10 @@ class JoinedHost:
         """Start charon with the kit; it begins to ask for the tunnel."""
         conf = self.directory / "strongswan.conf"
         text = _CONFIGURATION.format(
-            plugins=plugins(choose_esp(self.outer.namespace)), directory=self.directory, log=self.log
+            plugins=plugins(choose_esp(self.outer.namespace)),
+            directory=self.directory,
+            log=self.log,
+            retransmission=self.retransmission,
         )
         conf.write_text(text)
         environment = {"STRONGSWAN_CONF": str(conf), "PATH": os.environ["PATH"]}
@@ -104,10 +114,22 @@ class JoinedHost:
             since=since,
         )
 
-    def wait_until_refused(self) -> None:
-        """Wait until the appliance has refused the tunnel."""
+    def events(self) -> int:
+        """Return the number of lines that charon has printed."""
         assert self.charon is not None
-        self.charon.wait_for(lambda event: "AUTHENTICATION_FAILED" in str(event.get("text")))
+        return len(self.charon.events)
+
+    def wait_until_refused(self, since: int = 0) -> None:
+        """Wait until the appliance has refused the tunnel: this host, or all hosts if none is enrolled."""
+        assert self.charon is not None
+        self.charon.wait_for(
+            lambda event: (
+                re.search("received (AUTHENTICATION_FAILED|NO_PROPOSAL_CHOSEN)", str(event.get("text")))
+                is not None
+            ),
+            since=since,
+            timeout=2 * LIMIT,
+        )
 
     def stop(self) -> None:
         """Stop charon, which closes the tunnel."""

@@ -11,7 +11,7 @@ READERS = {
         "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
         "control/policies.py", "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
-        "hosts/checked_ports.py", "hosts/host_table.py",
+        "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "relay/recorder_ring.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
@@ -19,7 +19,8 @@ READERS = {
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
-        "control/passive_rest.py", "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py",
+        "control/passive_rest.py", "control/token_orders.py", "hosts/appliance_table.py",
+        "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [

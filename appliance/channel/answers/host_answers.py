@@ -122,7 +122,8 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
 
     `rest_url` is the URL of REST in the tunnel, and `pin` the pin of its server's key. If either is empty, the host
     cannot renew its certificate through REST. `rest_trouble` says why other machines cannot reach REST, else it is
-    empty. `kept` contains the data that were stored with the one-time token.
+    empty. `kept` contains the data that were stored with the one-time token. `second` is the address of the other
+    appliance of two, else empty; `pin` then names the keys of both.
     """
 
     revision: int
@@ -138,6 +139,7 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
     expires: Moment
     certificate: str
     authority: str
+    second: str = ""
     kept: dict[str, str] = {}
 
 

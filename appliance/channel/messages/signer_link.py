@@ -64,10 +64,14 @@ class AuthorityRequest(Message):
 
 
 class AuthorityStated(Message):
-    """The signer returns the authority's certificate, in PEM."""
+    """The signer returns the certificate (PEM) of the authority whose key it has.
+
+    `trouble` says why it cannot use the sealed key of the other appliance's authority; empty if it can, or has none.
+    """
 
     number: int
     certificate: bytes
+    trouble: str = ""
 
 
 class CertificateWanted(Message):

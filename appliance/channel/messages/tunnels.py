@@ -1,12 +1,15 @@
 """Messages about tunnels: control -> supervisor over the lifeline, and control <-> the process that runs charon."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 
 from appliance.channel.messages.message import Message
 
 Esp = Literal["kernel", "user space"]
+Fingerprint = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{64}\Z")]
+"""SHA-256 of a public key (SubjectPublicKeyInfo in DER), in hexadecimal."""
+
 APPLIANCE_NAME = "rosrv-appliance"  # the name in the appliance's own certificate; no host may have this name
 
 
@@ -29,9 +32,13 @@ class TunnelsEnclosed(Message):
 
 
 class CertificateNeeded(Message):
-    """The charon process asks for a certificate for the appliance's own key, with a signing request (PEM)."""
+    """The charon process asks for a certificate for the appliance's own key, with a signing request (PEM).
+
+    `key` is the fingerprint of the key.
+    """
 
     request: bytes
+    key: Fingerprint
 
 
 class CharonStarted(Message):

@@ -13,7 +13,7 @@ cd "$(dirname "$0")"
 
 missing=""
 for package in charon-systemd strongswan-swanctl libcharon-extra-plugins libstrongswan-standard-plugins nftables \
-    iproute2 openssl curl; do
+    iproute2 @ping@ openssl curl; do
     dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q "ok installed" || missing="$missing $package"
 done
 if [ -n "$missing" ]; then
@@ -174,8 +174,17 @@ fi
 swanctl --load-all --noprompt >/dev/null || die "strongSwan did not take the tunnel: $why"
 
 say "waiting for the tunnel to @endpoint@"
-said=$(swanctl --initiate --child @child@ --ike @connection@ --timeout 20 2>&1) || true
-if ! swanctl --list-sas --ike @connection@ | grep -q INSTALLED; then
+up() {
+    for one in @connections@; do
+        if swanctl --list-sas --ike "$one" | grep -q INSTALLED; then return; fi
+    done
+    return 1
+}
+said=""
+for connection in @connections@; do
+    up || said="$said$(swanctl --initiate --child @child@ --ike "$connection" --timeout 20 2>&1)" || true
+done
+if ! up; then
     printf '%s\n' "$said" >&2
     die "no tunnel. $why says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
 fi

@@ -3,8 +3,8 @@
 # starting may do. Arguments are passed to swanctl.
 
 while :; do
-    if ! swanctl --list-sas --ike @connection@ "$@" 2>/dev/null | grep -q INSTALLED; then
-        swanctl --initiate --child @child@ --ike @connection@ --timeout 20 "$@" >/dev/null 2>&1
+    if ! swanctl --list-sas --ike @connections@ "$@" 2>/dev/null | grep -q INSTALLED; then
+        swanctl --initiate --child @child@ --ike @connections@ --timeout 20 "$@" >/dev/null 2>&1
     fi
     sleep 5
 done

@@ -8,6 +8,7 @@ import pytest
 from appliance.control.inheritance import inherited_state
 from appliance.control.lease_client import LeaseClient
 from appliance.control.replication import Pair
+from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.store.state_file import StateStore
 from tests.support.standby_site import memberships
 
@@ -24,7 +25,10 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 def members(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pair]]:
     """Yield both appliances, without an epoch."""
     made, _settings = memberships(tmp_path_factory.mktemp("members"))
-    yield {name: Pair(one, LeaseClient(), 0, None, taken_over=True) for name, one in made.items()}
+    yield {
+        name: Pair(one, LeaseClient(), 0, None, taken_over=True, tunnels=StandbyTunnels())
+        for name, one in made.items()
+    }
 
 
 class Pairs:

@@ -40,9 +40,7 @@ from appliance.channel.answers.host_answers import (
     Revoked,
 )
 from appliance.channel.channel import Channel
-from appliance.channel.link import Link
 from appliance.channel.messages import (
-    CertificateMade,
     CertificateNeeded,
     Message,
     TunnelLink,
@@ -51,7 +49,7 @@ from appliance.channel.messages import (
     TunnelsStated,
     TunnelsWanted,
 )
-from appliance.hosts.certificate_requests import Authority, AuthorityError
+from appliance.hosts.appliance_table import ApplianceTable
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import (
@@ -62,54 +60,31 @@ from appliance.hosts.host_table import (
 )
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.rest_address import RestAddress
+from appliance.hosts.shared_authority import SharedAuthority
 from appliance.hosts.tunnel_state import Tunnels
-from appliance.ipsec import certificate_authority as ipsec
-from appliance.ipsec.proof_of_possession import RequestRefusedError
-from appliance.ipsec.requests import make_key, signing_request
+from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address
+from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
+from tests.support.near_authority import NearAuthority
 
 pytestmark = pytest.mark.anyio
-
-
-class NearAuthority(Authority):
-    """The real authority, asked without a link."""
-
-    def __init__(self, directory: Path) -> None:
-        super().__init__(Link(lambda _message: None))
-        self._near = ipsec.CertificateAuthority(directory)
-        self.meanwhile: Callable[[], object] = lambda: None
-        self.lists = 0
-
-    async def certificate(self) -> bytes:
-        """Return the authority's certificate."""
-        return self._near.certificate
-
-    async def issue(
-        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
-    ) -> CertificateMade:
-        """Return a certificate, or the refusal as it comes over the link; `meanwhile` runs before."""
-        self.meanwhile()
-        await asyncio.sleep(0)
-        try:
-            issued = self._near.issue(request, name, days, proof=proof, former=former)
-        except RequestRefusedError as error:
-            raise AuthorityError(str(error), refused=True) from error
-        return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
-
-    async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
-        """Return the list; the signatures of it are counted."""
-        self.lists += 1
-        await asyncio.sleep(0)
-        return self._near.revocations(revoked)
 
 
 class Bench:
     """Hosts with a store and a log of their own, and a supervisor that answers `answer`."""
 
-    def __init__(self, directory: Path, *, listen: str = "0.0.0.0", pool: str = "10.113.11.0/29") -> None:
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        listen: str = "0.0.0.0",
+        pool: str = "10.113.11.0/29",
+        endpoint: str | None = None,
+    ) -> None:
+        """With `endpoint`, this is one of two appliances."""
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
         self.order: list[str] = []
@@ -119,13 +94,19 @@ class Bench:
         self.authority = NearAuthority(directory)
         self.trail = RecordingTrail(self.log)
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), DeclaredHosts(self.declared))
-        self.tunnels = Tunnels(self.table, self.trail, self.authority, listen=(listen, 11311), say=self._said)
+        authority = SharedAuthority(self.authority, self.store.hosts, shared=endpoint is not None)
+        self.shared = authority
+        self.appliances = appliances = ApplianceTable(self.store.hosts, self.table.revoked, endpoint)
+        self.tunnels = Tunnels(
+            self.table, self.trail, authority, appliances, listen=(listen, 11311), say=self._said
+        )
         self.certification = certification = Certification(
             self.store,
             self.trail,
-            self.authority,
+            authority,
             self.table,
             self.tunnels,
+            appliances=appliances,
             master_port=11311,
             rest=RestAddress(8443, "", 8443),
             changed=self._changed,
@@ -469,6 +450,55 @@ async def test_a_host_renews_itself(bench: Bench) -> None:
         await bench.renew_itself("a", request, key)
 
 
+def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
+    """On the second of two appliances, new certificates wait, and so does the replacement of one; hosts are revoked."""
+    keys, request = [make_key(), make_key()], request_of("b")
+
+    async def first(bench: Bench) -> None:
+        for name, key in zip("ab", keys, strict=True):
+            await bench.add(name, key=key)
+        await bench.renew_itself("a", request_of("a"), keys[0])
+        await bench.shared.revocations([])
+
+    async def second(bench: Bench) -> None:
+        await bench.tunnels.start()
+        elsewhere = NearAuthority(tmp_path / "elsewhere")
+        bench.authority.stated = elsewhere.stated  # type: ignore[method-assign]  # another key than that of the state
+        for order in (
+            bench.add("c"),
+            bench.renewed("a"),
+            bench.hosts.itself.renew(HostRenewItself("b", request, sign(keys[1], request), "10.113.11.3")),
+        ):
+            with pytest.raises(HostRefusedError, match="new certificates wait") as caught:
+                await order
+            assert caught.value.ours
+        assert bench.store.hosts.revoked() == []
+        await bench.revoke("b")
+        assert [row.name for row in bench.table.enrolled()] == ["a"]
+
+    (tmp_path / "elsewhere").mkdir()
+    run(tmp_path, first, endpoint="192.168.1.20")
+    run(tmp_path, second, endpoint="192.168.1.21")
+
+
+def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its address and pin come from the other one's introduction; until then a warning says what to do."""
+    monkeypatch.setattr("appliance.hosts.appliance_table._INTRODUCTION_SECONDS", 0.01)
+    pin, key = "sha256//" + 43 * "B" + "=", make_key()
+    other = Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), "192.168.1.21", pin)
+
+    async def work(bench: Bench) -> None:
+        await bench.add("a")
+        kit = await bench.certification.kit("a", None)
+        assert kit.second == ""
+        assert "later, rosrv host kit a" in (kit.warning or "")
+        await bench.appliances.introduce(other, bench.shared)
+        kit = await bench.certification.kit("a", None)
+        assert (kit.second, kit.pin, kit.warning) == ("192.168.1.21", f"sha256//pin;{pin}", None)
+
+    run(tmp_path, work, endpoint="192.168.1.20")
+
+
 def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
     """A host waits a twentieth of its certificate's life, also across restarts of control; a kit needs no wait."""
     keys = [make_key(), make_key(), make_key()]
@@ -728,7 +758,7 @@ async def test_only_configurations_of_this_control_count_as_taken(
     await bench.add("a")
     bench.tunnels.attach(link)
     running = asyncio.create_task(bench.tunnels.run(lambda: None))
-    charon.send(CertificateNeeded(signing_request(make_key(), "rosrv-appliance")))
+    charon.send(CertificateNeeded(signing_request(key := make_key(), "rosrv-appliance"), fingerprint(key)))
     number = await stated.get()
     charon.send(TunnelsReported(number + 3_600_000_000_000, []))
     assert not await bench.tunnels.until_taken()

@@ -83,7 +83,9 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
 def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str, status: int) -> None:
     """A tunnel that comes up prints none of its two dozen lines; a failed one prints all, and where to look."""
-    text = filled("join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2"))
+    text = filled(
+        "join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2", connections="rosrv rosrv-2")
+    )
     begin, end = text.index('say "waiting for'), text.index("\nfi\n", text.index("INSTALLED")) + 4
     functions = "".join(line for line in text.splitlines(True) if line.startswith(("die()", "say()")))
     swanctl = tmp_path / "swanctl"

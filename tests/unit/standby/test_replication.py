@@ -25,6 +25,8 @@ from appliance.standby.replica import Replica
 from appliance.standby.replication_frames import (
     Changes,
     FromActive,
+    FromStandby,
+    Introduction,
     Refused,
     ReplicationError,
     ReplicationLink,
@@ -46,6 +48,7 @@ from appliance.store.state_file import (
     RevisionRow,
     StateStore,
 )
+from appliance.store.writer_thread import Database
 from tests.support.replication import (
     SCHEMA,
     ActiveSide,
@@ -597,3 +600,78 @@ async def test_the_standby_tells_why_it_refuses(tmp_path: Path) -> None:
         await until(lambda: "the standby refuses: a change does not fit: the" in active.sender.lag().reason)
     await standby.close()
     await active.close()
+
+
+INTRODUCTION = Introduction(b"request", "0" * 64, "10.0.0.3", "")
+
+
+async def test_a_standby_introduces_itself_once_an_hour(tmp_path: Path) -> None:
+    """The introduction comes as soon as it exists, between acknowledgements, and then not with each message."""
+    replica, made = Replica(tmp_path / "standby.db", SCHEMA, failed=pytest.fail), list[Introduction]()
+    ends, others = await pair_of_streams()
+    link: ReplicationLink[FromStandby] = ReplicationLink(*others, FromStandby)
+    receiver = ReplicationReceiver(replica, lambda _epoch: True, lambda: made[-1] if made else None)
+    following = asyncio.create_task(receiver.follow(*ends))
+
+    async def answers() -> list[object]:
+        await link.send(Changes(1, "", 1, []))
+        return [await link.receive(10) for _ in range(1 + len(made))]
+
+    async with asyncio.timeout(SECONDS):
+        assert isinstance(await link.receive(10), Stored)
+        assert isinstance((await answers())[0], Stored)
+        made.append(INTRODUCTION)
+        assert (await answers())[1] == INTRODUCTION
+        await link.send(Changes(1, "", 1, []))
+        await link.send(Changes(1, "", 1, []))
+        assert [type(await link.receive(10)) for _ in range(2)] == [Stored, Stored]
+    await link.close()
+    with contextlib.suppress(ReplicationError):
+        await following
+    replica.close()
+
+
+async def test_an_introduction_is_not_an_acknowledgement(tmp_path: Path) -> None:
+    """The active appliance passes it on; before the position of the standby it ends the link."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    sender, heard = ReplicationSender(database, lambda: 1), list[Introduction]()
+    sender.on_introduction(heard.append)
+    ends, others = await pair_of_streams()
+    serving = asyncio.create_task(sender.serve(*ends))
+    link: ReplicationLink[FromActive] = ReplicationLink(*others, FromActive)
+    async with asyncio.timeout(SECONDS):
+        await link.send(Stored(0, "", 0))
+        for _ in range(3):
+            await link.send(INTRODUCTION)
+        while len(heard) < 3:
+            await asyncio.sleep(0)
+        assert not serving.done()
+        await link.close()
+        with pytest.raises(ReplicationError):
+            await serving
+        ends, others = await pair_of_streams()
+        link = ReplicationLink(*others, FromActive)
+        await link.send(INTRODUCTION)
+        with pytest.raises(ReplicationError, match="did not send its position first"):
+            await sender.serve(*ends)
+    await link.close()
+    sender.close()
+    await asyncio.to_thread(database.close)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"endpoint": "10.0.0.3\n  local { }"},
+        {"endpoint": ""},
+        {"pin": 'sha256//"; reboot; "'},
+        {"key": "0"},
+        {"request": 20_000 * b"x"},
+    ],
+    ids=["a line of swanctl.conf", "no address", "a shell command", "no fingerprint", "a long request"],
+)
+async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str | bytes]) -> None:
+    """Hosts run scripts with these values, so only the characters of addresses and pins are accepted."""
+    fields = msgspec.structs.asdict(INTRODUCTION) | bad
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.msgpack.decode(msgspec.msgpack.encode(Introduction(**fields)), type=Introduction)

@@ -1,0 +1,44 @@
+"""The hosts' certificate authority without a signer process, for tests of its users."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from appliance.channel.link import Link
+from appliance.channel.messages import AuthorityStated, CertificateMade
+from appliance.hosts.certificate_requests import Authority, AuthorityError
+from appliance.ipsec.certificate_authority import CertificateAuthority
+from appliance.ipsec.proof_of_possession import RequestRefusedError
+
+
+class NearAuthority(Authority):
+    """The real authority, asked without a link."""
+
+    def __init__(self, directory: Path) -> None:
+        super().__init__(Link(lambda _message: None))
+        self._near = CertificateAuthority(directory)
+        self.meanwhile: Callable[[], object] = lambda: None
+        self.lists = 0
+        self.trouble = ""
+
+    async def stated(self) -> AuthorityStated:
+        """Return the authority's certificate."""
+        return AuthorityStated(0, self._near.certificate, self.trouble)
+
+    async def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> CertificateMade:
+        """Return a certificate, or the refusal as it comes over the link; `meanwhile` runs before."""
+        self.meanwhile()
+        await asyncio.sleep(0)
+        try:
+            issued = self._near.issue(request, name, days, proof=proof, former=former)
+        except RequestRefusedError as error:
+            raise AuthorityError(str(error), refused=True) from error
+        return CertificateMade(0, issued.certificate, issued.serial, issued.expires)
+
+    async def revocations(self, revoked: list[tuple[str, float]]) -> bytes:
+        """Return the list; the signatures of it are counted."""
+        self.lists += 1
+        await asyncio.sleep(0)
+        return self._near.revocations(revoked)

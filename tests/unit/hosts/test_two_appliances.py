@@ -1,0 +1,181 @@
+"""Tests of hosts' certificates on one of two appliances: the authority's key may be on the other one."""
+
+import asyncio
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from appliance.hosts import appliance_table
+from appliance.hosts.appliance_table import ApplianceTable
+from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.hosts.shared_authority import SharedAuthority
+from appliance.ipsec.requests import fingerprint, make_key, signing_request
+from appliance.standby.replication_frames import Introduction
+from appliance.store.state_file import StateStore
+from tests.support.near_authority import NearAuthority
+
+pytestmark = pytest.mark.anyio
+
+FIRST, SECOND = "10.0.0.2", "10.0.0.3"
+PIN = "sha256//" + 43 * "A" + "="
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[StateStore]:
+    """Return the state that both appliances have, one after the other."""
+    opened = StateStore(tmp_path, failed=pytest.fail)
+    yield opened
+    opened.close()
+
+
+def near(tmp_path: Path, name: str) -> NearAuthority:
+    """Return the signer's own authority on an appliance."""
+    (tmp_path / name).mkdir(exist_ok=True)
+    return NearAuthority(tmp_path / name)
+
+
+def introduction(endpoint: str = SECOND, key: bytes | None = None) -> Introduction:
+    """Return the introduction of an appliance, by default with a new key."""
+    key = key or make_key()
+    return Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), endpoint, PIN)
+
+
+def table(store: StateStore, endpoint: str | None = FIRST) -> ApplianceTable:
+    """Return the table of an appliance that hosts reach at this address."""
+    return ApplianceTable(store.hosts, RevokedCertificates(store.hosts), endpoint)
+
+
+async def test_the_second_appliance_opens_tunnels_and_issues_nothing(
+    tmp_path: Path, store: StateStore
+) -> None:
+    """It states the first one's authority and last list, although its own signer has another authority."""
+    first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True)
+    certificate, listed = await first.certificate(), await first.revocations([("1f", 1.0)])
+    assert await first.obstacle() == first.waits == ""
+    second = SharedAuthority(near(tmp_path, "b"), store.hosts, shared=True)
+    assert await second.certificate() == certificate
+    assert await second.revocations([("1f", 1.0), ("2f", 2.0)]) == listed
+    with pytest.raises(AuthorityError, match=r"new certificates wait, .*\(rosrv standby promote\)") as caught:
+        await second.issue(signing_request(make_key(), "ocu-1"), "ocu-1", 1)
+    assert not caught.value.refused
+
+
+async def test_the_end_of_the_last_list_is_shown(tmp_path: Path, store: StateStore) -> None:
+    """Operators see until when tunnels open without the key: as long as charon accepts the list."""
+    listed = await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).revocations([])
+    end = x509.load_pem_x509_crl(listed).next_update_utc
+    assert end is not None
+    other = near(tmp_path, "b")
+    other.trouble = "ca.key cannot be decrypted"
+    second = SharedAuthority(other, store.hosts, shared=True)
+    await second.obstacle()
+    assert f"tunnels open until {end:%Y-%m-%d %H:%M}Z" in second.waits
+    assert "(ca.key cannot be decrypted)" in second.waits
+
+
+async def test_without_a_list_no_tunnel_opens(tmp_path: Path, store: StateStore) -> None:
+    """A list is never made up: without it a revoked certificate would be accepted."""
+    await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).certificate()
+    second = SharedAuthority(near(tmp_path, "b"), store.hosts, shared=True)
+    with pytest.raises(AuthorityError, match="no list of revoked certificates was signed yet"):
+        await second.revocations([])
+
+
+async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateStore) -> None:
+    """An authority that is left in the state, from a pair, does not matter any more."""
+    await SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True).revocations([])
+    own = near(tmp_path, "b")
+    alone = SharedAuthority(own, store.hosts, shared=False)
+    assert await alone.certificate() == (await own.stated()).certificate
+    assert await alone.obstacle() == ""
+
+
+async def test_the_standby_finds_its_certificate_in_the_state(tmp_path: Path, store: StateStore) -> None:
+    """The active appliance certifies the key of the introduction, once; kits get its address and pin."""
+    authority = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True)
+    first, given = table(store), introduction()
+    await first.introduce(given, authority)
+    certificate = first.certificate(given.key)
+    x509.load_pem_x509_certificate(certificate).verify_directly_issued_by(
+        x509.load_pem_x509_certificate(await authority.certificate())
+    )
+    await first.introduce(given, authority)
+    assert first.certificate(given.key) == certificate
+    assert first.other is not None
+    assert (first.other.endpoint, first.other.pin) == (SECOND, PIN)
+    second = table(store, SECOND)
+    assert second.certificate(given.key) == certificate
+    assert second.certificate("0" * 64) == b""
+    assert second.other is None
+
+
+async def test_a_certificate_is_renewed_long_before_its_end(
+    tmp_path: Path, store: StateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An introduction renews a certificate with less than sixty days left; an ended one is not used."""
+    authority, first, given = (
+        SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store), introduction(),
+    )  # fmt: skip
+    monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 59.0)
+    await first.introduce(given, authority)
+    before = first.certificate(given.key)
+    monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 90.0)
+    await first.introduce(given, authority)
+    assert first.certificate(given.key) not in (b"", before)
+    monkeypatch.setattr(time, "time", lambda: 4e9)
+    assert first.certificate(given.key) == b""
+
+
+async def test_a_replaced_appliance_is_revoked(
+    tmp_path: Path, store: StateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new key makes the earlier one worthless, but not several in an hour: each makes the list longer."""
+    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store)
+    stolen, replacement, further = introduction(), introduction(), introduction()
+    await first.introduce(stolen, authority)
+    await first.introduce(replacement, authority)
+    assert first.certificate(replacement.key) == b""
+    monkeypatch.setattr(appliance_table, "_REPLACED_SECONDS", 0.0)
+    await first.introduce(replacement, authority)
+    await first.introduce(further, authority)
+    assert first.certificate(stolen.key) == first.certificate(replacement.key) == b""
+    assert first.certificate(further.key)
+    assert len(store.hosts.revoked()) == 2
+    table(store, None)
+    assert store.hosts.appliances() == []
+    assert len(store.hosts.revoked()) == 3
+
+
+async def test_an_appliance_with_the_same_address_is_not_taken(tmp_path: Path, store: StateStore) -> None:
+    """Hosts could not choose between the two."""
+    authority, first = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True), table(store)
+    await first.introduce(introduction(FIRST), authority)
+    assert first.other is None
+    assert store.hosts.appliances() == []
+
+
+async def test_a_flood_of_introductions_is_one_at_a_time(tmp_path: Path, store: StateStore) -> None:
+    """While the authority works on one introduction, others cost nothing."""
+    signer, first = near(tmp_path, "a"), table(store)
+    authority, issued = SharedAuthority(signer, store.hosts, shared=True), []
+    signer.meanwhile = lambda: issued.append(1)
+    await asyncio.gather(*(first.introduce(introduction(), authority) for _ in range(20)))
+    assert len(issued) == 1
+
+
+async def test_each_appliance_knows_its_own_row(tmp_path: Path, store: StateStore) -> None:
+    """The pin of REST is stored with the own certificate; for the other appliance this is the second one."""
+    signer, key = near(tmp_path, "a"), make_key()
+    first = table(store)
+    made = await signer.issue(signing_request(key, "rosrv-appliance"), "rosrv-appliance", 90)
+    first.certified(fingerprint(key), made)
+    first.is_served(PIN)
+    assert first.other is None
+    second = table(store, SECOND)
+    second.note_own("0" * 64)
+    assert second.other is not None
+    assert (second.other.endpoint, second.other.pin) == (FIRST, PIN)

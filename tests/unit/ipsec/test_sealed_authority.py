@@ -1,0 +1,77 @@
+"""Tests of an authority's key on the second appliance: only encrypted, and only used with the passphrase."""
+
+from pathlib import Path
+
+import pytest
+
+from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
+from appliance.ipsec.sealed_authority import (
+    FOLDER,
+    SealedAuthority,
+    keep_sealed,
+    open_authority,
+    sealed_authority,
+)
+
+SECRET = b"correct horse"
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """Return the signers' directories of both appliances; the second one does not exist yet."""
+    (tmp_path / "a").mkdir()
+    return tmp_path / "a", tmp_path / "b"
+
+
+def joined(folders: tuple[Path, Path]) -> CertificateAuthority:
+    """Bring the first appliance's sealed authority to the second one; return the authority."""
+    made = CertificateAuthority(folders[0], passphrase=SECRET)
+    sealed = sealed_authority(folders[0])
+    assert sealed is not None
+    keep_sealed(folders[1], sealed, None)
+    return made
+
+
+def test_a_clear_key_never_leaves(folders: tuple[Path, Path]) -> None:
+    """Without a passphrase there is nothing to bring, and a file that has a clear key is not taken."""
+    CertificateAuthority(folders[0])
+    assert sealed_authority(folders[0]) is None
+    clear = SealedAuthority("", (folders[0] / KEY_FILE).read_text())
+    with pytest.raises(ValueError, match=r"not encrypted: set ipsec\.ca_passphrase_file"):
+        keep_sealed(folders[1], clear, None)
+    assert not folders[1].exists()
+
+
+def test_the_passphrase_opens_it(folders: tuple[Path, Path]) -> None:
+    """The second appliance then has the same authority, now and after the next start."""
+    made = joined(folders)
+    assert (folders[1] / FOLDER / KEY_FILE).stat().st_mode & 0o777 == 0o600
+    for _start in range(2):
+        found, trouble = open_authority(folders[1], "ecdsa", SECRET)
+        assert (found.certificate, trouble) == (made.certificate, "")
+
+
+@pytest.mark.parametrize(
+    ("secret", "reason"),
+    [(None, "name the file that has its passphrase"), (b"battery", "the passphrase is wrong")],
+)
+def test_without_the_passphrase_it_waits(
+    folders: tuple[Path, Path], secret: bytes | None, reason: str
+) -> None:
+    """The appliance starts with its own authority and gives the reason; the sealed key is unchanged."""
+    made = joined(folders)
+    before = (folders[1] / FOLDER / KEY_FILE).read_bytes()
+    found, trouble = open_authority(folders[1], "ecdsa", secret)
+    assert found.certificate != made.certificate
+    assert reason in trouble
+    assert (folders[1] / FOLDER / KEY_FILE).read_bytes() == before
+
+
+def test_a_clear_key_in_its_place_is_not_used(folders: tuple[Path, Path]) -> None:
+    """Such a file was not written by `rosrv standby join`."""
+    made = joined(folders)
+    CertificateAuthority(folders[1])
+    (folders[1] / FOLDER / KEY_FILE).write_bytes((folders[1] / KEY_FILE).read_bytes())
+    found, trouble = open_authority(folders[1], "ecdsa", SECRET)
+    assert found.certificate != made.certificate
+    assert "the key is not encrypted, so it is not used" in trouble
