@@ -25,6 +25,7 @@ from examples.landshark.drive import TYPES, VELOCITY, Part, Simulation
 from examples.landshark.messages import DEFINITIONS, Messages, long_name
 from rosmop.check.sources import compiled_from
 from rosmop.learn.learner import LearningResult, learn
+from rosmop.learn.passes import run_here
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -319,7 +320,7 @@ def judge(count: int, faults: int, seed: int) -> Judged:
     """Drive, learn, and judge the result by other drives and by faults."""
     drives = [drive(number, seed) for number in range(count)]
     half = count // 2
-    learnt = learn(drives[:half], KNOWN, 0.3, lambda _: None)
+    learnt = learn(drives[:half], KNOWN, 0.3, run_here(drives[:half], KNOWN))
     tests = drives[half:]
     quiet = {each.name: alarms(learnt, each.rows) for each in tests}
     chance = random.Random(seed)

@@ -11,9 +11,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosmop.learn import extremes
-from rosmop.learn.recordings import Windows
 from rosmop.learn.rv_text import identifier, literal, number, rounded_down, rounded_up, short_names
-from rosmop.learn.series import HighestValues, Series, ValueSeries
+from rosmop.learn.series import HighestValues, Series, Statistic, ValueSeries
 from rosmop.learn.topic_orders import TopicOrders, TopicPair
 from rosmop.learn.topics import TopicContent, TopicRhythm
 
@@ -88,10 +87,15 @@ class LearntFacts:
     """The observations of all topics."""
 
     types: Mapping[str, str]
+    fields: Mapping[str, Mapping[str, str]]
+    """By topic: the types of the fields that are read, in the order of the definition."""
     rhythms: Mapping[str, TopicRhythm]
     contents: Mapping[str, TopicContent]
     orders: TopicOrders
-    windows: Windows
+    seconds: float
+    """The length of the recordings."""
+    windows: int
+    """The number of windows that they are divided into."""
     trimmed: Counter[str] = field(default_factory=Counter)
     """By topic: the number of conditions that `candidates` left out because there were more than `MOST`."""
 
@@ -104,14 +108,15 @@ class LearntFacts:
 
     def candidates(self) -> Iterator[Candidate]:
         """Yield all candidates, topic by topic."""
-        bounds = sum(3 * len(content.types) for content in self.contents.values()) + len(self.orders.pairs)
-        proposer = _Proposer(self, QUIET_HOURS * 3600 / self.windows.mean * max(bounds, 1))
+        bounds = sum(3 * len(self.fields[topic]) for topic in self.contents) + len(self.orders.pairs)
+        mean = max(self.seconds / self.windows, 1e-3)
+        proposer = _Proposer(self, QUIET_HOURS * 3600 / mean * max(bounds, 1))
         self.trimmed.clear()
         for topic in sorted(self.contents):
             found: Counter[str] = Counter()
             for candidate in proposer.of_topic(topic):
                 found[candidate.kind] += 1
-                if found[candidate.kind] <= MOST.get(candidate.kind, len(self.contents[topic].types)):
+                if found[candidate.kind] <= MOST.get(candidate.kind, len(self.fields[topic])):
                     yield candidate
                 else:
                     self.trimmed[topic] += 1
@@ -137,7 +142,7 @@ class _Proposer:
         if rhythm.count < _FEWEST_SET:
             return
         yield from self._stamps(topic, content, support)
-        for path, lengths in content.lengths.items():
+        for path, lengths in self._by_field(topic, content.lengths):
             if len(lengths.windows) == 1:
                 (length,) = lengths.windows
                 yield Candidate(
@@ -147,11 +152,15 @@ class _Proposer:
         yield from self._sets(topic, content, support)
         if rhythm.count < _FEWEST:
             return
-        for place in sorted(self._numbers(content), key=lambda found: -found[3].changed):
+        for place in sorted(self._numbers(topic, content), key=lambda found: -found[3].changed):
             yield from self._number(topic, content, rhythm, place)
 
+    def _by_field(self, topic: str, rows: Mapping[str, Statistic]) -> Iterator[tuple[str, Statistic]]:
+        """Yield the rows of a topic's fields, in the order of the definition."""
+        return ((path, rows[path]) for path in self._known.fields[topic] if path in rows)
+
     def _support(self, rhythm: TopicRhythm) -> CandidateSupport:
-        return CandidateSupport(rhythm.count, round(self._known.windows.seconds, 1), len(rhythm.recordings))
+        return CandidateSupport(rhythm.count, round(self._known.seconds, 1), len(rhythm.recordings))
 
     def _upper(self, highs: HighestValues, *, stops: bool = False) -> float | None:
         return extremes.upper(highs.of.values(), self._windows, stops=stops)
@@ -203,8 +212,9 @@ class _Proposer:
             )  # fmt: skip
 
     def _sets(self, topic: str, content: TopicContent, support: CandidateSupport) -> Iterator[Candidate]:
-        for path, values in content.sets.items():
-            if content.types[path] != "string[]":
+        types = self._known.fields[topic]
+        for path, values in self._by_field(topic, content.sets):
+            if types[path] != "string[]":
                 yield from self._set(topic, content, path, values, support)
             elif len(values.windows) == 1 and values.closed:
                 (texts,) = values.windows
@@ -216,22 +226,24 @@ class _Proposer:
                         condition=unlike, length=len(texts),
                     )  # fmt: skip
         integers = {
-            path: series for path, series in content.numbers.items() if not content.types[path].startswith("float")
+            path: series
+            for path, series in self._by_field(topic, content.numbers)
+            if not types[path].startswith("float")
         }  # fmt: skip
         for path, series in integers.items():
-            if not content.types[path].endswith("]"):
+            if not types[path].endswith("]"):
                 yield from self._set(topic, content, path, series.values, support)
 
     def _set(
         self, topic: str, content: TopicContent, path: str, values: ValueSeries, support: CandidateSupport
     ) -> Iterator[Candidate]:
-        texts = [literal(value) for value in values.windows]
+        texts = [literal(value) for value in values.ordered]
         if not values.closed or None in texts:
             return
-        if content.types[path] == "bool" and len(texts) == 2:  # `bool` has no other values
+        if self._known.fields[topic][path] == "bool" and len(texts) == 2:  # `bool` has no other values
             yield from self._moves(topic, content, path, values, support)
             return
-        shown = "{v}.c_str()" if content.types[path] == "string" else "(long) {v}"
+        shown = "{v}.c_str()" if self._known.fields[topic][path] == "string" else "(long) {v}"
         yield Candidate(
             topic, "constant" if len(texts) == 1 else "values", path, f"{path} has a new value",
             f"always {texts[0]}" if len(texts) == 1 else f"one of {', '.join(map(str, texts))}", support,
@@ -244,12 +256,12 @@ class _Proposer:
     ) -> Iterator[Candidate]:
         """Yield the automaton of a field's values, if some value never followed another and changes are frequent."""
         moves = content.moves.get(path, {})
-        ordered = list(values.windows)
+        ordered = values.ordered
         count = len(ordered)
         if (
             count < 3
             or len(moves) >= count * (count - 1)
-            or min((row[0] for row in moves.values()), default=0) < 3
+            or min(moves.values(), default=0) < 3
         ):
             return
         names = {value: f"value{place}" for place, value in enumerate(ordered)}
@@ -259,21 +271,21 @@ class _Proposer:
             for value in ordered
         )
         begin = ", ".join(go.values())
-        listed = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in moves)
+        listed = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in sorted(moves, key=lambda move: (ordered.index(move[0]), ordered.index(move[1]))))
         yield Candidate(
             topic, "moves", path, f"{path} makes a move that was never seen", listed, support,
             formula=f"fsm: start [ {begin} ] {states}",
             events={names[value]: (topic, f"{path}:{literal(value)}") for value in ordered},
         )  # fmt: skip
 
-    def _numbers(self, content: TopicContent) -> Iterator[_Place]:
-        for path, series in content.numbers.items():
+    def _numbers(self, topic: str, content: TopicContent) -> Iterator[_Place]:
+        for path, series in self._by_field(topic, content.numbers):
             row = content.elements.get(path)
             if row:
                 yield from ((path, place, len(row), element) for place, element in enumerate(row))
             elif (
-                content.types[path].endswith("]")
-                or content.types[path].startswith("float")
+                self._known.fields[topic][path].endswith("]")
+                or self._known.fields[topic][path].startswith("float")
                 or series.values.many
             ):
                 yield path, None, None, series
@@ -283,8 +295,8 @@ class _Proposer:
     ) -> Iterator[Candidate]:
         path, element, length, series = place_of
         support = self._support(rhythm)
-        integer = not content.types[path].startswith("float")
-        folded = content.types[path].endswith("]") and element is None
+        integer = not self._known.fields[topic][path].startswith("float")
+        folded = self._known.fields[topic][path].endswith("]") and element is None
         place = path if element is None else f"{path}[{element}]"
         shown = "(long) {v}" if integer else "{v}"
         base = Candidate(
@@ -308,7 +320,7 @@ class _Proposer:
         if not all(math.isfinite(2 * one) for one in (top, bottom, width)):
             return  # a bound would be beyond the largest number
         if integer:
-            least, most = _WHOLE_NUMBERS[content.types[path].startswith("u")]
+            least, most = _WHOLE_NUMBERS[self._known.fields[topic][path].startswith("u")]
             above, below = number(min(math.ceil(top), most)), number(max(-math.ceil(bottom), least))
         else:
             above, below = rounded_up(top, width), rounded_down(-bottom, width)
@@ -371,7 +383,7 @@ class _Proposer:
         self, a: str, b: str, pair: TopicPair, orders: TopicOrders
     ) -> Iterator[tuple[float, Candidate]]:
         rhythms = self._known.rhythms
-        seconds = max(self._known.windows.seconds, 1e-3)
+        seconds = max(self._known.seconds, 1e-3)
         back = self._upper(pair.back)
         if pair.requires and back is not None:
             rate, count = rhythms[a].count / seconds, rhythms[b].count

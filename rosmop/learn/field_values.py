@@ -1,6 +1,7 @@
 """Read the values of a message's fields by path, as far as they are useful for learning.
 
-Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. Only the length
+Numbers, strings and times are scalars, arrays of numbers are tuples, and arrays of strings are lists. A string that is
+not UTF-8 is bytes. Only the length
 of an array of messages is read. Bytes (images, points, maps) are left out, because single bytes mean nothing.
 The `seq` of headers is left out, because every publisher increments it automatically.
 """
@@ -138,11 +139,15 @@ def _array(part: ArrayPart) -> _Part:
     return read
 
 
-def _string(data: bytes, position: int) -> tuple[int, str]:
+def _string(data: bytes, position: int) -> tuple[int, str | bytes]:
     (length,) = _LENGTH.unpack_from(data, position)
     start = position + 4
     end = _within(data, start + length)
-    return end, data[start:end].decode("utf-8", "surrogateescape")
+    text = data[start:end]
+    try:
+        return end, text.decode("utf-8")
+    except UnicodeDecodeError:
+        return end, text
 
 
 def _within(data: bytes, position: int) -> int:

@@ -1,35 +1,43 @@
-"""Learn in two passes over the training recordings, and one over the held-out part.
+"""Learn in two passes over all recordings, and one over the held-out part.
 
-1. The first pass reads only times: the rhythm of each topic, and its order relative to other topics.
-2. The second pass reads the fields of each message. Then the candidates are written as specifications.
+1. The first pass reads only times: the rhythm of each topic.
+2. The second pass reads the fields of each message, and the order of topics. Then the candidates of the training
+   recordings are written as specifications.
 3. The specifications run on the held-out recordings. A bound that was exceeded there is learnt again from all
    recordings, and so stays untested. Any other candidate with an alarm is left out.
 
-Messages are never stored, so the memory depends only on the number of topics and fields.
+`passes` executes a pass on one recording. Messages are never stored, so the memory depends only on the number of topics
+and fields.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from rosmop.check.sources import compiled_from
 from rosmop.learn.candidates import Candidate, LearntFacts
-from rosmop.learn.field_values import Fields, MessageError
-from rosmop.learn.recordings import Received, RecordingPart, RecordingSource, Windows, split
+from rosmop.learn.field_values import Fields
+from rosmop.learn.passes import (
+    AlarmFacts,
+    AlarmStep,
+    AnyStep,
+    ContentFacts,
+    ContentStep,
+    Facts,
+    Run,
+    TimeFacts,
+    TimeStep,
+)
+from rosmop.learn.recordings import LearningError, RecordingFacts, RecordingSpan, split
 from rosmop.learn.rv_writer import on, specifications
 from rosmop.learn.topic_orders import TopicOrders
-from rosmop.learn.topics import TopicContent, TopicRhythm
-from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import Outcome
+from rosmop.learn.topics import MOST_GAPS, TopicContent, TopicRhythm
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 
 _WIDENS = frozenset({"range", "rate", "unchanged", "often", "late", "age", "requires", "causes"})
-Progress = Callable[[int], None]
-
-
-class LearningError(Exception):
-    """Nothing can be learnt from these recordings; the text names them and the reason."""
+_WINDOWS = 24  # the minimum number for all recordings together
 
 
 @dataclass(frozen=True)
@@ -46,57 +54,47 @@ class LearningResult:
     """The specification of each candidate, by its key."""
     types: Mapping[str, str]
     """The message types of the topics."""
-    trained: tuple[RecordingPart, ...]
-    held_out: tuple[RecordingPart, ...]
+    trained: tuple[RecordingSpan, ...]
+    held_out: tuple[RecordingSpan, ...]
     skipped: tuple[str, ...]
     """Topics whose type cannot be read, with the reason."""
+    failed: Mapping[int, str]
+    """By number: the reasons why recordings were not, or only partly, learnt from."""
 
 
 def learn(
-    recordings: Sequence[RecordingSource], definitions: Definitions, held_out: float, progress: Progress
+    recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Learn from recordings, but hold out the fraction `held_out`. `progress` gets the number of messages so far.
-
-    Raises `LearningError`.
-    """
-    return _Learner(recordings, definitions, held_out, progress).learnt()
+    """Learn from recordings, but hold out the fraction `held_out`. `run` executes the passes. Raises `LearningError`."""
+    return _Learner(recordings, definitions, held_out, run).learnt()
 
 
 class _Learner:
     def __init__(
-        self,
-        recordings: Sequence[RecordingSource],
-        definitions: Definitions,
-        held_out: float,
-        progress: Progress,
+        self, recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
     ) -> None:
         self._definitions = definitions
-        self._progress, self._seen = progress, 0
+        self._run = run
         self._trained, self._held_out = split(recordings, held_out)
+        self._each = math.ceil(_WINDOWS / max(len(self._trained), 1))
         self._types = _types_of(recordings)
-        self._fields: dict[str, Fields] = {}
+        self._fields: dict[str, Mapping[str, str]] = {}
         self._skipped: list[str] = []
-        self._beats = Windows(len(self._trained))
+        self._failed: dict[int, str] = {}
         for topic, kind in sorted(self._types.items()):
             try:
-                self._fields[topic] = Fields(definitions.layout(kind))
+                self._fields[topic] = Fields(definitions.layout(kind)).types
             except DefinitionError as error:
                 self._skipped.append(f"{topic} ({kind}): {error}")
 
     def learnt(self) -> LearningResult:
-        rhythms = {topic: TopicRhythm() for topic in self._fields}
-        self._times(self._trained, rhythms)
-        if not any(rhythm.count for rhythm in rhythms.values()):
-            raise LearningError("the recordings to learn from have no message on any of these topics")
-        known = self._contents(rhythms)
-        candidates = list(known.candidates())
-        rows = list(specifications(candidates, known))
-        alarms = self._alarms(rows)
-        self._continue(known)
-        wider = {candidate.key: candidate for candidate in known.candidates()}
+        tested, whole = self._facts()
+        candidates = list(tested.candidates())
+        alarms = self._alarms(candidates, tested) if candidates else AlarmFacts()
+        wider = {candidate.key: candidate for candidate in whole.candidates()}
         kept, left_out = [], []
-        for candidate in candidates:
-            count = alarms[candidate.key]
+        for number, candidate in enumerate(candidates):
+            count = alarms.alarms.get(number, 0)
             again = wider.get(candidate.key)
             if not count:
                 kept.append(candidate)
@@ -109,9 +107,9 @@ class _Learner:
             raise LearningError(
                 "no condition holds often enough in these recordings to propose it: record for longer"
             )
-        rows = list(specifications(kept, known))
+        rows = list(specifications(kept, whole))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
-        text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
+        text = "\n".join([self._head(whole, kept, left_out), *(row[1] for row in rows)])
         compiled_from({"learnt.rv": text}, self._definitions)
         return LearningResult(
             text,
@@ -122,74 +120,86 @@ class _Learner:
             tuple(self._trained),
             tuple(self._held_out),
             tuple(self._skipped),
+            self._failed,
         )
 
-    def _times(self, parts: Sequence[RecordingPart], rhythms: Mapping[str, TopicRhythm]) -> None:
-        for part in parts:
-            self._beats.enter(part)
-            for rhythm in rhythms.values():
-                rhythm.begin()
-            for topic, time, _ in self._messages(part):
-                rhythms[topic].add(time, self._beats.at(time), part.name)
+    def _facts(self) -> tuple[LearntFacts, LearntFacts]:
+        """Return the facts of the training recordings, and those of all recordings."""
+        times = [
+            TimeStep(*self._span(place), gaps=math.ceil(MOST_GAPS / len(self._trained)))
+            for place in range(len(self._parts))
+        ]
+        trained, every = self._pass(times, TimeFacts())
+        rhythms = dict(sorted(trained.rhythms.items()))
+        if not rhythms:
+            raise LearningError("the recordings to learn from have no message on any of these topics")
+        orders = TopicOrders({topic: rhythm.count for topic, rhythm in rhythms.items()})
+        periods = {topic: (rhythm.period, rhythm.interval) for topic, rhythm in rhythms.items()}
+        # A topic that is only in the held-out recordings has no rhythm.
+        contents = [
+            ContentStep(*self._span(place, rhythms), rhythms=periods, ordered=list(orders.names))
+            for place in range(len(self._parts))
+        ]
+        content, contents_of_all = self._pass(contents, ContentFacts())
+        return (
+            self._known(trained, content, orders, len(self._trained)),
+            self._known(every, contents_of_all, orders, len(self._parts)),
+        )
 
-    def _contents(self, rhythms: dict[str, TopicRhythm]) -> LearntFacts:
-        contents = {
-            topic: TopicContent(fields, rhythms[topic])
-            for topic, fields in self._fields.items()
-            if rhythms[topic].count
+    def _known(
+        self, times: TimeFacts, contents: ContentFacts, orders: TopicOrders, parts: int
+    ) -> LearntFacts:
+        own = TopicOrders({})
+        own.names, own.left_out, own.pairs = orders.names, orders.left_out, dict(orders.pairs)
+        own.add_recordings(contents.pairs)
+        rows: dict[str, TopicContent] = {
+            topic: contents.contents[topic] for topic in self._fields if topic in contents.contents
         }
-        orders = TopicOrders({topic: rhythms[topic].count for topic in contents})
-        known = LearntFacts(self._types, rhythms, contents, orders, Windows(len(self._trained)))
-        for part in self._trained:
-            self._observe(known, part)
-        return known
+        rhythms: dict[str, TopicRhythm] = times.rhythms
+        seconds = sum(part.seconds for part in self._parts[:parts] if part.number not in self._failed)
+        return LearntFacts(self._types, self._fields, rhythms, rows, own, seconds, parts * self._each)
 
-    def _continue(self, known: LearntFacts) -> None:
-        """Also learn from the held-out recordings, after the test."""
-        self._times(self._held_out, known.rhythms)
-        for part in self._held_out:
-            self._observe(known, part)
+    @property
+    def _parts(self) -> list[RecordingSpan]:
+        return [*self._trained, *self._held_out]
 
-    def _observe(self, known: LearntFacts, part: RecordingPart) -> None:
-        known.windows.enter(part)
-        known.orders.begin()
-        for content in known.contents.values():
-            content.begin()
-        for topic, time, data in self._messages(part):
-            if topic not in known.contents:  # the topic is only in the held-out recordings
-                continue
-            window = known.windows.at(time)
-            try:
-                known.contents[topic].add(data, time, window)
-            except MessageError as error:
-                kind = self._types[topic]
-                raise LearningError(
-                    f"{part.name}: a message on {topic} is not of type {kind}: {error}"
-                ) from error
-            known.orders.add(topic, time, window)
+    def _span(
+        self, place: int, topics: Mapping[str, object] | None = None
+    ) -> tuple[int, int, int, int, int, dict[str, str]]:
+        """Return the fields of a step for a part, with these topics or all."""
+        part = self._parts[place]
+        chosen = {topic: self._types[topic] for topic in self._fields if topics is None or topic in topics}
+        return part.number, part.began, part.ended, place * self._each, self._each, chosen
 
-    def _messages(self, part: RecordingPart) -> Iterator[Received]:
-        for topic, time, data in part.messages():
-            self._seen += 1
-            self._progress(self._seen)
-            if topic in self._fields:
-                yield topic, time, data
+    def _pass(self, steps: Sequence[AnyStep], nothing: Facts) -> tuple[Any, Any]:
+        """Return the merged facts of the training recordings, and of all. Raises `LearningError` if all failed."""
+        trained, held_out = nothing, nothing
+        waiting = [step for step in steps if step.recording not in self._failed]
+        for place, facts in self._run(waiting):
+            step = waiting[place]
+            if isinstance(facts, LearningError):
+                self._failed[step.recording] = str(facts)
+            elif step.first_window < len(self._trained) * self._each:
+                trained = trained.merged(facts)
+            else:
+                held_out = held_out.merged(facts)
+        if self._failed.keys() >= {part.number for part in self._trained}:
+            raise LearningError(next(iter(self._failed.values())))
+        return trained, trained.merged(held_out)
 
-    def _alarms(
-        self, rows: Sequence[tuple[str, str, list[Candidate]]]
-    ) -> Counter[tuple[str, str, str, int | None]]:
-        """Return how often each candidate warned on the held-out recordings."""
-        found: Counter[tuple[str, str, str, int | None]] = Counter()
-        groups = {name: group for name, _, group in rows}
+    def _alarms(self, candidates: Sequence[Candidate], known: LearntFacts) -> AlarmFacts:
+        """Return the number of warnings of each candidate, by its place, on the held-out recordings."""
+        rows = list(specifications(candidates, known))
+        numbers = {candidate.key: number for number, candidate in enumerate(candidates)}
+        says = {
+            name: [(numbers[candidate.key], f"{candidate.topic} {candidate.says}") for candidate in group]
+            for name, _, group in rows
+        }
         text = "\n".join(row[1] for row in rows)
-        for part in self._held_out if rows else ():
-            monitors = MonitorSet.of(compiled_from({"learnt.rv": text}, self._definitions))
-            monitors.start(part.began, frozenset(part.topics))
-            for topic, time, data in self._messages(part):
-                outcome = monitors.process(topic, data, time)
-                for each in (*outcome.before, outcome):
-                    found.update(_warned(each, groups))
-        return found
+        held_out = range(len(self._trained), len(self._parts))
+        steps = [AlarmStep(*self._span(place), text=text, says=says) for place in held_out]
+        alarms: AlarmFacts = self._pass(steps, AlarmFacts())[1]
+        return alarms
 
     def _head(self, known: LearntFacts, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
         seconds = sum(part.seconds for part in self._trained)
@@ -213,6 +223,7 @@ class _Learner:
             f"{on(candidate.support)}"
             for candidate in left_out
         ]
+        lines += [f"Not, or only partly, learnt from: {text}" for _, text in sorted(self._failed.items())]
         lines += [f"Not looked at: {text}" for text in self._skipped]
         lines += [
             f"{count} conditions more on {topic} are not here: they are many"
@@ -223,13 +234,13 @@ class _Learner:
         return "".join(f"// {' '.join(line.split())}\n" for line in lines)
 
 
-def _names(parts: Sequence[RecordingPart]) -> str:
+def _names(parts: Sequence[RecordingSpan]) -> str:
     most = 6
     names = [part.name for part in parts]
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _types_of(recordings: Sequence[RecordingSource]) -> dict[str, str]:
+def _types_of(recordings: Sequence[RecordingFacts]) -> dict[str, str]:
     types: dict[str, str] = {}
     for recording in recordings:
         for topic, kind in recording.topics.items():
@@ -240,15 +251,3 @@ def _types_of(recordings: Sequence[RecordingSource]) -> dict[str, str]:
                 )
     return types
 
-
-def _warned(outcome: Outcome, groups: dict[str, list[Candidate]]) -> list[tuple[str, str, str, int | None]]:
-    found = []
-    for line in outcome.log:
-        if line.level != "WARN":
-            continue
-        for candidate in groups.get(line.monitor, ()):
-            if line.text == f"{candidate.topic} {candidate.says}" or line.text.startswith(
-                f"{candidate.topic} {candidate.says}: "
-            ):
-                found.append(candidate.key)
-    return found

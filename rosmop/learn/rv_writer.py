@@ -46,7 +46,7 @@ def _topic(name: str, rows: list[Candidate], known: LearntFacts) -> str:
     checks = [row for row in rows if not row.formula]
     names = short_names(dict.fromkeys(row.path for row in checks if row.path))
     topic = rows[0].topic
-    kind, kinds, period = known.types[topic], known.contents[topic].types, known.rhythms[topic].period
+    kind, kinds, period = known.types[topic], known.fields[topic], known.rhythms[topic].period
     parameters = ", ".join(f"{_parameter(kinds[path])} {short}" for path, short in names.items())
     fields = ", ".join(f"{path}:{short}" for path, short in names.items())
     lines = [f"// {topic} ({kind}): {on(rows[0].support)}.", f"{name}() {{"]

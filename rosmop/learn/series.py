@@ -1,25 +1,45 @@
-"""Statistics of one field over all recordings: extremes by window, few values, rates of change, standstills.
+"""Statistics of one field: extremes by window, few values, rates of change, standstills.
 
-Memory is bounded: one number for each window, and a limited set of values.
+Memory is bounded: one number for each window, and a limited set of values. Statistics of different recordings are
+merged. As recordings have different windows, merging is associative and commutative.
 """
 
 import math
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import msgspec
+
+Statistic = TypeVar("Statistic")
+_Key = TypeVar("_Key")
 
 MOST_VALUES = 8
 """A field with more distinct values is not an enumeration."""
 
 
-class HighestValues:
+def merged_rows(
+    one: Mapping[_Key, Statistic], other: Mapping[_Key, Statistic], merge: Callable[[Statistic, Statistic], Statistic]
+) -> dict[_Key, Statistic]:
+    """Return the rows of both tables; rows of the same key are merged."""
+    rows = {**one, **other}
+    for key in one.keys() & other.keys():
+        rows[key] = merge(one[key], other[key])
+    return rows
+
+
+class HighestValues(msgspec.Struct):
     """The highest number of each window."""
 
-    def __init__(self) -> None:
-        self.of: dict[int, float] = {}
+    of: dict[int, float] = {}
 
     def add(self, value: float, window: int) -> None:
         """Add a number that is not NaN."""
         if value > self.of.get(window, -math.inf):
             self.of[window] = value
+
+    def merged(self, other: "HighestValues") -> "HighestValues":
+        """Return the highest numbers of both."""
+        return HighestValues(merged_rows(self.of, other.of, max))
 
     @property
     def top(self) -> float:
@@ -27,23 +47,43 @@ class HighestValues:
         return max(self.of.values(), default=-math.inf)
 
 
-class ValueSeries:
+class ValueSeries(msgspec.Struct):
     """The distinct values of a field while they are few, and the number of windows with each."""
 
-    def __init__(self) -> None:
-        self.windows: dict[Any, int] = {}
-        self._last: dict[Any, int] = {}
-        self.many = False
+    windows: dict[Any, int] = {}
+    many: bool = False
+    last: dict[Any, int] = {}
+    """The last window with each value, until the recording ends."""
 
     def add(self, value: Any, window: int) -> None:
         """Add a value."""
-        if self.many or self._last.get(value) == window:
+        if self.many or self.last.get(value) == window:
             return
-        self._last[value] = window
+        self.last[value] = window
         self.windows[value] = self.windows.get(value, 0) + 1
-        if len(self._last) > MOST_VALUES:
+        self._limit()
+
+    def end(self) -> None:
+        """End a recording."""
+        self.last = {}
+
+    def merged(self, other: "ValueSeries") -> "ValueSeries":
+        """Return the values of both, which have ended."""
+        result = ValueSeries(
+            merged_rows(self.windows, other.windows, int.__add__), many=self.many or other.many
+        )
+        result._limit()
+        return result
+
+    @property
+    def ordered(self) -> list[Any]:
+        """Return the values in an order that does not depend on the recordings."""
+        return sorted(self.windows, key=lambda value: (isinstance(value, bytes), value))
+
+    def _limit(self) -> None:
+        if self.many or len(self.windows) > MOST_VALUES:
             self.many = True
-            self.windows, self._last = {}, {}
+            self.windows, self.last = {}, {}
 
     @property
     def closed(self) -> bool:
@@ -53,42 +93,57 @@ class ValueSeries:
         return bool(self.windows) and min(self.windows.values()) > 1
 
 
-class Series:
+class Series(msgspec.Struct):
     """A numeric field, or a numeric array folded into one value: its values, and how they changed.
 
     `period` is the usual time between two messages in seconds. Closer messages count as one period apart, because
     otherwise network delays would determine their rate.
     """
 
-    def __init__(self, period: float) -> None:
-        self.count = self.changed = 0
-        self.nan = self.infinite = False
-        self.highs, self.lows = HighestValues(), HighestValues()  # `lows` has the negated values
-        self.values = ValueSeries()
-        self.rates, self.stays = HighestValues(), HighestValues()
-        self._period = period
-        self.begin()
+    period: float
+    count: int = 0
+    changed: int = 0
+    nan: bool = False
+    infinite: bool = False
+    highs: HighestValues = msgspec.field(default_factory=HighestValues)
+    lows: HighestValues = msgspec.field(default_factory=HighestValues)
+    """The negated values."""
+    values: ValueSeries = msgspec.field(default_factory=ValueSeries)
+    rates: HighestValues = msgspec.field(default_factory=HighestValues)
+    stays: HighestValues = msgspec.field(default_factory=HighestValues)
+    last: float | None = None
+    """This value, its time and the time since which it is the same are reset at the end of a recording."""
+    time: float = 0.0
+    since: float = 0.0
 
-    def begin(self) -> None:
-        """Begin a recording, whose values are independent of earlier values."""
-        self._last: float | None = None
-        self._time = self._since = 0.0
+    def end(self) -> None:
+        """End a recording: the values of the next one are independent of its values."""
+        self.last, self.time, self.since = None, 0.0, 0.0
+        self.values.end()
+
+    def merged(self, other: "Series") -> "Series":
+        """Return the statistics of both, which have ended."""
+        return Series(
+            self.period, self.count + other.count, self.changed + other.changed, self.nan or other.nan,
+            self.infinite or other.infinite, self.highs.merged(other.highs), self.lows.merged(other.lows),
+            self.values.merged(other.values), self.rates.merged(other.rates), self.stays.merged(other.stays),
+        )  # fmt: skip
 
     def add(self, value: float, seconds: float, window: int) -> None:
-        """Add a value and its time."""
+        """Add a value and its time. Only whole numbers may be an enumeration."""
         self.count += 1
-        if not self.values.many:
+        if not self.values.many and not isinstance(value, float):
             self.values.add(value, window)
-        last, self._last = self._last, value
-        elapsed = max(seconds - self._time, self._period)
-        self._time = seconds
+        last, self.last = self.last, value
+        elapsed = max(seconds - self.time, self.period)
+        self.time = seconds
         if last is None or value != last:
-            self._since = seconds
+            self.since = seconds
         if math.isfinite(value):
             self.highs.add(value, window)
             self.lows.add(-value, window)
             if last is not None:
-                self.stays.add(seconds - self._since, window)
+                self.stays.add(seconds - self.since, window)
                 if value != last:
                     self.changed += 1
                 if math.isfinite(last):

@@ -8,7 +8,9 @@ turns. `by_chance` returns whether chance would give the same result.
 import math
 from collections.abc import Mapping, Sequence
 
-from rosmop.learn.series import HighestValues
+import msgspec
+
+from rosmop.learn.series import HighestValues, merged_rows
 
 MOST_TOPICS = 24
 """The maximum number of topics that are compared with each other. The topics with the fewest messages are used."""
@@ -17,68 +19,68 @@ _SURE = 1e-6  # the probability that any of all pairs looks like an order by cha
 _FEWEST = 20  # the minimum number of messages for an order
 
 
-class TopicPair:
+class TopicPair(msgspec.Struct):
     """The order of the messages of one topic relative to another."""
 
-    def __init__(self) -> None:
-        self.back, self.forth = HighestValues(), HighestValues()
-        self.answered = 0
-        self.requires = True
-        self.turns = True
-        self.begin()
+    back: HighestValues = msgspec.field(default_factory=HighestValues)
+    forth: HighestValues = msgspec.field(default_factory=HighestValues)
+    answered: int = 0
+    requires: bool = True
+    turns: bool = True
+    first: int | None = None
+    """The first message that no second-topic message has followed; like the next ones, until the recording ends."""
+    last: int | None = None
+    seconds: int = 0
+    """Second-topic messages since the last first-topic message."""
+    started: bool = False
 
-    def begin(self) -> None:
-        """Begin a recording."""
-        self._first: int | None = None  # the first message that no second-topic message has followed
-        self._last: int | None = None
-        self._seconds = 0  # second-topic messages since the last first-topic message
-        self._started = False
+    def end(self) -> None:
+        """End a recording."""
+        self.first = self.last = None
+        self.seconds, self.started = 0, False
+
+    def merged(self, other: "TopicPair") -> "TopicPair":
+        """Return the order in both, which have ended."""
+        return TopicPair(
+            self.back.merged(other.back), self.forth.merged(other.forth), self.answered + other.answered,
+            self.requires and other.requires, self.turns and other.turns,
+        )  # fmt: skip
 
     def add_first(self, time: int) -> None:
         """Add a message of the first topic."""
-        if self._started and self._seconds != 1:
+        if self.started and self.seconds != 1:
             self.turns = False
-        self._started, self._seconds = True, 0
-        self._last = time
-        if self._first is None:
-            self._first = time
+        self.started, self.seconds = True, 0
+        self.last = time
+        if self.first is None:
+            self.first = time
 
     def add_second(self, time: int, window: int) -> None:
         """Add a message of the second topic."""
-        if self._last is None:
+        if self.last is None:
             self.requires = False
             return
-        self._seconds += 1
-        self.turns &= self._seconds == 1
-        self.back.add((time - self._last) / 10**9, window)
-        if self._first is not None:
-            self.forth.add((time - self._first) / 10**9, window)
+        self.seconds += 1
+        self.turns &= self.seconds == 1
+        self.back.add((time - self.last) / 10**9, window)
+        if self.first is not None:
+            self.forth.add((time - self.first) / 10**9, window)
             self.answered += 1
-            self._first = None
+            self.first = None
 
 
 class TopicOrders:
     """All pairs of some topics."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        names = sorted((name for name in counts if counts[name] >= _FEWEST), key=lambda name: counts[name])
+        names = sorted((name for name in counts if counts[name] >= _FEWEST), key=lambda name: (counts[name], name))
         self.names: Sequence[str] = names[:MOST_TOPICS]
         self.left_out: Sequence[str] = names[MOST_TOPICS:]
         self.pairs = {(a, b): TopicPair() for a in self.names for b in self.names if a != b}
-        self._firsts = {a: [self.pairs[a, b] for b in self.names if b != a] for a in self.names}
-        self._seconds = {b: [self.pairs[a, b] for a in self.names if a != b] for b in self.names}
 
-    def begin(self) -> None:
-        """Begin a recording."""
-        for pair in self.pairs.values():
-            pair.begin()
-
-    def add(self, topic: str, time: int, window: int) -> None:
-        """Add a message."""
-        for pair in self._seconds.get(topic, ()):
-            pair.add_second(time, window)
-        for pair in self._firsts.get(topic, ()):
-            pair.add_first(time)
+    def add_recordings(self, pairs: Mapping[tuple[str, str], TopicPair]) -> None:
+        """Add the pairs of recordings."""
+        self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:
         """Whether chance alone would place `count` messages within `bound` seconds of another topic's messages.
@@ -87,3 +89,25 @@ class TopicOrders:
         """
         share = bound * rate
         return share >= 0.5 or count * math.log(max(share, 1e-12)) > math.log(_SURE / max(len(self.pairs), 1))
+
+
+class TopicOrderReader:
+    """Observes the pairs of some topics in one recording."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.pairs = {(a, b): TopicPair() for a in names for b in names if a != b}
+        self._firsts = {a: [self.pairs[a, b] for b in names if b != a] for a in names}
+        self._seconds = {b: [self.pairs[a, b] for a in names if a != b] for b in names}
+
+    def add(self, topic: str, time: int, window: int) -> None:
+        """Add a message."""
+        for pair in self._seconds.get(topic, ()):
+            pair.add_second(time, window)
+        for pair in self._firsts.get(topic, ()):
+            pair.add_first(time)
+
+    def ended(self) -> dict[tuple[str, str], TopicPair]:
+        """End the recording, and return its pairs."""
+        for pair in self.pairs.values():
+            pair.end()
+        return self.pairs

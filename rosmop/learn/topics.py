@@ -1,48 +1,67 @@
-"""Statistics of one topic: the intervals of its messages, and a series for each field."""
+"""Statistics of one topic: the intervals of its messages, and a series for each field; merged as in `series`."""
 
 import math
 import statistics
 from typing import Any
 
+import msgspec
+
 from rosmop.learn.field_values import Fields
-from rosmop.learn.series import HighestValues, Series, ValueSeries
+from rosmop.learn.series import HighestValues, Series, ValueSeries, merged_rows
 
 MOST_SINGLE = 6
 """Arrays that always have the same length, up to this maximum, have a series for each element."""
 
-_MOST_GAPS = 5000
+MOST_GAPS = 5000
+"""The number of gaps that the median of all recordings is calculated from."""
+
 _IN_STEP = 60.0  # seconds from a stamp to its reception; longer times mean clocks of different robots
 
 
-class TopicRhythm:
+class TopicRhythm(msgspec.Struct):
     """The times between the messages of a topic."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.recordings: set[str] = set()
-        self.gaps = HighestValues()
-        self._some: list[int] = []  # gaps, for the median
-        self._last: int | None = None
+    count: int = 0
+    recordings: set[int] = set()
+    """The numbers of the recordings with a message."""
+    gaps: HighestValues = msgspec.field(default_factory=HighestValues)
+    some: dict[int, list[int]] = {}
+    """By the first window of each part of a recording: its first gaps in nanoseconds, for the median."""
+    last: int | None = None
+    """The time of the last message, until the recording ends."""
 
-    def begin(self) -> None:
-        """Enter a new recording."""
-        self._last = None
-
-    def add(self, time: int, window: int, recording: str) -> None:
-        """Add the time of a message."""
-        self.count += 1
+    def begin(self, recording: int, first_window: int) -> None:
+        """Begin a part of a recording."""
         self.recordings.add(recording)
-        if self._last is not None:
-            gap = time - self._last
+        self.some[first_window] = []
+
+    def add(self, time: int, window: int, most: int) -> None:
+        """Add the time of a message, and its gap if there are not yet `most`."""
+        self.count += 1
+        if self.last is not None:
+            gap = time - self.last
             self.gaps.add(gap / 10**9, window)
-            if len(self._some) < _MOST_GAPS:
-                self._some.append(gap)
-        self._last = time
+            (some,) = self.some.values()
+            if len(some) < most:
+                some.append(gap)
+        self.last = time
+
+    def end(self) -> None:
+        """End a recording."""
+        self.last = None
+
+    def merged(self, other: "TopicRhythm") -> "TopicRhythm":
+        """Return the rhythm of both, which have ended and are of different parts."""
+        return TopicRhythm(
+            self.count + other.count, self.recordings | other.recordings, self.gaps.merged(other.gaps),
+            {**self.some, **other.some},
+        )  # fmt: skip
 
     @property
     def period(self) -> float:
         """Return the usual interval in seconds; a nanosecond if the interval is unknown."""
-        return max(statistics.median(self._some) if self._some else 0.0, 1.0) / 10**9
+        gaps = [gap for some in self.some.values() for gap in some]
+        return max(statistics.median(gaps) if gaps else 0.0, 1.0) / 10**9
 
     @property
     def interval(self) -> float:
@@ -50,43 +69,84 @@ class TopicRhythm:
         return float(max(1, round(5 * self.period)))
 
 
-class TopicContent:
+class TopicContent(msgspec.Struct):
     """The fields of a topic's messages."""
 
-    def __init__(self, fields: Fields, rhythm: TopicRhythm) -> None:
-        self._fields = fields
-        self._period = rhythm.period
-        self._interval = rhythm.interval
-        self.types = fields.types
-        self.numbers: dict[str, Series] = {}
-        self.elements: dict[str, list[Series]] = {}
-        self.sets: dict[str, ValueSeries] = {}
-        self.lengths: dict[str, ValueSeries] = {}
-        self.moves: dict[str, dict[tuple[Any, Any], tuple[int, int]]] = {}
-        """For fields with few values: how often a value was followed by another value (number of windows, the last
-        window).
-        """
-        self.ages, self.leads, self.counts = HighestValues(), HighestValues(), HighestValues()
-        self.backward = False
-        """Whether some message had an earlier stamp than the previous message."""
-        self.begin()
+    numbers: dict[str, Series] = {}
+    elements: dict[str, list[Series]] = {}
+    """The series of each element of arrays that always have the same, small length."""
+    sets: dict[str, ValueSeries] = {}
+    lengths: dict[str, ValueSeries] = {}
+    moves: dict[str, dict[tuple[Any, Any], int]] = {}
+    """For fields with few values: the number of windows in which a value was followed by another value."""
+    ages: HighestValues = msgspec.field(default_factory=HighestValues)
+    leads: HighestValues = msgspec.field(default_factory=HighestValues)
+    counts: HighestValues = msgspec.field(default_factory=HighestValues)
+    backward: bool = False
+    """Whether some message had an earlier stamp than the previous message."""
 
-    def begin(self) -> None:
-        """Enter a new recording."""
-        for series in [
-            *self.numbers.values(),
-            *(element for row in self.elements.values() for element in row),
-        ]:
-            series.begin()
+    def merged(self, other: "TopicContent") -> "TopicContent":
+        """Return the statistics of both, which have ended."""
+        result = TopicContent(
+            merged_rows(self.numbers, other.numbers, Series.merged),
+            merged_rows(self.elements, other.elements, _merged_elements),
+            merged_rows(self.sets, other.sets, ValueSeries.merged),
+            merged_rows(self.lengths, other.lengths, ValueSeries.merged),
+            merged_rows(self.moves, other.moves, _merged_moves),
+            self.ages.merged(other.ages), self.leads.merged(other.leads), self.counts.merged(other.counts),
+            self.backward or other.backward,
+        )  # fmt: skip
+        result.limit()
+        return result
+
+    def limit(self) -> None:
+        """Leave out the elements of arrays with several lengths, and the moves of fields with many values."""
+        for path in [path for path in self.elements if len(self.lengths[path].windows) != 1]:
+            del self.elements[path]
+        for path in [path for path in self.moves if self._values(path).many]:
+            del self.moves[path]
+
+    def _values(self, path: str) -> ValueSeries:
+        return self.sets[path] if path in self.sets else self.numbers[path].values
+
+
+def _merged_elements(one: list[Series], other: list[Series]) -> list[Series]:
+    # Arrays of different lengths are left out afterwards, by `limit`.
+    return [a.merged(b) for a, b in zip(one, other, strict=False)]
+
+
+def _merged_moves(one: dict[tuple[Any, Any], int], other: dict[tuple[Any, Any], int]) -> dict[tuple[Any, Any], int]:
+    return merged_rows(one, other, int.__add__)
+
+
+class TopicContentReader:
+    """Reads the messages of a topic in one recording. `period` and `interval` are those of the topic's rhythm."""
+
+    def __init__(self, fields: Fields, period: float, interval: float) -> None:
+        self.content = TopicContent()
+        self._fields = fields
+        self._types = fields.types
+        self._period = period
+        self._interval = interval
         self._before: dict[str, Any] = {}
+        self._moved: dict[tuple[str, Any, Any], int] = {}  # the last window of each move
         self._stamp = -1.0
         self._opened, self._counted = 0.0, 0
+
+    def ended(self) -> TopicContent:
+        """End the recording, and return its statistics."""
+        content = self.content
+        elements = [element for row in content.elements.values() for element in row]
+        for series in [*content.numbers.values(), *elements, *content.sets.values(), *content.lengths.values()]:
+            series.end()
+        content.limit()
+        return content
 
     def add(self, data: bytes, time: int, window: int) -> None:
         """Add a message. Raises `MessageError`."""
         seconds = time / 10**9
         for path, value in self._fields.read(data).items():
-            kind = self.types[path]
+            kind = self._types[path]
             if kind in {"string", "bool"}:
                 self._add_set(path, value, window)
             elif kind in {"time", "duration"}:
@@ -101,20 +161,20 @@ class TopicContent:
             elif isinstance(value, tuple):
                 self._add_array(path, value, seconds, window)
             else:
-                if path not in self.numbers:
-                    self.numbers[path] = Series(self._period)
-                self.numbers[path].add(value, seconds, window)
-                if not kind.startswith("float") and not self.numbers[path].values.many:
+                if path not in self.content.numbers:
+                    self.content.numbers[path] = Series(self._period)
+                self.content.numbers[path].add(value, seconds, window)
+                if not kind.startswith("float") and not self.content.numbers[path].values.many:
                     self._add_move(path, value, window)
         if seconds - self._opened >= self._interval:
             self._opened, self._counted = seconds, 0
         self._counted += 1
-        self.counts.add(self._counted, window)
+        self.content.counts.add(self._counted, window)
 
     def _add_set(self, path: str, value: Any, window: int) -> None:
-        if path not in self.sets:
-            self.sets[path] = ValueSeries()
-        found = self.sets[path]
+        if path not in self.content.sets:
+            self.content.sets[path] = ValueSeries()
+        found = self.content.sets[path]
         found.add(value, window)
         if not found.many:
             self._add_move(path, value, window)
@@ -122,36 +182,37 @@ class TopicContent:
     def _add_move(self, path: str, value: Any, window: int) -> None:
         before = self._before.get(path)
         if before is not None and before != value:
-            moves = self.moves.setdefault(path, {})
-            windows, last = moves.get((before, value), (0, -1))
-            moves[before, value] = (windows + (last != window), window)
+            moves = self.content.moves.setdefault(path, {})
+            if self._moved.get((path, before, value)) != window:
+                self._moved[path, before, value] = window
+                moves[before, value] = moves.get((before, value), 0) + 1
         self._before[path] = value
 
     def _add_stamp(self, stamp: float, seconds: float, window: int) -> None:
         age = seconds - stamp
         if abs(age) <= _IN_STEP:
-            self.ages.add(age, window)
-            self.leads.add(-age, window)
-        self.backward |= stamp < self._stamp
+            self.content.ages.add(age, window)
+            self.content.leads.add(-age, window)
+        self.content.backward |= stamp < self._stamp
         self._stamp = stamp
 
     def _add_length(self, path: str, length: int, window: int) -> None:
-        if path not in self.lengths:
-            self.lengths[path] = ValueSeries()
-        self.lengths[path].add(length, window)
+        if path not in self.content.lengths:
+            self.content.lengths[path] = ValueSeries()
+        self.content.lengths[path].add(length, window)
 
     def _add_array(self, path: str, array: tuple[float, ...], seconds: float, window: int) -> None:
         self._add_length(path, len(array), window)
-        if len(array) <= MOST_SINGLE and len(self.lengths[path].windows) == 1:
-            row = self.elements.setdefault(path, [Series(self._period) for _ in array])
+        if len(array) <= MOST_SINGLE and len(self.content.lengths[path].windows) == 1:
+            row = self.content.elements.setdefault(path, [Series(self._period) for _ in array])
             for series, value in zip(row, array, strict=True):
                 series.add(value, seconds, window)
         else:
-            self.elements.pop(path, None)
-        if path not in self.numbers:
-            self.numbers[path] = Series(self._period)
+            self.content.elements.pop(path, None)
+        if path not in self.content.numbers:
+            self.content.numbers[path] = Series(self._period)
         finite = array if math.isfinite(sum(array)) else [value for value in array if math.isfinite(value)]
         nan = len(finite) < len(array) and any(map(math.isnan, array))
         infinite = len(finite) < len(array) and any(map(math.isinf, array))
         low, high = (float(min(finite)), float(max(finite))) if finite else (1.0, 0.0)
-        self.numbers[path].add_array(low, high, nan, infinite, window)
+        self.content.numbers[path].add_array(low, high, nan, infinite, window)

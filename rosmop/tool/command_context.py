@@ -2,27 +2,19 @@
 
 import errno
 import io
-import os
-import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import typer
 
+from rosmop.recordings.recording import RecordingError
+from rosmop.recordings.regular_files import open_regular
 from rosmop.tool.terminal import printable
 
 MAX_FILE = 64 << 20
 """The size limit in bytes of a file that is read whole."""
-
-_NULL = os.makedev(1, 3)  # /dev/null: an empty file
-_KINDS = {
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-    stat.S_IFDIR: "a folder",
-    stat.S_IFSOCK: "a socket",
-}
 
 
 @dataclass(frozen=True)
@@ -57,22 +49,10 @@ class CommandContext:
         self.warn(text)
         return typer.Exit(2)
 
-
-def open_regular(path: Path) -> io.BufferedReader:
-    """Open a regular file, or the pipe that a shell made for `<(command)` or `command |`. Raises `OSError`.
-
-    Other files are rejected: a named pipe may block its reader for ever, and a device may be endless.
-    """
-    descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    try:
-        status = os.fstat(descriptor)
-        kind = stat.S_IFMT(status.st_mode)
-        if kind == stat.S_IFIFO and str(Path(f"/proc/self/fd/{descriptor}").readlink()).startswith("pipe:"):
-            os.set_blocking(descriptor, True)
-        elif kind != stat.S_IFREG and status.st_rdev != _NULL:
-            text = f"not a regular file: it is {_KINDS.get(kind, 'something else')}"
-            raise OSError(errno.EINVAL, text, str(path))
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return os.fdopen(descriptor, "rb")
+    @contextmanager
+    def reports(self) -> Iterator[None]:
+        """Turn a `RecordingError` in the block into a usage error."""
+        try:
+            yield
+        except RecordingError as error:
+            raise self.usage_error(str(error)) from error

@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import pytest
 
 from rosmop.check.sources import compiled_from
-from rosmop.learn.learner import LearningError, LearningResult, learn
+from rosmop.learn.learner import LearningResult, learn
+from rosmop.learn.passes import run_here
+from rosmop.learn.recordings import LearningError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
 from roswire.standard import standard_definitions
@@ -78,7 +80,13 @@ DRIVES = [drive(seed) for seed in range(1, 9)]
 @pytest.fixture(scope="module")
 def learnt() -> LearningResult:
     """Return the result of learning from eight drives."""
-    return learn(DRIVES, standard_definitions(), 0.3, lambda _: None)
+    return learnt_from(DRIVES, 0.3)
+
+
+def learnt_from(recordings: Sequence[Recorded], held_out: float) -> LearningResult:
+    """Learn in this process."""
+    definitions = standard_definitions()
+    return learn(recordings, definitions, held_out, run_here(recordings, definitions))
 
 
 def warnings(learnt: LearningResult, rows: Sequence[Row]) -> list[str]:
@@ -160,7 +168,7 @@ def test_contradictions_of_held_out_recordings_are_listed() -> None:
     speeds = [place for place, row in enumerate(rows) if row[0] == "/speed"]
     rows[speeds[300]] = (*rows[speeds[300]][:2], number(50.0))
     odd[2] = replace(odd[2], rows=tuple(rows))
-    learnt = learn(odd, standard_definitions(), 0.25, lambda _: None)
+    learnt = learnt_from(odd, 0.25)
     assert [part.name for part in learnt.held_out] == ["drive 3"]
     widened = {each.says for each in learnt.candidates if each.widened}
     assert "data is out of range" in widened
@@ -172,7 +180,7 @@ def test_contradictions_of_held_out_recordings_are_listed() -> None:
 
 def test_a_recording_alone_is_divided_in_time() -> None:
     """The end of a single recording tests the conditions learnt from its beginning."""
-    learnt = learn([drive(1, 200.0)], standard_definitions(), 0.3, lambda _: None)
+    learnt = learnt_from([drive(1, 200.0)], 0.3)
     (trained,), (held_out,) = learnt.trained, learnt.held_out
     assert trained.ended < held_out.began
     assert held_out.seconds == pytest.approx(60, rel=0.01)
@@ -184,12 +192,15 @@ def test_nothing_to_learn_from_is_an_error() -> None:
     with pytest.raises(
         LearningError, match="/speed carries std_msgs/Float64 in one recording and std_msgs/Float32"
     ):
-        learn([DRIVES[0], other], standard_definitions(), 0.3, lambda _: None)
+        learnt_from([DRIVES[0], other], 0.3)
     with pytest.raises(LearningError, match="no message"):
-        learn([replace(DRIVES[0], topics={})], standard_definitions(), 0.3, lambda _: None)
+        learnt_from([replace(DRIVES[0], topics={})], 0.3)
     broken = replace(DRIVES[0], rows=(("/speed", START, b"abc"), *DRIVES[0].rows[1:]))
     with pytest.raises(LearningError, match="drive 1: a message on /speed is not of type std_msgs/Float64"):
-        learn([broken, DRIVES[1]], standard_definitions(), 0.3, lambda _: None)
+        learnt_from([broken], 0)
+    learnt = learnt_from([broken, *DRIVES[1:]], 0.3)
+    assert list(learnt.failed) == [0]
+    assert "partly, learnt from: drive 1: a message on /speed" in learnt.text
 
 
 def test_omitted_conditions_are_listed() -> None:
@@ -201,9 +212,7 @@ def test_omitted_conditions_are_listed() -> None:
         return message("sensor_msgs/JointState", name=[f"joint{number}" for number in range(6)], **arrays)
 
     rows = tuple(("/arm", START + tick * 50_000_000, joints()) for tick in range(600))
-    learnt = learn(
-        [Recorded("arm", rows, {"/arm": "sensor_msgs/JointState"})], standard_definitions(), 0, lambda _: None
-    )
+    learnt = learnt_from([Recorded("arm", rows, {"/arm": "sensor_msgs/JointState"})], 0)
     kinds = [each.kind for each in learnt.candidates]
     assert (kinds.count("range"), kinds.count("length")) == (10, 4)
     assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
@@ -226,7 +235,7 @@ def test_numbers_of_any_size_give_a_valid_specification() -> None:
         for place, (topic, (kind, value)) in enumerate(topics.items())
     )
     recorded = Recorded("r", rows, {topic: kind for topic, (kind, _) in topics.items()})
-    learnt = learn([recorded], standard_definitions(), 0.2, lambda _: None)
+    learnt = learnt_from([recorded], 0.2)
     assert MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions())).warnings == ()
     assert {row.topic for row in learnt.candidates if row.kind == "range"} == {"/unsigned", "/signed"}
     assert "data <= 18446744073709551615u" in learnt.text

@@ -1,34 +1,23 @@
-"""Run monitors on a bag, and write the messages that subscribers would have received into another bag.
+"""Run monitors on a recording, and write the messages that subscribers would have received into a bag.
 
 Messages of a topic with a different definition than the specifications expect are dropped.
 """
 
-import struct
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from types import TracebackType
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag1
-from rosbags.rosbag1 import ReaderError, Writer
+from rosbags.rosbag1 import Writer
 from rosbags.rosbag1.writer import WriterError
 
+from rosmop.recordings.recording import Reader, RecordingError, fits, messages_of, ros_type
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import MessageSender, Outcome, Verdict, bound
-from rosmop.tool.bounded_bag import BoundedReader
-from rosmop.tool.command_context import CommandContext
 from roswire.definitions import Definitions
-from roswire.errors import DefinitionError
-from roswire.message_text import MessageDefinition
 
 _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not receive them
-# The exceptions that `rosbags` and its decompressors raise for a damaged bag.
-_DAMAGE = (
-    ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError, OSError,
-    EOFError, RuntimeError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,97 +29,14 @@ class ReplayStep:
     topic: str | None = None
 
 
-def ros_type(name: str) -> str:
-    """Return `package/Type` for the bag reader's `package/msg/Type`."""
-    package, _, kind = name.partition("/")
-    return f"{package}/{kind.rpartition('/')[2]}"
-
-
-def open_bag(program: CommandContext, path: Path) -> BoundedReader:
-    """Open a recording. Raises a usage error for a file that is not a bag."""
-    try:
-        reader = BoundedReader(program, path)
-        reader.open()
-    except _DAMAGE as error:
-        advice = (
-            "; it must be a ROS 1 bag; `rosbag reindex` repairs a truncated bag" if path.is_file() else ""
-        )
-        raise program.usage_error(
-            f"cannot read the bag {path}: {_text_of(error).rstrip('.')}{advice}"
-        ) from error
-    return reader
-
-
-def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield connection, time in nanoseconds and bytes of every message, in order.
-
-    Raises a usage error for a damaged bag.
-    """
-    try:
-        yield from reader.in_order()
-    except _DAMAGE as error:
-        raise reader.program.usage_error(f"the bag {reader.path} is damaged: {_text_of(error)}") from error
-
-
-def _text_of(error: Exception) -> str:
-    return str(error) or type(error).__name__
-
-
-def definitions_of(reader: BoundedReader) -> Definitions:
-    """Return the message definitions in the bag, without those that cannot be parsed."""
-    found: dict[str, MessageDefinition] = {}
-    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
-    for name, text in sent:
-        try:
-            own = Definitions.from_full_text(name, text)
-        except DefinitionError:
-            continue
-        found |= {kind: own.message(kind) for kind in own.message_types}
-    return Definitions(found)
-
-
-class RecordedBag:
-    """The messages of a bag on topics that match a pattern, read again for each pass.
-
-    `definitions` has the message definitions of the bag. Raises a usage error for a bag that cannot be read, has no
-    messages, or has two types on one topic.
-    """
-
-    def __init__(self, program: CommandContext, path: Path, patterns: Sequence[str]) -> None:
-        self._program = program
-        self._path = path
-        self.name = path.name
-        self.topics: dict[str, str] = {}
-        with closing(open_bag(program, path)) as reader:
-            self.began, self.ended = reader.start_time, reader.end_time - 1
-            self.message_count = reader.message_count
-            if not self.message_count:
-                raise program.usage_error(f"the bag {path} has no messages")
-            self.definitions = definitions_of(reader)
-            for connection in reader.connections:
-                if not _fits(connection, patterns):
-                    continue
-                kind = ros_type(connection.msgtype)
-                other = self.topics.setdefault(connection.topic, kind)
-                if other != kind:
-                    raise program.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
-
-    def messages(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, time in nanoseconds and bytes of every message, in order."""
-        with closing(open_bag(self._program, self._path)) as reader:
-            for connection, time_ns, data in messages_of(reader):
-                if connection.topic in self.topics:
-                    yield connection.topic, time_ns, data
-
-
 # Topic, type, definition, md5sum, caller, latching
 _Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class OutputBag:
-    """Write a bag of the messages that subscribers would have received."""
+    """Write a bag of the messages that subscribers would have received. Raises `RecordingError`."""
 
-    def __init__(self, program: CommandContext, path: Path, definitions: Definitions) -> None:
+    def __init__(self, path: Path, definitions: Definitions) -> None:
         self._path = path
         self._definitions = definitions
         self._connections: dict[_Header, Connection] = {}
@@ -138,7 +44,7 @@ class OutputBag:
             self._writer = Writer(path)
             self._writer.open()
         except (WriterError, OSError) as error:
-            raise program.usage_error(f"cannot write the bag {path}: {error}") from error
+            raise RecordingError(f"cannot write the bag {path}: {error}") from error
 
     def __enter__(self) -> "OutputBag":
         return self
@@ -172,13 +78,13 @@ class OutputBag:
 
 def _sender(connection: Connection) -> ConnectionExtRosbag1:
     """Return the caller id of a recorded publisher, and whether it latches."""
-    assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  `BoundedReader` reads no other bags
+    assert isinstance(connection.ext, ConnectionExtRosbag1)  # noqa: S101  the readers make no other connections
     return connection.ext
 
 
 def replay(
     monitors: MonitorSet,
-    reader: BoundedReader,
+    reader: Reader,
     output: OutputBag | None,
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
@@ -191,7 +97,7 @@ def replay(
     refusals = {
         connection.id: _refusal(monitors, connection)
         for connection in reader.connections
-        if _fits(connection, topics) and _sender(connection).callerid != _OWN
+        if fits(connection.topic, topics) and _sender(connection).callerid != _OWN
     }
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
@@ -276,11 +182,7 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
     return None
 
 
-def _fits(connection: Connection, topics: Sequence[str]) -> bool:
-    return any(fnmatchcase(connection.topic, pattern) for pattern in topics)
-
-
-def refusals(monitors: MonitorSet, reader: BoundedReader, topics: Sequence[str] = ("*",)) -> list[str]:
+def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
     """Return the reasons why messages on topics that match a pattern are dropped."""
-    found = [_refusal(monitors, connection) for connection in reader.connections if _fits(connection, topics)]
+    found = [_refusal(monitors, connection) for connection in reader.connections if fits(connection.topic, topics)]
     return sorted({text for text in found if text is not None})

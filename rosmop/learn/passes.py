@@ -1,0 +1,173 @@
+"""The passes of learning over one recording, as pure functions, and the merging of their results.
+
+A step is the input of a pass, besides the messages and their definitions. Merging is associative and commutative, so
+the recordings may be read in any order, and anywhere.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import msgspec
+
+from rosmop.check.sources import compiled_from
+from rosmop.learn.field_values import Fields, MessageError
+from rosmop.learn.recordings import LearningError, Received, RecordingSource
+from rosmop.learn.series import merged_rows
+from rosmop.learn.topic_orders import TopicOrderReader, TopicPair
+from rosmop.learn.topics import TopicContent, TopicContentReader, TopicRhythm
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome
+from roswire.definitions import Definitions
+
+
+class Step(msgspec.Struct, frozen=True, tag=True):
+    """The part of a recording from `began` to `ended` (nanoseconds), and the topics to read.
+
+    `recording` is its number. It has `windows` windows, of which the first has the number `first_window`.
+    """
+
+    recording: int
+    began: int
+    ended: int
+    first_window: int
+    windows: int
+    topics: dict[str, str]
+
+    def messages(self, source: RecordingSource) -> Iterator[tuple[Received, int]]:
+        """Yield the part's messages on these topics, each with its window."""
+        length = self.ended - self.began + 1
+        for message in source.messages():
+            if message[0] in self.topics and self.began <= message[1] <= self.ended:
+                yield message, self.first_window + (message[1] - self.began) * self.windows // length
+
+
+class TimeStep(Step, frozen=True):
+    """Reads only times; keeps at most `gaps` of each topic for the median."""
+
+    gaps: int
+
+
+class ContentStep(Step, frozen=True):
+    """Reads the fields of each message. `rhythms` has the period and the interval of each topic."""
+
+    rhythms: dict[str, tuple[float, float]]
+    ordered: list[str]
+    """The topics that are compared with each other."""
+
+
+class AlarmStep(Step, frozen=True):
+    """Runs the learnt specifications. `says`, by monitor: a candidate's number, and how its warning begins."""
+
+    text: str
+    says: dict[str, list[tuple[int, str]]]
+
+
+class TimeFacts(msgspec.Struct, frozen=True, tag=True):
+    """The rhythm of each topic."""
+
+    rhythms: dict[str, TopicRhythm] = {}
+
+    def merged(self, other: "TimeFacts") -> "TimeFacts":
+        """Return the facts of both."""
+        return TimeFacts(merged_rows(self.rhythms, other.rhythms, TopicRhythm.merged))
+
+
+class ContentFacts(msgspec.Struct, frozen=True, tag=True):
+    """The fields of each topic, and the order of topics."""
+
+    contents: dict[str, TopicContent] = {}
+    pairs: dict[tuple[str, str], TopicPair] = {}
+
+    def merged(self, other: "ContentFacts") -> "ContentFacts":
+        """Return the facts of both."""
+        return ContentFacts(
+            merged_rows(self.contents, other.contents, TopicContent.merged),
+            merged_rows(self.pairs, other.pairs, TopicPair.merged),
+        )
+
+
+class AlarmFacts(msgspec.Struct, frozen=True, tag=True):
+    """The number of alarms of each candidate that has some."""
+
+    alarms: dict[int, int] = {}
+
+    def merged(self, other: "AlarmFacts") -> "AlarmFacts":
+        """Return the facts of both."""
+        return AlarmFacts(merged_rows(self.alarms, other.alarms, int.__add__))
+
+
+Facts = TimeFacts | ContentFacts | AlarmFacts
+AnyStep = TimeStep | ContentStep | AlarmStep
+
+
+def facts_of(step: AnyStep, source: RecordingSource, definitions: Definitions) -> Facts:
+    """Return the facts of a pass over one recording. Raises `LearningError`."""
+    if isinstance(step, TimeStep):
+        return _times(step, source)
+    if isinstance(step, ContentStep):
+        return _contents(step, source, definitions)
+    return _alarms(step, source, definitions)
+
+
+def _times(step: TimeStep, source: RecordingSource) -> TimeFacts:
+    rhythms: dict[str, TopicRhythm] = {}
+    for (topic, time, _data), window in step.messages(source):
+        if topic not in rhythms:
+            rhythms[topic] = TopicRhythm()
+            rhythms[topic].begin(step.recording, step.first_window)
+        rhythms[topic].add(time, window, step.gaps)
+    for rhythm in rhythms.values():
+        rhythm.end()
+    return TimeFacts(rhythms)
+
+
+def _contents(step: ContentStep, source: RecordingSource, definitions: Definitions) -> ContentFacts:
+    contents = {
+        topic: TopicContentReader(Fields(definitions.layout(kind)), *step.rhythms[topic])
+        for topic, kind in step.topics.items()
+    }
+    orders = TopicOrderReader(step.ordered)
+    for (topic, time, data), window in step.messages(source):
+        try:
+            contents[topic].add(data, time, window)
+        except MessageError as error:
+            text = f"{source.name}: a message on {topic} is not of type {step.topics[topic]}: {error}"
+            raise LearningError(text) from error
+        orders.add(topic, time, window)
+    return ContentFacts({topic: content.ended() for topic, content in contents.items()}, orders.ended())
+
+
+def _alarms(step: AlarmStep, source: RecordingSource, definitions: Definitions) -> AlarmFacts:
+    found: dict[int, int] = {}
+    monitors = MonitorSet.of(compiled_from({"learnt.rv": step.text}, definitions))
+    monitors.start(step.began, frozenset(source.topics))
+    for (topic, time, data), _window in step.messages(source):
+        outcome = monitors.process(topic, data, time)
+        for each in (*outcome.before, outcome):
+            for number in _warned(each, step.says):
+                found[number] = found.get(number, 0) + 1
+    return AlarmFacts(found)
+
+
+def _warned(outcome: Outcome, says: Mapping[str, list[tuple[int, str]]]) -> Iterator[int]:
+    for line in outcome.log:
+        if line.level == "WARN":
+            for number, text in says.get(line.monitor, ()):
+                if line.text == text or line.text.startswith(f"{text}: "):
+                    yield number
+
+
+def run_here(sources: Sequence[RecordingSource], definitions: Definitions) -> "Run":
+    """Return a function that executes steps in this process."""
+
+    def run(steps: list[AnyStep]) -> Iterator[tuple[int, Facts | LearningError]]:
+        for number, step in enumerate(steps):
+            try:
+                yield number, facts_of(step, sources[step.recording], definitions)
+            except LearningError as error:
+                yield number, error
+
+    return run
+
+
+Run = Callable[[list[AnyStep]], Iterator[tuple[int, Facts | LearningError]]]
+"""Executes steps, and yields the number and the facts of each in any order, or the reason why it failed."""

@@ -1,0 +1,122 @@
+"""Open recordings: bags and MCAP files, told apart by their first bytes."""
+
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import zstandard
+from mcap.exceptions import McapError
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import ReaderError
+
+from rosmop.recordings.bounded_bag import BoundedReader
+from rosmop.recordings.bounded_mcap import MAGIC, BoundedMcap
+from rosmop.recordings.regular_files import open_regular
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.message_text import MessageDefinition
+
+Reader = BoundedReader | BoundedMcap
+# The exceptions that the libraries and their decompressors raise for a damaged file.
+_DAMAGE = (
+    ReaderError, McapError, zstandard.ZstdError, ValueError, LookupError, AssertionError, struct.error, MemoryError,
+    OverflowError, OSError, EOFError, RuntimeError,
+)  # fmt: skip
+
+
+class RecordingError(Exception):
+    """A recording cannot be read or used; the text names the recording and the reason."""
+
+
+def ros_type(name: str) -> str:
+    """Return `package/Type` for the reader's `package/msg/Type`."""
+    package, _, kind = name.partition("/")
+    return f"{package}/{kind.rpartition('/')[2]}"
+
+
+def open_recording(path: Path) -> Reader:
+    """Open a recording. Raises `RecordingError`."""
+    is_mcap = False
+    try:
+        if path.is_file():
+            with open_regular(path) as file:
+                is_mcap = file.peek(len(MAGIC))[: len(MAGIC)] == MAGIC
+        if is_mcap:
+            return BoundedMcap(path)
+        reader = BoundedReader(path)
+        reader.open()
+    except _DAMAGE as error:
+        advice = "; it must be a ROS 1 bag or an MCAP file; `rosbag reindex` repairs a truncated bag"
+        text = f"cannot read the bag {path}: {_text_of(error).rstrip('.')}"
+        if is_mcap:
+            raise RecordingError(f"cannot read the MCAP file {path}: {_text_of(error).rstrip('.')}") from error
+        raise RecordingError(text + (advice if path.is_file() else "")) from error
+    return reader
+
+
+def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield connection, time in nanoseconds and bytes of every message, in order.
+
+    Raises `RecordingError` for a damaged file.
+    """
+    try:
+        yield from reader.in_order()
+    except _DAMAGE as error:
+        raise RecordingError(f"the bag {reader.path} is damaged: {_text_of(error)}") from error
+
+
+def _text_of(error: Exception) -> str:
+    return str(error) or type(error).__name__
+
+
+def definitions_of(reader: Reader) -> Definitions:
+    """Return the message definitions in the recording, without those that cannot be parsed."""
+    found: dict[str, MessageDefinition] = {}
+    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
+    for name, text in sent:
+        try:
+            own = Definitions.from_full_text(name, text)
+        except DefinitionError:
+            continue
+        found |= {kind: own.message(kind) for kind in own.message_types}
+    return Definitions(found)
+
+
+def fits(topic: str, patterns: Sequence[str]) -> bool:
+    """Whether a topic matches one of the patterns."""
+    return any(fnmatchcase(topic, pattern) for pattern in patterns)
+
+
+class RecordedFile:
+    """The messages of a recording on topics that match a pattern, read again for each pass.
+
+    `definitions` has the message definitions of the recording. Raises `RecordingError` for a recording that cannot be
+    read, has no messages, or has two types on one topic. `name` is its name for messages to the user.
+    """
+
+    def __init__(self, path: Path, patterns: Sequence[str], name: str | None = None) -> None:
+        self._path = path
+        self.name = name or path.name
+        self.topics: dict[str, str] = {}
+        with closing(open_recording(path)) as reader:
+            self.began, self.ended = reader.start_time, reader.end_time - 1
+            self.message_count = reader.message_count
+            if not self.message_count:
+                raise RecordingError(f"the bag {path} has no messages")
+            self.definitions = definitions_of(reader)
+            for connection in reader.connections:
+                if not fits(connection.topic, patterns):
+                    continue
+                kind = ros_type(connection.msgtype)
+                other = self.topics.setdefault(connection.topic, kind)
+                if other != kind:
+                    raise RecordingError(f"{path}: {connection.topic} carries both {other} and {kind}")
+
+    def messages(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield topic, time in nanoseconds and bytes of every message, in order. Raises `RecordingError`."""
+        with closing(open_recording(self._path)) as reader:
+            for connection, time_ns, data in messages_of(reader):
+                if connection.topic in self.topics:
+                    yield connection.topic, time_ns, data
