@@ -153,7 +153,7 @@ class _Proposer:
         if rhythm.count < _FEWEST:
             return
         for place in sorted(self._numbers(topic, content), key=lambda found: -found[3].changed):
-            yield from self._number(topic, content, rhythm, place)
+            yield from self._number(topic, rhythm, place)
 
     def _by_field(self, topic: str, rows: Mapping[str, Statistic]) -> Iterator[tuple[str, Statistic]]:
         """Yield the rows of a topic's fields, in the order of the definition."""
@@ -258,11 +258,7 @@ class _Proposer:
         moves = content.moves.get(path, {})
         ordered = values.ordered
         count = len(ordered)
-        if (
-            count < 3
-            or len(moves) >= count * (count - 1)
-            or min(moves.values(), default=0) < 3
-        ):
+        if count < 3 or len(moves) >= count * (count - 1) or min(moves.values(), default=0) < 3:
             return
         names = {value: f"value{place}" for place, value in enumerate(ordered)}
         go = {value: f"{name} -> at_{name}" for value, name in names.items()}
@@ -271,7 +267,10 @@ class _Proposer:
             for value in ordered
         )
         begin = ", ".join(go.values())
-        listed = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in sorted(moves, key=lambda move: (ordered.index(move[0]), ordered.index(move[1]))))
+        listed = "; ".join(
+            f"{literal(a)} to {literal(b)}"
+            for a, b in sorted(moves, key=lambda move: (ordered.index(move[0]), ordered.index(move[1])))
+        )
         yield Candidate(
             topic, "moves", path, f"{path} makes a move that was never seen", listed, support,
             formula=f"fsm: start [ {begin} ] {states}",
@@ -290,9 +289,7 @@ class _Proposer:
             ):
                 yield path, None, None, series
 
-    def _number(
-        self, topic: str, content: TopicContent, rhythm: TopicRhythm, place_of: _Place
-    ) -> Iterator[Candidate]:
+    def _number(self, topic: str, rhythm: TopicRhythm, place_of: _Place) -> Iterator[Candidate]:
         path, element, length, series = place_of
         support = self._support(rhythm)
         integer = not self._known.fields[topic][path].startswith("float")

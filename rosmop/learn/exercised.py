@@ -7,7 +7,7 @@ the monitors behave as usual, and no messages are stored.
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,32 +38,47 @@ class CoverageItem:
     position: Position
 
 
-def covered(
-    texts: Mapping[str, str], definitions: Definitions, recordings: Iterable[RecordingSource]
-) -> dict[CoverageItem, int]:
-    """Return how often the recordings exercised each item, in the order of the text.
+def items_of(texts: Mapping[str, str]) -> list[CoverageItem]:
+    """Return the items of these specifications, in the order of the text. Raises `SpecificationError`."""
+    return _items(_marked(texts))
+
+
+def covered(texts: Mapping[str, str], definitions: Definitions, recording: RecordingSource) -> list[int]:
+    """Return how often a recording exercised each item of `items_of`.
 
     The number for a state is how often an event entered it or stayed in it. Raises `SpecificationError`.
     """
     compiled_from(texts, definitions)  # reports errors for the unchanged text
-    marked = _Marked([parse(text, name) for name, text in texts.items()])
+    marked = _marked(texts)
     counts: Counter[CoverageItem] = Counter()
-    for recording in recordings:
-        monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
-        # explaining a verdict makes test runs, which are not part of the recording
-        monitors.explain_when(lambda *_: False, lambda *_: False)
-        watches = _watch(monitors)
-        monitors.start(recording.began, frozenset(recording.topics))
-        for topic, time, data in recording.messages():
-            monitors.process(topic, data, time)
-        for monitor in monitors.monitors:
-            for name, item in marked.items.items():
-                if item.specification == monitor.name:
-                    counts[item] += monitors.value(monitor.name, name)
-        for watch in watches:
-            counts.update(watch.seen())
+    monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
+    # explaining a verdict makes test runs, which are not part of the recording
+    monitors.explain_when(lambda *_: False, lambda *_: False)
+    watches = _watch(monitors)
+    monitors.start(recording.began, frozenset(recording.topics))
+    for topic, time, data in recording.messages():
+        monitors.process(topic, data, time)
+    for monitor in monitors.monitors:
+        for name, item in marked.items.items():
+            if item.specification == monitor.name:
+                counts[item] += monitors.value(monitor.name, name)
+    for watch in watches:
+        counts.update(watch.seen())
+    return [counts[item] for item in _items(marked)]
+
+
+def merged(one: Sequence[int], other: Sequence[int]) -> list[int]:
+    """Return the counts of two recordings together; the order of recordings makes no difference."""
+    return [a + b for a, b in zip(one, other, strict=True)]
+
+
+def _marked(texts: Mapping[str, str]) -> "_Marked":
+    return _Marked([parse(text, name) for name, text in texts.items()])
+
+
+def _items(marked: "_Marked") -> list[CoverageItem]:
     items = [*marked.items.values(), *(item for file in marked.files for item in _machine_items(file))]
-    return {item: counts[item] for item in sorted(items, key=lambda item: item.position)}
+    return sorted(dict.fromkeys(items), key=lambda item: item.position)
 
 
 # Counters in the tree

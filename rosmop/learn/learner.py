@@ -65,7 +65,10 @@ class LearningResult:
 def learn(
     recordings: Sequence[RecordingFacts], definitions: Definitions, held_out: float, run: Run
 ) -> LearningResult:
-    """Learn from recordings, but hold out the fraction `held_out`. `run` executes the passes. Raises `LearningError`."""
+    """Learn from recordings, but hold out the fraction `held_out`; `run` executes the passes.
+
+    Raises `LearningError`.
+    """
     return _Learner(recordings, definitions, held_out, run).learnt()
 
 
@@ -173,7 +176,8 @@ class _Learner:
 
     def _pass(self, steps: Sequence[AnyStep], nothing: Facts) -> tuple[Any, Any]:
         """Return the merged facts of the training recordings, and of all. Raises `LearningError` if all failed."""
-        trained, held_out = nothing, nothing
+        trained: Any = nothing  # of the kind of the pass
+        held_out: Any = nothing
         waiting = [step for step in steps if step.recording not in self._failed]
         for place, facts in self._run(waiting):
             step = waiting[place]
@@ -250,4 +254,3 @@ def _types_of(recordings: Sequence[RecordingFacts]) -> dict[str, str]:
                     f"{topic} carries {other} in one recording and {kind} in {recording.name}"
                 )
     return types
-

@@ -78,4 +78,3 @@ def split(
         [part for number, part in enumerate(parts) if number not in chosen],
         [part for number, part in enumerate(parts) if number in chosen],
     )
-

@@ -18,7 +18,9 @@ MOST_VALUES = 8
 
 
 def merged_rows(
-    one: Mapping[_Key, Statistic], other: Mapping[_Key, Statistic], merge: Callable[[Statistic, Statistic], Statistic]
+    one: Mapping[_Key, Statistic],
+    other: Mapping[_Key, Statistic],
+    merge: Callable[[Statistic, Statistic], Statistic],
 ) -> dict[_Key, Statistic]:
     """Return the rows of both tables; rows of the same key are merged."""
     rows = {**one, **other}
@@ -129,7 +131,7 @@ class Series(msgspec.Struct):
             self.values.merged(other.values), self.rates.merged(other.rates), self.stays.merged(other.stays),
         )  # fmt: skip
 
-    def add(self, value: float, seconds: float, window: int) -> None:
+    def add(self, value: float | int, seconds: float, window: int) -> None:
         """Add a value and its time. Only whole numbers may be an enumeration."""
         self.count += 1
         if not self.values.many and not isinstance(value, float):

@@ -73,7 +73,9 @@ class TopicOrders:
     """All pairs of some topics."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        names = sorted((name for name in counts if counts[name] >= _FEWEST), key=lambda name: (counts[name], name))
+        names = sorted(
+            (name for name in counts if counts[name] >= _FEWEST), key=lambda name: (counts[name], name)
+        )
         self.names: Sequence[str] = names[:MOST_TOPICS]
         self.left_out: Sequence[str] = names[MOST_TOPICS:]
         self.pairs = {(a, b): TopicPair() for a in self.names for b in self.names if a != b}

@@ -115,7 +115,9 @@ def _merged_elements(one: list[Series], other: list[Series]) -> list[Series]:
     return [a.merged(b) for a, b in zip(one, other, strict=False)]
 
 
-def _merged_moves(one: dict[tuple[Any, Any], int], other: dict[tuple[Any, Any], int]) -> dict[tuple[Any, Any], int]:
+def _merged_moves(
+    one: dict[tuple[Any, Any], int], other: dict[tuple[Any, Any], int]
+) -> dict[tuple[Any, Any], int]:
     return merged_rows(one, other, int.__add__)
 
 
@@ -136,9 +138,13 @@ class TopicContentReader:
     def ended(self) -> TopicContent:
         """End the recording, and return its statistics."""
         content = self.content
-        elements = [element for row in content.elements.values() for element in row]
-        for series in [*content.numbers.values(), *elements, *content.sets.values(), *content.lengths.values()]:
+        for series in [
+            *content.numbers.values(),
+            *(each for row in content.elements.values() for each in row),
+        ]:
             series.end()
+        for values in [*content.sets.values(), *content.lengths.values()]:
+            values.end()
         content.limit()
         return content
 

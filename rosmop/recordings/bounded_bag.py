@@ -64,7 +64,8 @@ class BoundedReader(Reader):
         waiting: list[_Entry] = []
         here, content = -1, BytesIO()
         infos = sorted(self.chunk_infos, key=lambda info: (info.start_time, info.pos))
-        for info, following in zip(infos, [*(info.start_time for info in infos[1:]), 1 << 63], strict=True):
+        nexts = [*(info.start_time for info in infos), 1 << 63][1:]
+        for info, following in zip(infos, nexts, strict=True):
             for entry in self._index(info):
                 heapq.heappush(waiting, entry)
             while waiting and waiting[0][0] < following:
@@ -92,7 +93,7 @@ class BoundedReader(Reader):
             self._entries += (self.bio.tell() - begin - _HEADER) // _ENTRY
             if self._entries * _ENTRY > self._size:
                 raise ReaderError("its chunks share an index.")
-        entries = [tuple(entry) for row in found.values() for entry in row]
+        entries = [(entry.time, entry.chunk_pos, entry.offset) for row in found.values() for entry in row]
         if any(entry[0] < info.start_time for entry in entries):
             raise ReaderError("a chunk has messages before its first time.")
         return entries

@@ -58,7 +58,7 @@ class BoundedMcap:
         connections = {connection.id: connection for connection in self.connections}
         waiting: list[tuple[int, int, int, int, bytes]] = []
         held = 0
-        nexts = [*(place.first for place in self._chunks[1:]), 1 << 64]
+        nexts = [*(place.first for place in self._chunks), 1 << 64][1:]
         for place, following in zip(self._chunks, nexts, strict=True):
             for number, record in enumerate(self._records(place)):
                 if isinstance(record, Message) and record.channel_id in connections:
@@ -73,7 +73,9 @@ class BoundedMcap:
                 yield connections[channel], time, data
             if held > regular_files.LARGEST_CHUNK:
                 limit = regular_files.LARGEST_CHUNK
-                raise ValueError(f"chunks of the same time have more than {limit} bytes: sort the file by time")
+                raise ValueError(
+                    f"chunks of the same time have more than {limit} bytes: sort the file by time"
+                )
 
     def _read_summary(self) -> None:
         self._file.seek(0)
@@ -95,9 +97,7 @@ class BoundedMcap:
                 channels[record.id] = record
             elif isinstance(record, ChunkIndex):
                 chunks.append(
-                    _ChunkPlace(
-                        record.message_start_time, record.chunk_start_offset, record.message_end_time
-                    )
+                    _ChunkPlace(record.message_start_time, record.chunk_start_offset, record.message_end_time)
                 )
             elif isinstance(record, Statistics):
                 count = record.message_count
@@ -137,9 +137,7 @@ class BoundedMcap:
 
     def _stream(self, file: BinaryIO | BytesIO) -> Iterator[McapRecord]:
         limit = regular_files.LARGEST_CHUNK
-        return iter(
-            StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit).records
-        )
+        return iter(StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit).records)
 
     def _charge(self, count: int) -> None:
         self._left -= count

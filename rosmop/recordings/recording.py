@@ -51,7 +51,9 @@ def open_recording(path: Path) -> Reader:
         advice = "; it must be a ROS 1 bag or an MCAP file; `rosbag reindex` repairs a truncated bag"
         text = f"cannot read the bag {path}: {_text_of(error).rstrip('.')}"
         if is_mcap:
-            raise RecordingError(f"cannot read the MCAP file {path}: {_text_of(error).rstrip('.')}") from error
+            raise RecordingError(
+                f"cannot read the MCAP file {path}: {_text_of(error).rstrip('.')}"
+            ) from error
         raise RecordingError(text + (advice if path.is_file() else "")) from error
     return reader
 

@@ -7,23 +7,29 @@ from pathlib import Path
 import typer
 
 from rosmop.tool import check_command, coverage_command, learn_command, run_command
+from rosmop.tool.batch_session import BatchOptions
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.options import (
     SUMMARIES,
-    Bag,
     Bags,
+    BagSets,
     Dot,
     FailUnder,
     Files,
     Folders,
     HoldOut,
     Json,
+    On,
     Out,
     Output,
     Prove,
+    ReportFile,
+    Resume,
+    ShowProgress,
     Svg,
     Topics,
     WhySlow,
+    Workers,
 )
 
 
@@ -49,20 +55,62 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         raise typer.Exit(status)
 
     def run(
-        files: Files, *, bag: Bag, as_json: Json = False, output: Output = None, msg: Folders = None
+        files: Files,
+        *,
+        bags: Bags = None,
+        sets: BagSets = None,
+        as_json: Json = False,
+        output: Output = None,
+        msg: Folders = None,
+        workers: Workers = None,
+        on: On = None,
+        resume: Resume = None,
+        report: ReportFile = None,
+        show_progress: ShowProgress = False,
     ) -> None:
-        run_command.run(program, files, msg or [], bag, output=output, as_json=as_json)
+        """Exit status 3 if recordings failed: they are in the report, and the others are complete."""
+        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
+        raise typer.Exit(run_command.run(program, files, msg or [], options, output=output, as_json=as_json))
 
     def learn(
-        bags: Bags, topics: Topics = None, out: Out = None, hold_out: HoldOut = 0.3, as_json: Json = False
+        *,
+        bags: Bags = None,
+        sets: BagSets = None,
+        topics: Topics = None,
+        out: Out = None,
+        hold_out: HoldOut = 0.3,
+        as_json: Json = False,
+        workers: Workers = None,
+        on: On = None,
+        resume: Resume = None,
+        report: ReportFile = None,
+        show_progress: ShowProgress = False,
     ) -> None:
-        learn_command.learn_monitors(program, bags, topics or [], out, hold_out=hold_out, as_json=as_json)
+        """Exit status 3 if recordings failed: they are reported, and the others were learnt from."""
+        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
+        status = learn_command.learn_monitors(
+            program, options, topics or [], out, hold_out=hold_out, as_json=as_json
+        )
+        raise typer.Exit(status)
 
     def coverage(
-        files: Files, *, bags: Bags, msg: Folders = None, fail_under: FailUnder = 0.0, as_json: Json = False
+        files: Files,
+        *,
+        bags: Bags = None,
+        sets: BagSets = None,
+        msg: Folders = None,
+        fail_under: FailUnder = 0.0,
+        as_json: Json = False,
+        workers: Workers = None,
+        on: On = None,
+        resume: Resume = None,
+        report: ReportFile = None,
+        show_progress: ShowProgress = False,
     ) -> None:
+        """Exit status 3 if recordings failed: they are reported, and not counted."""
+        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         status = coverage_command.coverage(
-            program, files, msg or [], bags, fail_under=fail_under, as_json=as_json
+            program, files, msg or [], options, fail_under=fail_under, as_json=as_json
         )
         raise typer.Exit(status)
 

@@ -1,19 +1,18 @@
 """Report which parts of specifications recordings exercise."""
 
 from collections.abc import Iterable
-from contextlib import closing
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Column
 
-from rosmop.check.sources import compiled_from
+from rosmop.batch.jobs import Coverage, CoverageJob, Failure
+from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
-from rosmop.learn.exercised import CoverageItem, covered
-from rosmop.run.engine import MonitorSet
-from rosmop.tool.bag import RecordedBag, open_bag, refusals
+from rosmop.learn.exercised import CoverageItem, items_of, merged
+from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.specification_input import read_definitions, read_specifications
+from rosmop.tool.specification_input import read_definition_files, read_specifications
 from rosmop.tool.tables import table_of
 from rosmop.tool.terminal import refused, say, say_json
 
@@ -24,38 +23,56 @@ def coverage(
     program: CommandContext,
     files: list[Path],
     folders: list[Path],
-    bags: list[Path],
+    options: BatchOptions,
     *,
     fail_under: float,
     as_json: bool,
 ) -> int:
     """Report the exercised and the missing parts; return the exit status."""
-    recordings = [RecordedBag(program, bag, ["*"]) for bag in bags]
     try:
-        definitions = read_definitions(program, files, folders)
-        for recording in recordings:
-            definitions = recording.definitions.extended(definitions)
-        texts = read_specifications(program, files)
-        monitors = MonitorSet.of(compiled_from(texts, definitions))
-        for bag in bags:
-            with closing(open_bag(program, bag)) as reader:
-                for text in refusals(monitors, reader):
-                    raise program.usage_error(f"{bag}: {text}")
-        counts = covered(texts, definitions, recordings)
+        definitions = read_definition_files(program, files, folders)
+        specifications = Specifications(read_specifications(program, files), definitions)
+        items = items_of(specifications.texts)
     except SpecificationError as error:
         raise refused(error.findings) from None
+    with batch_session(program, options) as session:
+        counts, rows = _covered(session, specifications, items)
+        failed = any("error" in row for row in rows)
+        rows += [
+            {
+                "specification": item.specification, "kind": item.kind, "what": item.what,
+                "file": item.position.file, "line": item.position.line, "count": count,
+            } for item, count in counts.items()
+        ]  # fmt: skip
+        session.write_report(rows)
     exercised = sum(count > 0 for count in counts.values())
     percent = 100 * exercised / len(counts) if counts else 100.0
     if as_json:
-        for item, count in counts.items():
-            say_json({
-                "specification": item.specification, "kind": item.kind, "what": item.what,
-                "file": item.position.file, "line": item.position.line, "count": count,
-            })  # fmt: skip
+        for row in rows:
+            say_json(row)
     else:
         _show(counts)
         say(f"{exercised} of {len(counts)} exercised: {percent:.1f} %")
-    return 1 if percent < fail_under else 0
+    if percent < fail_under:
+        return 1
+    return SOME_FAILED if failed else 0
+
+
+def _covered(
+    session: BatchSession, specifications: Specifications, items: list[CoverageItem]
+) -> tuple[dict[CoverageItem, int], list[dict[str, object]]]:
+    """Return the counts of all recordings, and a row for each recording that failed, which is also printed."""
+    jobs = [CoverageJob(recording, specifications) for recording in session.recordings]
+    counts = [0] * len(items)
+    failures: dict[int, Failure] = {}
+    for number, result in session.results("reading", jobs):
+        if isinstance(result, Coverage):
+            counts = merged(counts, result.counts)
+        elif isinstance(result, Failure):
+            failures[number] = result
+    ordered = sorted(failures.items())
+    session.require([failure for _number, failure in ordered])
+    return dict(zip(items, counts, strict=True)), session.failed_rows(ordered)
 
 
 def _show(counts: dict[CoverageItem, int]) -> None:

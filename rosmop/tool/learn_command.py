@@ -2,13 +2,18 @@
 
 import os
 import sys
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from rosmop.learn.learner import LearningError, LearningResult, learn
-from rosmop.tool.bag import RecordedBag
+from rosmop.batch.jobs import Failure, LearnJob, Survey, SurveyJob, definitions_by_type
+from rosmop.batch.recording_list import RecordingName
+from rosmop.learn.learner import LearningResult, learn
+from rosmop.learn.passes import AlarmFacts, AnyStep, ContentFacts, ContentStep, Facts, TimeFacts, TimeStep
+from rosmop.learn.recordings import LearningError
+from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.progress_bar import progress
 from rosmop.tool.specification_input import BESIDE
 from rosmop.tool.terminal import counted, say, say_json
 from roswire.definitions import Definitions
@@ -19,34 +24,107 @@ from roswire.standard import standard_definitions
 
 def learn_monitors(
     program: CommandContext,
-    bags: list[Path],
+    options: BatchOptions,
     topics: list[str],
     out: Path | None,
     *,
     hold_out: float,
     as_json: bool,
-) -> None:
-    """Propose specifications from the recordings, and print or write them."""
+) -> int:
+    """Propose specifications from the recordings, print or write them, and return the exit status."""
     if out is not None and out.exists():
         raise program.usage_error(f"{out} already exists")
-    if len({os.path.realpath(bag) for bag in bags}) < len(bags):
+    if len({os.path.realpath(bag) for bag in options.bags}) < len(options.bags):
         raise program.usage_error("a recording is given twice: it would test itself")
-    recordings = [RecordedBag(program, bag, topics or ["*"]) for bag in bags]
+    with batch_session(program, options) as session:
+        surveys, failures = _surveys(session, topics or ["*"])
+        recorded = _definitions(program, [survey for _number, survey in surveys])
+        try:
+            learnt = learn(
+                [survey for _number, survey in surveys],
+                standard_definitions().extended(recorded),
+                hold_out,
+                _Passes(session, [session.recordings[number] for number, _survey in surveys], recorded).run,
+            )
+        except LearningError as error:
+            raise program.usage_error(str(error)) from error
+        failures |= {surveys[place][0]: Failure(text) for place, text in learnt.failed.items()}
+        rows = [*session.failed_rows(sorted(failures.items())), *_rows(learnt)]
+        session.write_report(rows)
+    _show(program, learnt, rows, recorded, out, as_json=as_json)
+    return SOME_FAILED if failures else 0
+
+
+def _surveys(session: BatchSession, topics: list[str]) -> tuple[list[tuple[int, Survey]], dict[int, Failure]]:
+    """Return the headers of the recordings by number, and the recordings that failed."""
+    jobs = [SurveyJob(recording, topics) for recording in session.recordings]
+    surveys: list[tuple[int, Survey]] = []
+    failures: dict[int, Failure] = {}
+    for number, result in enumerate(session.in_order("reading headers", jobs)):
+        if isinstance(result, Survey):
+            surveys.append((number, result))
+        elif isinstance(result, Failure):
+            failures[number] = result
+    session.require(list(failures.values()))
+    if not surveys:
+        session.failed_rows(sorted(failures.items()))
+        raise session.program.usage_error("no recording can be read")
+    return surveys, failures
+
+
+def _definitions(program: CommandContext, surveys: Sequence[Survey]) -> Definitions:
+    """Return the definitions of all recordings. Rejects recordings with different definitions of one type."""
     recorded = Definitions({})
-    for recording in recordings:
-        _check_same(program, recording, recorded)
-        recorded = recorded.extended(recording.definitions)
-    definitions = standard_definitions().extended(recorded)
-    total = sum(recording.message_count for recording in recordings)
-    try:
-        with progress("learning", lambda: 2 * total, shares_screen=out is None) as advance:
-            learnt = learn(recordings, definitions, hold_out, advance)
-    except LearningError as error:
-        raise program.usage_error(str(error)) from error
+    for survey in surveys:
+        own = definitions_by_type(survey.definitions)
+        for kind in set(survey.topics.values()) & set(own.message_types) & set(recorded.message_types):
+            if recorded.md5sum(kind) != own.md5sum(kind):
+                raise program.usage_error(
+                    f"{survey.name} has a different definition of {kind} than the recordings before it"
+                )
+        if not set(own.message_types) <= set(recorded.message_types):
+            recorded = recorded.extended(own)
+    return recorded
+
+
+@dataclass(frozen=True)
+class _Passes:
+    """Executes the passes of learning as jobs."""
+
+    session: BatchSession
+    recordings: Sequence[RecordingName]
+    recorded: Definitions
+
+    def run(self, steps: list[AnyStep]) -> Iterator[tuple[int, Facts | LearningError]]:
+        texts = {kind: self.recorded.message(kind).text for kind in self.recorded.message_types}
+        jobs = [LearnJob(self.recordings[step.recording], step, texts) for step in steps]
+        for number, result in self.session.results(_pass_of(steps), jobs):
+            if isinstance(result, Failure):
+                yield number, LearningError(result.text)
+            elif isinstance(result, TimeFacts | ContentFacts | AlarmFacts):
+                yield number, result
+
+
+def _pass_of(steps: Sequence[AnyStep]) -> str:
+    if not steps or isinstance(steps[0], TimeStep):
+        return "learning (1 of 3)"
+    return "learning (2 of 3)" if isinstance(steps[0], ContentStep) else "testing (3 of 3)"
+
+
+def _show(
+    program: CommandContext,
+    learnt: LearningResult,
+    rows: Sequence[dict[str, Any]],
+    recorded: Definitions,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
     if out is not None:
         _write(program, out, learnt, recorded)
     if as_json:
-        _say_rows(learnt)
+        for row in rows:
+            say_json(row)
     elif out is None:
         sys.stdout.write(learnt.text)
     else:
@@ -57,24 +135,15 @@ def learn_monitors(
             say(f"alarms on the held-out part: {widened} widened, {len(learnt.left_out)} left out")
 
 
-def _check_same(program: CommandContext, recording: RecordedBag, others: Definitions) -> None:
-    """Reject recordings with different definitions of one type."""
-    for kind in set(recording.topics.values()) & set(recording.definitions.message_types):
-        if kind in others.message_types and others.md5sum(kind) != recording.definitions.md5sum(kind):
-            raise program.usage_error(
-                f"{recording.name} has a different definition of {kind} than the recordings before it"
-            )
-
-
-def _say_rows(learnt: LearningResult) -> None:
-    for result, rows in (("kept", learnt.candidates), ("left out", learnt.left_out)):
-        for candidate in rows:
-            say_json({
+def _rows(learnt: LearningResult) -> Iterator[dict[str, Any]]:
+    for result, candidates in (("kept", learnt.candidates), ("left out", learnt.left_out)):
+        for candidate in candidates:
+            yield {
                 "specification": learnt.names.get(candidate.key, ""), "topic": candidate.topic, "kind": candidate.kind,
                 "field": candidate.place, "says": candidate.says, "seen": candidate.seen,
                 "support": asdict(candidate.support), "held_out_alarms": candidate.alarms,
                 "result": "widened" if candidate.widened else result,
-            })  # fmt: skip
+            }  # fmt: skip
 
 
 def _write(program: CommandContext, out: Path, learnt: LearningResult, recorded: Definitions) -> None:

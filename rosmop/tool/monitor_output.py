@@ -2,11 +2,11 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
+from rosmop.batch.replay_job import because, place_of
 from rosmop.form.findings import Diagnostic
 from rosmop.run.monitor import MonitorInstance
-from rosmop.run.outcomes import Fault, Outcome, Verdict, bound, lines_of_why, why_of
+from rosmop.run.outcomes import Fault, Outcome, bound, why_of
 from rosmop.tool.terminal import say, say_json
 
 BILLION = 1_000_000_000
@@ -36,7 +36,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
                 "logic": verdict.logic,
                 "category": verdict.category,
                 **({"binding": dict(verdict.binding)} if verdict.binding else {}),
-                **why_of(verdict, _place),
+                **why_of(verdict, place_of),
             }
             for verdict in outcome.verdicts
         ],
@@ -57,15 +57,6 @@ def explained(monitor: MonitorInstance) -> Iterator[str]:
     begins = ", ".join(event.name for event in monitor.code.events if event.creates)
     names = ", ".join(name for name, _, _ in slicing.parameters)
     yield f"a slice for each {names}, begun by {begins}; at most {slices.limit} at a time"
-
-
-def because(verdict: Verdict) -> Iterator[str]:
-    """Yield the messages of the recording that caused a verdict."""
-    return lines_of_why(why_of(verdict, _place).get("why", {}))
-
-
-def _place(source: int) -> dict[str, Any]:
-    return {"index": source - 1}
 
 
 def _fault(fault: Fault) -> dict[str, object]:

@@ -14,7 +14,37 @@ Folders = Annotated[
     typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
 ]
 Bags = Annotated[
-    list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
+    list[Path] | None,
+    typer.Option("--bag", metavar="FILE", help="A recording: a bag or an MCAP file (repeatable)"),
+]
+BagSets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--bags",
+        metavar="DIR",
+        help="All recordings in a folder, of a pattern ('2026-*/*.bag'), or of s3://BUCKET/PREFIX (repeatable)",
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(min=1, metavar="N", help="Processes on this machine; by default one for each processor"),
+]
+On = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Use a Ray cluster: ray://HEAD:PORT, or auto on one of its nodes"),
+]
+Resume = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Keep the results of finished recordings in a file, and use those that it has"
+    ),
+]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", metavar="FILE", help="Also write the report of --json to a file")
+]
+ShowProgress = Annotated[
+    bool,
+    typer.Option("--progress", help="Print the progress on standard error, also if it is not a terminal"),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 Prove = Annotated[
@@ -29,9 +59,11 @@ WhySlow = Annotated[
 ]
 Dot = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz (.dot)")]
 Svg = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture (.svg)")]
-Bag = Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)]
 Output = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="Write the messages that subscribers would have received")
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Write the messages that subscribers would have received, for one recording"
+    ),
 ]
 Topics = Annotated[
     list[str] | None,
@@ -49,7 +81,7 @@ FailUnder = Annotated[
 ]
 SUMMARIES: Mapping[str, str] = {
     "check": "List all errors and warnings with line and column. Exit status 1 if there is an error.",
-    "run": "Run the monitors on a recording, by the recording's clock, and report the result for each message.",
+    "run": "Run the monitors on recordings, by their clock, and report the result for each message or recording.",
     "learn": "Propose specifications from recordings of a robot that behaves correctly, for you to edit.",
     "coverage": "List the events, branches, handlers, states and transitions that the recordings covered or missed.",
 }

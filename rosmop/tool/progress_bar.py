@@ -1,4 +1,4 @@
-"""Show progress: a bar on standard error if that is a terminal, nothing otherwise."""
+"""Show progress on standard error: a bar if that is a terminal, lines if the user wants them, nothing otherwise."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -12,22 +12,39 @@ from rich.progress import (
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
+    TimeRemainingColumn,
 )
 
 
 @contextmanager
 def progress(
-    what: str, total: Callable[[], int], *, shares_screen: bool = False
+    what: str, total: Callable[[], int], *, shares_screen: bool = False, always: bool = False
 ) -> Iterator[Callable[[int], None]]:
     """Yield a function that takes the finished amount of `total()`.
 
     `shares_screen`: the work writes to standard output. If standard output is a terminal, there is no bar.
+    `always`: without a bar, print a line for each percent, with the estimated remaining time.
     """
     console = Console(stderr=True)
-    if not console.is_terminal or (shares_screen and sys.stdout.isatty()):
+    is_bar = console.is_terminal and not (shares_screen and sys.stdout.isatty())
+    if not is_bar and not always:
         yield lambda _done: None
         return
-    columns = (SpinnerColumn(), TextColumn(what), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    columns = (
+        SpinnerColumn(), TextColumn(what), BarColumn(), TaskProgressColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, transient=True, disable=not is_bar) as bar:
         task = bar.add_task(what, total=total() or None)
-        yield lambda done: bar.update(task, completed=done)
+        shown = -1
+
+        def advance(done: int) -> None:
+            nonlocal shown
+            bar.update(task, completed=done)
+            row = bar.tasks[0]
+            if not is_bar and int(row.percentage) > shown:
+                shown = int(row.percentage)
+                left = "" if row.time_remaining is None else f", {row.time_remaining:.0f} s left"
+                sys.stderr.write(f"{what}: {shown} %{left}\n")
+
+        yield advance

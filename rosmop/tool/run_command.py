@@ -1,18 +1,22 @@
-"""Run monitors on a recording."""
+"""Run monitors on recordings."""
 
+from collections.abc import Sequence
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 
-from rosmop.fast.build import fast_path_of
+from rosmop.batch.jobs import Failure
+from rosmop.batch.recording_list import RecordingName
+from rosmop.batch.replay_job import EVER, Replayed, ReplayJob, Specifications, replayed
 from rosmop.form.findings import SpecificationError
+from rosmop.recordings.recording import Reader, definitions_of, open_recording
+from rosmop.recordings.replay import OutputBag, refusals, replay
 from rosmop.run.engine import MonitorSet
-from rosmop.tool.bag import OutputBag, definitions_of, open_bag, refusals, replay
-from rosmop.tool.bounded_bag import BoundedReader
+from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.progress_bar import progress
-from rosmop.tool.specification_input import load
+from rosmop.tool.replay_report import MOST_IN_ROWS, ReplayReport
+from rosmop.tool.specification_input import read_definition_files, read_specifications
 from rosmop.tool.terminal import counted, refused, say, say_json
 
 _PROGRESS_EVERY = 1000
@@ -22,31 +26,86 @@ def run(
     program: CommandContext,
     files: list[Path],
     folders: list[Path],
-    bag: Path,
+    options: BatchOptions,
     *,
     output: Path | None,
     as_json: bool,
+) -> int:
+    """Report the outcome of every message of a single recording, or the effects on many; return the exit status."""
+    try:
+        definitions = read_definition_files(program, files, folders)
+        specifications = Specifications(read_specifications(program, files), definitions)
+        if options.single is not None:
+            with program.reports():
+                _run_single(program, specifications, options.single, output, as_json=as_json)
+            return 0
+    except SpecificationError as error:
+        raise refused(error.findings) from None
+    if output is not None:
+        raise program.usage_error("--output is for a single --bag FILE")
+    with batch_session(program, options) as session:
+        return run_batch(session, specifications, ReplayReport(10, as_json=as_json), strict=False)
+
+
+def run_batch(
+    session: BatchSession,
+    specifications: Specifications,
+    report: ReplayReport,
+    topics: list[str] | None = None,
+    *,
+    margins: bool = False,
+    strict: bool = True,
+) -> int:
+    """Run specifications on all recordings, print the report and return the exit status."""
+    # Each recording has its rows, so the same places are kept with and without --json.
+    jobs = [
+        ReplayJob(recording, specifications, topics or ["*"], EVER, MOST_IN_ROWS, margins, strict)
+        for recording in session.recordings
+    ]
+    results = session.in_order("replaying", jobs)
+    for recording, result in zip(session.recordings, results, strict=True):
+        assert isinstance(result, Replayed | Failure)  # noqa: S101  for mypy: jobs of one kind
+        report.add(recording.uri, result)
+    session.require(report.failures)
+    report.show(specifications.texts)
+    session.write_report(report.rows)
+    return SOME_FAILED if report.failures else 0
+
+
+def run_spans(
+    specifications: Specifications,
+    spans: Sequence[tuple[str, Path, tuple[int, int]]],
+    report: ReplayReport,
+    topics: list[str],
+    *,
+    margins: bool,
 ) -> None:
-    """Report the outcome of every message, by the recording's clock."""
-    with closing(open_bag(program, bag)) as reader:
-        try:
-            compiled = load(program, files, folders, definitions_of(reader))
-        except SpecificationError as error:
-            raise refused(error.findings) from None
-        fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
-        monitors = MonitorSet.of(compiled, fast=fast)
+    """Run specifications on spans of files, each with a name, in this process, and print the report.
+
+    Raises `RecordingError` and `SpecificationError`.
+    """
+    for name, path, span in spans:
+        recording = RecordingName(name, path.stat().st_size, "")
+        job = ReplayJob(recording, specifications, topics, span, MOST_IN_ROWS, margins, strict=True)
+        report.add(name, replayed(job, path))
+    report.show(specifications.texts)
+
+
+def _run_single(
+    program: CommandContext, specifications: Specifications, bag: Path, output: Path | None, *, as_json: bool
+) -> None:
+    with closing(open_recording(bag)) as reader:
+        monitors = specifications.monitors(definitions_of(reader))
         for text in refusals(monitors, reader):
             program.warn(f"{text}; its messages are dropped")
         if output is None:
             _report(monitors, reader, None, as_json=as_json)
         else:
-            with OutputBag(program, output, monitors.definitions) as recording:
+            with OutputBag(output, monitors.definitions) as recording:
                 _report(monitors, reader, recording, as_json=as_json)
 
 
-def _report(
-    monitors: MonitorSet, reader: BoundedReader, recording: OutputBag | None, *, as_json: bool
-) -> None:
+def _report(monitors: MonitorSet, reader: Reader, recording: OutputBag | None, *, as_json: bool) -> None:
     counts = {"passed": 0, "changed": 0, "dropped": 0}
     verdicts = faults = 0
     with progress("replaying", lambda: reader.message_count, shares_screen=True) as advance:

@@ -73,6 +73,20 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
     return definitions
 
 
+def read_definition_files(
+    program: CommandContext, files: Sequence[Path], folders: Sequence[Path]
+) -> dict[str, str]:
+    """Return the texts of these definitions, except those of ROS, by name (`package/File`).
+
+    Raises `SpecificationError` for a definition that cannot be read.
+    """
+    read_definitions(program, files, folders)
+    texts: dict[str, str] = {}
+    for folder in definition_folders(program, files, folders):
+        texts |= definition_texts(program, folder)[0]
+    return texts
+
+
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
     """Return the folders of definitions beside the files, followed by the given folders."""
     for folder in folders:

@@ -45,7 +45,7 @@ ALLOWED = {
     "rosmop/prove/terms.py choice": FIELDS,
     "rosmop/run/outcomes.py __repr__": TEXT,
     "rosmop/text/tree.py fields_of": FIELDS,
-    "rosmop/tool/bag.py _text_of": TEXT,
+    "rosmop/recordings/recording.py _text_of": TEXT,
 }
 """The functions that may look up names, with the reason."""
 

@@ -32,9 +32,6 @@ class Span(NamedTuple):
         return f"{rfc3339(self.since)} to {rfc3339(self.until)} ({seconds:.1f} s)"
 
 
-EVER = Span(0, 1 << 63)
-
-
 class Piece(NamedTuple):
     """A bag of the recorder, its name, and the period to read from the bag. Periods of pieces do not overlap."""
 

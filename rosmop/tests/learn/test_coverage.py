@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import pytest
 
 from rosmop.form.findings import SpecificationError
-from rosmop.learn.exercised import covered
+from rosmop.learn.exercised import CoverageItem, covered, items_of, merged
 from rosmop.tests.acting import message
 from rosmop.tests.learn.test_learner import START, Recorded
 from roswire.standard import standard_definitions
@@ -30,6 +30,16 @@ TEXT = """gate() {
 """
 
 
+def counted(text: str, recordings: Sequence[Recorded]) -> dict[CoverageItem, int]:
+    """Return how often the recordings exercise each item of a specification."""
+    texts = {"gate.rv": text}
+    items = items_of(texts)
+    counts = [0] * len(items)
+    for recording in recordings:
+        counts = merged(counts, covered(texts, standard_definitions(), recording))
+    return dict(zip(items, counts, strict=True))
+
+
 def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
     """Return a recording of numbers, one second apart."""
     rows = tuple(
@@ -41,7 +51,7 @@ def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
 
 def exercised(*recordings: Recorded) -> dict[str, int]:
     """Return how often each `line kind what` was exercised."""
-    found = covered({"gate.rv": TEXT}, standard_definitions(), recordings)
+    found = counted(TEXT, recordings)
     return {f"{item.position.line} {item.kind} {item.what}": count for item, count in found.items()}
 
 
@@ -100,10 +110,7 @@ def test_a_timeout_is_a_transition() -> None:
 }
 """
     recording = recorded("a", [("/a", 0), ("/c", 0), ("/c", 0), ("/c", 0), ("/c", 0), ("/b", 0)])
-    counts = {
-        f"{item.kind} {item.what}": count
-        for item, count in covered({"quiet.rv": text}, standard_definitions(), [recording]).items()
-    }
+    counts = {f"{item.kind} {item.what}": count for item, count in counted(text, [recording]).items()}
     assert counts["transition busy: timeout -> late"] == 1
     assert counts["transition late: default -> late"] == 1
     assert counts["transition late: timeout -> idle"] == 0
@@ -113,7 +120,7 @@ def test_a_timeout_is_a_transition() -> None:
 def test_an_error_is_that_of_the_text() -> None:
     """An error in a specification has the positions and names of the original text."""
     with pytest.raises(SpecificationError) as caught:
-        covered({"gate.rv": TEXT.replace("n--", "m--")}, standard_definitions(), [])
+        counted(TEXT.replace("n--", "m--"), [recorded("a", [])])
     assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: unknown variable `m`")
 
 
@@ -126,7 +133,7 @@ def test_slices_are_counted_together() -> None:
     @fail { __RESET; }
 }"""
     messages = [("/open", 1), ("/open", 2), ("/shut", 1), ("/shut", 2), ("/shut", 1)]
-    found = covered({"gate.rv": text}, standard_definitions(), [recorded("a", messages)])
+    found = counted(text, [recorded("a", messages)])
     counts = {f"{item.kind} {item.what}": count for item, count in found.items()}
     assert counts["event open"] == 2
     assert counts["branch if"] == 1

@@ -8,11 +8,9 @@ from pathlib import Path
 
 import lz4.frame
 import pytest
-import typer
 
-from appliance.cli.monitor.monitor_program import MONITOR
-from rosmop.tool import bounded_bag
-from rosmop.tool.bag import RecordedBag
+from rosmop.recordings import bounded_bag, regular_files
+from rosmop.recordings.recording import RecordedFile, RecordingError
 from tests.support.bags import make_bag, number
 from tests.support.command import rosrv
 
@@ -62,71 +60,66 @@ def message(seconds: int, text: bytes) -> bytes:
     return record({"op": b"\x02", "conn": U32(0), "time": U64(seconds)}, U32(len(text)) + text)
 
 
-def refusal(place: Path, capsys: pytest.CaptureFixture[str]) -> str:
+def refusal(place: Path) -> str:
     """Return the message for a bag that is rejected."""
-    with pytest.raises(typer.Exit) as ended:
-        list(RecordedBag(MONITOR, place, ["*"]).messages())
-    assert ended.value.exit_code == 2
-    return capsys.readouterr().err
+    with pytest.raises(RecordingError) as ended:
+        list(RecordedFile(place, ["*"]).messages())
+    return str(ended.value)
 
 
 @pytest.mark.parametrize(
     ("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress), ("none", bytes)]
 )
 def test_a_chunk_is_unpacked_up_to_a_limit(
-    name: str, pack: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    name: str, pack: Callable[[bytes], bytes], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """A chunk of the largest size is read; a larger one is not unpacked further."""
     one = message(1, b"x" * 1000)
     place = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
-    monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", len(one))
-    assert [data for _topic, _time, data in RecordedBag(MONITOR, place, ["*"]).messages()] == [
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", len(one))
+    assert [data for _topic, _time, data in RecordedFile(place, ["*"]).messages()] == [
         U32(1000) + b"x" * 1000
     ]
     place = bag(tmp_path / "x.bag", [(name, pack(message(1, bytes(2000))), [(1, 0)])])
-    assert f"more than {len(one)} bytes" in refusal(place, capsys)
+    assert f"more than {len(one)} bytes" in refusal(place)
 
 
 @pytest.mark.parametrize(("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress)])
-def test_a_damaged_chunk_is_reported(
-    name: str, pack: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_chunk_is_reported(name: str, pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
     """A cut, invalid or empty chunk ends the command with the reason."""
     packed = pack(message(1, b"x" * 1000))
     for wrong in (packed[:-4], b"?" * 50, b"", packed[:20] + b"?" * 20 + packed[40:]):
-        assert "is damaged" in refusal(bag(tmp_path / "x.bag", [(name, wrong, [(1, 0)])]), capsys)
+        assert "is damaged" in refusal(bag(tmp_path / "x.bag", [(name, wrong, [(1, 0)])]))
 
 
-def test_repeated_reading_is_bounded(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Alternating chunks, several entries for one message, and repeated connections share one limit."""
-    monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", 1 << 20)
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 1 << 20)
     monkeypatch.setattr(bounded_bag, "PER_BYTE", 4)
     large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
     turns = [("bz2", large, [(0, 0)] * 40), ("bz2", large, [(0, 0)] * 40)]
-    assert RecordedBag(MONITOR, bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
+    assert RecordedFile(bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
     one = bag(tmp_path / "one.bag", [("none", message(1, bytes(1 << 17)), [(1, 0)] * 100)])
-    assert "more than 4 times its size" in refusal(one, capsys)
+    assert "more than 4 times its size" in refusal(one)
     chain = record(*CONNECTION)
     offsets = [(1, number * len(chain)) for number in range(500)]
     links = bag(tmp_path / "links.bag", [("none", chain * 500 + message(1, b""), offsets)])
-    assert "more than 4 times its size" in refusal(links, capsys)
+    assert "more than 4 times its size" in refusal(links)
     between = [
         ("bz2", bz2.compress(message(time, b"") * 2 + bytes(1 << 17)), [(time, 0)]) for time in range(20)
     ]
     twice = [(name, packed, [entries[0], (entries[0][0] + 1, 0)]) for name, packed, entries in between]
-    assert "damaged" in refusal(bag(tmp_path / "turns.bag", twice), capsys)
+    assert "damaged" in refusal(bag(tmp_path / "turns.bag", twice))
 
 
-def test_chunks_cannot_share_an_index(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
     """A hundred index entries for one chunk count its messages only once."""
     place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
     data = place.read_bytes()
     info = data[data.index(record(*CONNECTION)) + len(record(*CONNECTION)) :]
     place.write_bytes(data.replace(b"chunk_count=" + U32(1), b"chunk_count=" + U32(100)) + info * 99)
-    assert "share an index" in refusal(place, capsys)
+    assert "share an index" in refusal(place)
 
 
 @pytest.mark.parametrize("times", [[1000.0], [1000.0, 1000.0], [1000.0, 1000.000000001], [1000.0, 1001.0]])

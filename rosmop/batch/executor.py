@@ -1,0 +1,94 @@
+"""The interface of a place that executes jobs, and the loop that gives it jobs and retries those whose worker died.
+
+A job and its result are bytes; `work` of `rosmop.batch.jobs` turns one into the other and depends on nothing else but
+the recording. So the result is the same everywhere.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+ATTEMPTS = 3
+"""How often a job is tried whose worker dies."""
+
+Work = Callable[[bytes], bytes]
+
+
+@dataclass(frozen=True)
+class WorkerDeath:
+    """The worker of a job ended without a result, with the reason."""
+
+    reason: str
+
+
+class Executor(Protocol):
+    """A place that executes jobs at the same time."""
+
+    @property
+    def capacity(self) -> int:
+        """Return the number of jobs to submit before the first result."""
+
+    def submit(self, number: int, job: bytes) -> None:
+        """Begin a job; the number names it."""
+
+    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+        """Wait until at least one submitted job has ended, and return those that have."""
+
+    def close(self) -> None:
+        """End all workers, with their jobs."""
+
+
+class ThisProcess:
+    """Executes jobs one by one in this process."""
+
+    capacity = 1
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+        self._waiting: deque[tuple[int, bytes]] = deque()
+
+    def submit(self, number: int, job: bytes) -> None:
+        """Keep a job for `finished`."""
+        self._waiting.append((number, job))
+
+    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+        """Execute the next job."""
+        number, job = self._waiting.popleft()
+        return [(number, self._work(job))]
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def execute(
+    executor: Executor, jobs: Iterable[tuple[int, bytes]]
+) -> Iterator[tuple[int, bytes | WorkerDeath]]:
+    """Yield the number and the result of each job, in the order in which they end.
+
+    A job whose worker dies is tried `ATTEMPTS` times in all. Jobs are read as they are needed.
+    """
+    supply = iter(jobs)
+    again: deque[tuple[int, bytes]] = deque()
+    running: dict[int, bytes] = {}
+    attempts: dict[int, int] = {}
+    while True:
+        while len(running) < executor.capacity:
+            number, job = again.popleft() if again else next(supply, (None, b""))
+            if number is None:
+                break
+            running[number] = job
+            attempts[number] = attempts.get(number, 0) + 1
+            executor.submit(number, job)
+        if not running:
+            return
+        for number, result in executor.finished():
+            job = running.pop(number)
+            if isinstance(result, WorkerDeath) and attempts[number] < ATTEMPTS:
+                again.append((number, job))
+                continue
+            tried = attempts.pop(number)
+            if isinstance(result, WorkerDeath):
+                yield number, WorkerDeath(f"{result.reason}; tried {tried} times")
+            else:
+                yield number, result

@@ -1,0 +1,102 @@
+"""Execute jobs in processes of this machine. A process that dies takes only its own job with it.
+
+`concurrent.futures` gives up all jobs if one process dies, and does not report which job it had. Here each process has
+a pipe of its own. Jobs and results are bytes, so nothing is unpickled.
+"""
+
+import ctypes
+import os
+import signal
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+
+from rosmop.batch.executor import Work, WorkerDeath
+
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl
+
+
+class ProcessPool:
+    """At most `capacity` processes, which are started as they are needed."""
+
+    def __init__(self, work: Work, capacity: int) -> None:
+        self.capacity = capacity
+        self._work = work
+        self._context = get_context("spawn")
+        self._idle: list[tuple[BaseProcess, Connection]] = []
+        self._running: dict[Connection, tuple[BaseProcess, int]] = {}
+
+    def submit(self, number: int, job: bytes) -> None:
+        """Give a job to an idle process, or to a new one."""
+        while True:
+            is_new = not self._idle
+            process, pipe = self._start() if is_new else self._idle.pop()
+            try:
+                pipe.send_bytes(job)
+            except OSError:
+                if not is_new:  # it died while it was idle
+                    _end(process, pipe)
+                    continue
+            # A new process that died is noticed by `finished`.
+            self._running[pipe] = process, number
+            return
+
+    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+        """Wait for a result, or for the death of a process."""
+        results: list[tuple[int, bytes | WorkerDeath]] = []
+        for pipe in wait(list(self._running)):
+            assert isinstance(pipe, Connection)  # noqa: S101  for mypy: no others are waited for
+            process, number = self._running.pop(pipe)
+            try:
+                result = pipe.recv_bytes()
+            except (EOFError, OSError):
+                process.join()
+                results.append((number, WorkerDeath(_reason(process.exitcode))))
+                pipe.close()
+            else:
+                results.append((number, result))
+                self._idle.append((process, pipe))
+        return results
+
+    def close(self) -> None:
+        """Kill all processes."""
+        for process, pipe in [
+            *self._idle, *((process, pipe) for pipe, (process, _number) in self._running.items())
+        ]:  # fmt: skip
+            _end(process, pipe)
+        self._idle, self._running = [], {}
+
+    def _start(self) -> tuple[BaseProcess, Connection]:
+        near, far = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(self._work, far, os.getpid()), daemon=True)
+        process.start()
+        far.close()
+        return process, near
+
+
+def _end(process: BaseProcess, pipe: Connection) -> None:
+    process.kill()
+    process.join()
+    pipe.close()
+
+
+def _reason(status: int | None) -> str:
+    if status is not None and status < 0:
+        name = signal.Signals(-status).name
+        hint = " (out of memory?)" if -status == signal.SIGKILL else ""
+        return f"its worker was ended by {name}{hint}"
+    return f"its worker ended with status {status}"
+
+
+def _serve(work: Work, pipe: Connection, parent: int) -> None:
+    """Execute jobs until the parent closes the pipe or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the parent, which ends its workers
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != parent:
+        return
+    while True:
+        try:
+            job = pipe.recv_bytes()
+        except EOFError:
+            return
+        pipe.send_bytes(work(job))

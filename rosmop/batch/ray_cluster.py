@@ -1,0 +1,67 @@
+"""Execute jobs as tasks of a Ray cluster, whose nodes have this package installed.
+
+Ray's token authentication is on unless the environment switches it off (`RAY_AUTH_MODE`).
+"""
+
+import logging
+import os
+from typing import Any
+
+from rosmop.batch.executor import Work, WorkerDeath
+
+ADDRESSES = "ray://HEAD:PORT, or auto on a node of the cluster"
+_AHEAD = 2  # jobs for each processor, so that none waits for the next job
+
+
+class ClusterError(Exception):
+    """The cluster cannot be used, with the reason."""
+
+
+class RayCluster:
+    """The processors of a cluster. Raises `ClusterError`."""
+
+    def __init__(self, work: Work, address: str) -> None:
+        if address.removeprefix("ray:") != "auto" and not address.startswith("ray://"):
+            raise ClusterError(f"{address!r} is not a cluster: give {ADDRESSES}")
+        os.environ.setdefault("RAY_AUTH_MODE", "token")
+        try:
+            import ray  # noqa: PLC0415  an optional extra, which takes seconds to load
+        except ImportError:
+            raise ClusterError("Ray is not installed: pip install 'rosmop[ray]'") from None
+        self._ray: Any = ray
+        try:
+            ray.init(
+                address if address.startswith("ray://") else "auto",
+                logging_level=logging.ERROR,
+                log_to_driver=False,
+            )
+            processors = int(self._ray.cluster_resources().get("CPU", 0))
+        except Exception as error:
+            ray.shutdown()
+            raise ClusterError(f"cannot use the cluster {address}: {_first_line(error)}") from error
+        self.capacity = max(processors, 1) * _AHEAD
+        # `execute` tries again, as on one machine.
+        self._task = ray.remote(num_cpus=1, max_retries=0)(work)
+        self._running: dict[Any, int] = {}
+
+    def submit(self, number: int, job: bytes) -> None:
+        """Submit a task."""
+        self._running[self._task.remote(job)] = number
+
+    def finished(self) -> list[tuple[int, bytes | WorkerDeath]]:
+        """Wait for the result of a task, or for the death of its worker or node."""
+        (ready,), _others = self._ray.wait(list(self._running), num_returns=1)
+        number = self._running.pop(ready)
+        try:
+            return [(number, self._ray.get(ready))]
+        except self._ray.exceptions.RayError as error:
+            return [(number, WorkerDeath(f"its worker in the cluster failed: {_first_line(error)}"))]
+
+    def close(self) -> None:
+        """Cancel all tasks, and leave the cluster."""
+        self._ray.shutdown()
+
+
+def _first_line(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

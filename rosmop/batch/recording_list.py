@@ -1,0 +1,61 @@
+"""List the recordings that a user names: files, folders, patterns and S3 prefixes."""
+
+import glob
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+
+from rosmop.batch import object_store
+from rosmop.recordings.recording import RecordingError
+
+ENDINGS = (".bag", ".mcap")
+
+
+class RecordingName(msgspec.Struct, frozen=True):
+    """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents."""
+
+    uri: str
+    size: int
+    version: str
+
+
+def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
+    """Return the recordings, each once: the files, then those of each set in the order of their names.
+
+    A set is a folder (with its folders), a pattern or an S3 prefix. Raises `RecordingError` for a set without
+    recordings.
+    """
+    found: dict[str, RecordingName] = {}
+    for file in files:
+        found.setdefault(os.path.realpath(file), _local(str(file)))
+    for one in sets:
+        if one.startswith(object_store.SCHEME):
+            objects = [RecordingName(*row) for row in object_store.listed(one) if row[0].endswith(ENDINGS)]
+            found.update((row.uri, row) for row in objects)
+            empty = not objects
+        else:
+            paths = sorted(_paths(one))
+            for path in paths:
+                found.setdefault(os.path.realpath(path), _local(path))
+            empty = not paths
+        if empty:
+            raise RecordingError(f"there are no recordings ({', '.join(ENDINGS)}) in {one}")
+    return list(found.values())
+
+
+def _paths(one: str) -> Iterator[str]:
+    if Path(one).is_dir():
+        for folder, _folders, names in os.walk(one):
+            yield from (os.path.join(folder, name) for name in names if name.endswith(ENDINGS))  # noqa: PTH118
+    else:
+        yield from (path for path in glob.glob(one, recursive=True) if not Path(path).is_dir())  # noqa: PTH207
+
+
+def _local(path: str) -> RecordingName:
+    try:
+        status = Path(path).stat()
+    except OSError:
+        return RecordingName(path, 0, "")  # opening it reports the reason
+    return RecordingName(path, status.st_size, str(status.st_mtime_ns))

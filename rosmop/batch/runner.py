@@ -1,0 +1,73 @@
+"""Execute jobs, and return their results: from the journal if it has them, otherwise from workers."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from rosmop.batch.executor import Executor, ThisProcess, WorkerDeath, execute
+from rosmop.batch.jobs import Failure, Job, Result, packed, unpacked, work
+from rosmop.batch.journal import Journal
+from rosmop.batch.process_pool import ProcessPool
+from rosmop.batch.ray_cluster import RayCluster
+
+
+@dataclass(frozen=True)
+class JobRunner:
+    """An executor, and the journal of the command if it has one. `done` gets the number of each job that ended."""
+
+    executor: Executor
+    journal: Journal | None
+
+    def run(
+        self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
+    ) -> Iterator[tuple[int, Result | Failure]]:
+        """Yield the number and the result of each job, in the order in which they end. Failures are not kept."""
+        waiting: list[int] = []
+        for number, job in enumerate(jobs):
+            known = self.journal.result(packed(job)) if self.journal is not None else None
+            if known is None:
+                waiting.append(number)
+                continue
+            done(number)
+            yield number, unpacked(known)
+        for number, answer in execute(self.executor, ((number, packed(jobs[number])) for number in waiting)):
+            if isinstance(answer, WorkerDeath):
+                done(number)
+                yield number, Failure(answer.reason)
+                continue
+            result = unpacked(answer)
+            if self.journal is not None and not isinstance(result, Failure):
+                self.journal.add(packed(jobs[number]), answer)
+            done(number)
+            yield number, result
+
+    def in_order(
+        self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
+    ) -> Iterator[Result | Failure]:
+        """Yield the results in the order of the jobs."""
+        early: dict[int, Result | Failure] = {}
+        following = 0
+        for number, result in self.run(jobs, done):
+            early[number] = result
+            while following in early:
+                yield early.pop(following)
+                following += 1
+
+
+@contextmanager
+def executor_for(recordings: int, workers: int | None, cluster: str | None) -> Iterator[Executor]:
+    """Open a block with an executor: a cluster, processes of this machine, or this process for one recording or worker.
+
+    Raises `ClusterError`.
+    """
+    executor: Executor
+    count = min(workers or len(os.sched_getaffinity(0)), recordings)
+    if cluster is not None:
+        executor = RayCluster(work, cluster)
+    else:
+        executor = ProcessPool(work, count) if count > 1 else ThisProcess(work)
+    try:
+        yield executor
+    finally:
+        executor.close()

@@ -1,0 +1,129 @@
+"""The recordings of a command and the executor of its jobs, for `run`, `learn`, `coverage` and `replay`.
+
+Exit status 3 if one of several recordings failed. A single recording that fails is a usage error.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import typer
+
+from rosmop.batch.jobs import Failure, Job, Result
+from rosmop.batch.journal import Journal, JournalError
+from rosmop.batch.ray_cluster import ClusterError
+from rosmop.batch.recording_list import RecordingName, recordings_of
+from rosmop.batch.runner import JobRunner, executor_for
+from rosmop.recordings.recording import RecordingError
+from rosmop.tool.command_context import CommandContext
+from rosmop.tool.progress_bar import progress
+from rosmop.tool.terminal import refused
+
+SOME_FAILED = 3
+_INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """The options of a command with recordings."""
+
+    bags: Sequence[Path] = ()
+    sets: Sequence[str] = ()
+    workers: int | None = None
+    on: str | None = None
+    resume: Path | None = None
+    report: Path | None = None
+    progress: bool = False
+
+    @property
+    def single(self) -> Path | None:
+        """Return the recording if it is a single one and no option concerns many; otherwise None."""
+        many = self.sets or self.workers or self.on or self.resume or self.report
+        return self.bags[0] if len(self.bags) == 1 and not many else None
+
+
+@dataclass(frozen=True)
+class BatchSession:
+    """The recordings, and a runner of jobs on them."""
+
+    program: CommandContext
+    recordings: Sequence[RecordingName]
+    options: BatchOptions
+    runner: JobRunner
+
+    def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
+        """Yield the number and result of each job, in the order in which they end, and show progress by bytes."""
+        with self._progress(what, jobs) as done:
+            yield from self.runner.run(jobs, done)
+
+    def in_order(self, what: str, jobs: Sequence[Job]) -> Iterator[Result | Failure]:
+        """Yield the results in the order of the jobs, and show progress by bytes."""
+        with self._progress(what, jobs) as done:
+            yield from self.runner.in_order(jobs, done)
+
+    def require(self, failures: Sequence[Failure]) -> None:
+        """Exit if all recordings failed for the same errors of specifications, or if the only one failed."""
+        if len(failures) < len(self.recordings):
+            return
+        findings = [failure.findings for failure in failures]
+        if findings[0] and all(other == findings[0] for other in findings):
+            raise refused(findings[0])
+        if len(failures) == 1:
+            raise self.program.usage_error(failures[0].text)
+
+    def failed_rows(self, failures: Iterable[tuple[int, Failure]]) -> list[dict[str, object]]:
+        """Return a row for each recording that failed, by its number, and print its reason on standard error."""
+        rows: list[dict[str, object]] = []
+        for number, failure in failures:
+            uri = self.recordings[number].uri
+            self.program.warn(f"{uri} failed: {failure.text}")
+            rows.append({"kind": "recording", "bag": uri, "error": failure.text})
+        return rows
+
+    def write_report(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Write the rows to the file of --report, if it is given."""
+        if self.options.report is None:
+            return
+        lines = "".join(json.dumps(msgspec.to_builtins(row)) + "\n" for row in rows)
+        try:
+            self.program.write(self.options.report, lines.encode("utf-8", "surrogateescape"))
+        except OSError as error:
+            raise self.program.usage_error(f"cannot write {self.options.report}: {error.strerror}") from error
+
+    @contextmanager
+    def _progress(self, what: str, jobs: Sequence[Job]) -> Iterator[Any]:
+        sizes = [job.recording.size for job in jobs]
+        finished = 0
+        with progress(what, lambda: sum(sizes), shares_screen=True, always=self.options.progress) as advance:
+
+            def done(number: int) -> None:
+                nonlocal finished
+                finished += sizes[number]
+                advance(finished)
+
+            yield done
+
+
+@contextmanager
+def batch_session(program: CommandContext, options: BatchOptions) -> Iterator[BatchSession]:
+    """Open a block with the recordings of the options. Exits with status 2 if there are none or an option is wrong."""
+    if not options.bags and not options.sets:
+        raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
+    with ExitStack() as opened:
+        try:
+            recordings = recordings_of(options.bags, options.sets)
+            journal = None if options.resume is None else opened.enter_context(Journal(options.resume))
+            executor = opened.enter_context(executor_for(len(recordings), options.workers, options.on))
+            yield BatchSession(program, recordings, options, JobRunner(executor, journal))
+        except (RecordingError, JournalError, ClusterError) as error:
+            raise program.usage_error(str(error)) from error
+        except KeyboardInterrupt:
+            kept = "add --resume FILE to keep what is finished"
+            if options.resume is not None:
+                kept = f"{options.resume} has what is finished; the same command continues"
+            program.warn(f"interrupted; {kept}")
+            raise typer.Exit(_INTERRUPTED) from None
