@@ -5,7 +5,7 @@ recording's length.
 """
 
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -146,10 +146,10 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 @contextmanager
 def local_file(recording: RecordingName) -> Iterator[Path]:
     """Open a block with the path of a recording, which is fetched if it is remote. Errors have the name of the user."""
-    if not recording.uri.startswith(SCHEME):
-        yield Path(recording.uri)
-        return
-    with fetched(recording.uri, recording.version) as path:
+    with ExitStack() as opened:
+        path = Path(recording.path)
+        if recording.uri.startswith(SCHEME):
+            path = opened.enter_context(fetched(recording.uri, recording.version))
         try:
             yield path
         except RecordingError as error:

@@ -39,10 +39,13 @@ class Journal:
             raise JournalError(f"cannot open {path}: {error.strerror}") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._places = dict(self._read())
+        except JournalError:
+            self._file.close()
+            raise
         except OSError as error:
             self._file.close()
             raise JournalError(f"{path} is in use by another command") from error
-        self._places = dict(self._read())
 
     def __enter__(self) -> Self:
         return self

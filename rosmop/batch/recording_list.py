@@ -14,11 +14,15 @@ ENDINGS = (".bag", ".mcap")
 
 
 class RecordingName(msgspec.Struct, frozen=True):
-    """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents."""
+    """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents.
+
+    `path` is the absolute path of a local file, because workers have other current folders.
+    """
 
     uri: str
     size: int
     version: str
+    path: str = ""
 
 
 def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
@@ -53,9 +57,10 @@ def _paths(one: str) -> Iterator[str]:
         yield from (path for path in glob.glob(one, recursive=True) if not Path(path).is_dir())  # noqa: PTH207
 
 
-def _local(path: str) -> RecordingName:
+def _local(uri: str) -> RecordingName:
+    path = Path(uri).absolute()
     try:
-        status = Path(path).stat()
+        status = path.stat()
     except OSError:
-        return RecordingName(path, 0, "")  # opening it reports the reason
-    return RecordingName(path, status.st_size, str(status.st_mtime_ns))
+        return RecordingName(uri, 0, "", str(path))  # opening it reports the reason
+    return RecordingName(uri, status.st_size, str(status.st_mtime_ns), str(path))

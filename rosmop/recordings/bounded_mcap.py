@@ -6,7 +6,8 @@ waiting messages of such chunks have at most `LARGEST_CHUNK` bytes in all.
 
 import heapq
 from collections.abc import Iterator
-from io import SEEK_END, BytesIO
+from dataclasses import replace
+from io import SEEK_END
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -14,7 +15,7 @@ import lz4.frame
 import zstandard
 from mcap.exceptions import McapError
 from mcap.records import Channel, Chunk, ChunkIndex, Footer, McapRecord, Message, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.interfaces import Connection, ConnectionExtRosbag1, MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
@@ -125,17 +126,17 @@ class BoundedMcap:
         kind = normalize_msgtype(schema.name)
         return Connection(channel.id, channel.topic, kind, definition, digest, 0, sender, self)
 
-    def _records(self, place: _ChunkPlace) -> Iterator[McapRecord]:
-        """Yield the records in a chunk."""
+    def _records(self, place: _ChunkPlace) -> list[McapRecord]:
+        """Return the records in a chunk."""
         self._file.seek(place.offset)
         chunk = next(self._stream(self._file), None)
         if not isinstance(chunk, Chunk):
             raise ValueError("its index does not fit its chunks")
         data = _unpacked(chunk)
         self._charge(len(chunk.data) + len(data))
-        return self._stream(BytesIO(data))
+        return breakup_chunk(replace(chunk, compression="", data=data))
 
-    def _stream(self, file: BinaryIO | BytesIO) -> Iterator[McapRecord]:
+    def _stream(self, file: BinaryIO) -> Iterator[McapRecord]:
         limit = regular_files.LARGEST_CHUNK
         return iter(StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=limit).records)
 

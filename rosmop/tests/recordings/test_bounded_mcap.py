@@ -1,0 +1,103 @@
+"""Damaged and hostile MCAP files: bounded memory and time, and an error with the reason."""
+
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from rosmop.recordings import bounded_mcap, regular_files
+from rosmop.recordings.recording import RecordedFile, RecordingError
+
+
+def make_mcap(
+    path: Path,
+    rows: Sequence[tuple[int, bytes]],
+    *,
+    chunk: int = 200,
+    compression: CompressionType = CompressionType.NONE,
+    encoding: str = "ros1",
+) -> Path:
+    """Write strings (nanoseconds, bytes) on /t."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk, compression=compression)
+        writer.start(profile="ros1")
+        schema = writer.register_schema("std_msgs/String", "ros1msg", b"string data")
+        channel = writer.register_channel("/t", encoding, schema)
+        for time, data in rows:
+            writer.add_message(channel, time, data, time)
+        writer.finish()
+    return path
+
+
+def refusal(path: Path) -> str:
+    """Return the reason why a file is rejected."""
+    with pytest.raises(RecordingError) as ended:
+        list(RecordedFile(path, ["*"]).messages())
+    return str(ended.value)
+
+
+def test_messages_are_in_the_order_of_time(tmp_path: Path) -> None:
+    """Chunks whose times overlap are merged; messages of one time keep the order of the file."""
+    chance = random.Random(1)  # noqa: S311  no secret
+    rows = [(number // 20 * 10 + chance.randrange(40), str(number).encode()) for number in range(500)]
+    found = list(RecordedFile(make_mcap(tmp_path / "x.mcap", rows), ["*"]).messages())
+    assert [(time, data) for _topic, time, data in found] == sorted(rows, key=lambda row: row[0])
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_chunk_is_unpacked_up_to_a_limit(
+    compression: CompressionType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file that unpacks to more than the limit is rejected before it is unpacked whole."""
+    path = make_mcap(tmp_path / "x.mcap", [(1, bytes(100_000))], chunk=200_000, compression=compression)
+    assert len(next(RecordedFile(path, ["*"]).messages())[2]) == 100_000
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
+    reason = "exceeds limit 50000" if compression is CompressionType.NONE else "more than 50000 bytes"
+    assert reason in refusal(path)
+
+
+def test_chunks_of_one_time_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file all of whose chunks overlap does not fill the memory."""
+    rows = [(time, bytes(1000)) for _chunk in range(40) for time in (1, 1000)]
+    path = make_mcap(tmp_path / "x.mcap", rows, chunk=1500)
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 20_000)
+    assert "sort the file by time" in refusal(path)
+
+
+def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The work is at most a multiple of the size of the file."""
+    rows = [(time, bytes(10_000)) for time in range(50)]
+    path = make_mcap(tmp_path / "x.mcap", rows, chunk=20_000, compression=CompressionType.ZSTD)
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 50_000)
+    monkeypatch.setattr(bounded_mcap, "PER_BYTE", 1)
+    assert "unpacks to more than 1 times its size" in refusal(path)
+
+
+def test_other_files_are_named(tmp_path: Path) -> None:
+    """A file of ROS 2, one that was cut off and an empty one give the reason."""
+    rows = [(1, b"x")]
+    assert "only of encoding cdr" in refusal(make_mcap(tmp_path / "2.mcap", rows, encoding="cdr"))
+    whole = make_mcap(tmp_path / "1.mcap", rows).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[:-20])
+    assert "cannot read the MCAP file" in refusal(tmp_path / "cut.mcap")
+    assert "has no messages" in refusal(make_mcap(tmp_path / "0.mcap", []))
+
+
+def test_damage_gives_messages_or_the_reason(tmp_path: Path) -> None:
+    """No change of bytes gives another exception."""
+    rows = [(time, bytes([time]) * 30) for time in range(60)]
+    chance, ended = random.Random(5), 0  # noqa: S311  the same each time
+    for compression in CompressionType:
+        whole = make_mcap(tmp_path / "whole.mcap", rows, compression=compression).read_bytes()
+        for _turn in range(150):
+            data = bytearray(whole)
+            for _byte in range(3):
+                data[chance.randrange(9, len(data))] = chance.randrange(256)
+            (tmp_path / "damaged.mcap").write_bytes(data)
+            try:
+                list(RecordedFile(tmp_path / "damaged.mcap", ["*"]).messages())
+            except RecordingError:
+                ended += 1
+    assert ended > 50

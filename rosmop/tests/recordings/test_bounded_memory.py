@@ -1,0 +1,32 @@
+"""A long recording needs no more memory than a short one."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from rosmop.tests.batch.test_many_recordings import make_bag
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from rosmop.recordings.recording import RecordedFile
+count = sum(1 for _ in RecordedFile(Path(sys.argv[1]), ["*"]).messages())
+# ru_maxrss would include the memory of the process that started this one.
+(most,) = [line.split()[1] for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line]
+print(count, most)
+"""
+
+
+def memory(path: Path, count: int) -> int:
+    """Return the most memory of a process that reads a recording, in KiB."""
+    command = [sys.executable, "-P", "-c", PROGRAM, path]
+    read, most = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert int(read) == count
+    return int(most)
+
+
+def test_the_index_is_not_kept(tmp_path: Path) -> None:
+    """Two hundred thousand messages take at most 8 MiB more than ten thousand; an index of all would take 30 MiB."""
+    short = memory(make_bag(tmp_path / "short.bag", 1, 10_000), 10_000)
+    long = memory(make_bag(tmp_path / "long.bag", 1, 200_000), 200_000)
+    assert long - short < 8 * 1024
