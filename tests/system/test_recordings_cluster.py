@@ -48,7 +48,7 @@ class Cluster:
             f"--runtime-env-agent-port={AGENT}", f"--temp-dir={self.folder}",
         ]  # fmt: skip
         command = [
-            BIN / "ray",
+            str(BIN / "ray"),
             "start",
             "--num-cpus=1",
             "--disable-usage-stats",

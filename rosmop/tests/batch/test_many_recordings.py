@@ -123,7 +123,7 @@ def test_mcap_files_are_recordings(folder: Path) -> None:
             for number in range(400):
                 time = 10**9 + number * 10**8
                 writer.add_message(channel, time, message(KIND, data=number * 7 % 100), time)
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]  # mcap has no type for it
         assert rosmop("run limit.rv --bag 0.mcap --json")[1] == expected
 
 

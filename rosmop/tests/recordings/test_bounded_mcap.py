@@ -27,7 +27,7 @@ def make_mcap(
         channel = writer.register_channel("/t", encoding, schema)
         for time, data in rows:
             writer.add_message(channel, time, data, time)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap has no type for it
     return path
 
 
