@@ -189,7 +189,7 @@ class MonitorSet:
         """The known initial states of the monitors that guard topics, as returned by `shape`."""
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
-        self._silent: dict[tuple[str, int], BatchOptions] = {}
+        self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
         self._execution = MonitorExecution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
@@ -629,11 +629,10 @@ class MonitorSet:
         """Process a message by its lane if possible, as the relay does."""
 
         def silent(lane: FastLane) -> BatchOptions:
-            key = topic, sender.source
-            if key not in self._silent:
-                told = [True] * len(lane.events)
-                self._silent[key] = lane.prepare(loud=True, told=told, source=sender.source)
-            return self._silent[key]
+            # Not by source: in a recording, each message has its own.
+            if topic not in self._silent:
+                self._silent[topic] = lane.prepare(loud=True, told=[True] * len(lane.events))
+            return self._silent[topic]._replace(source=sender.source)
 
         taken = self.process_fast(topic, buffer, time_ns, silent)
         return self.process(topic, buffer, time_ns, sender) if taken is None else taken
