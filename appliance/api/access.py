@@ -2,7 +2,8 @@
 
 Invariants:
 
-1. Only a token from control's list that has not expired identifies its owner.
+1. Only a token from control's list that has not expired identifies its owner. Before the first list arrives, clients
+   are asked to try again, because "revoked" would end their sessions.
 2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
    wait between checks, so guessing cannot keep the process busy.
 3. A valid token is remembered only as a hash under a random key of this process, never in clear text. A change of the
@@ -61,6 +62,7 @@ class TokenAuthenticator:
         self._used = used
         self._reported: dict[str, float] = {}  # by token: the time of the last report
         self._tokens: dict[str, TokenKept] = {}
+        self._stated = False
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
         # Counted separately, so that a peer that tries random ids does not lock out a neighbour with a valid token.
@@ -78,6 +80,7 @@ class TokenAuthenticator:
     def state(self, tokens: Iterable[TokenKept]) -> None:
         """Accept only these tokens from now on."""
         self._tokens = {token.id: token for token in tokens}
+        self._stated = True
         self._recognised.clear()
         self._reported.clear()
 
@@ -87,9 +90,11 @@ class TokenAuthenticator:
         return kept is not None and time.time() < kept.expires  # a rotation may have brought its end forward
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
-        """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429)."""
+        """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
         if authorization is None:
             raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
+        if not self._stated:
+            raise ProblemError(503, "not-available", "the appliance is starting: try again", retry_after=1)
         scheme, _space, text = authorization.partition(" ")
         text = text.strip() if scheme.lower() == "bearer" else ""
         parsed = parse_token(text)

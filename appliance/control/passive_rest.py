@@ -68,6 +68,7 @@ class PassiveRest:
     def attach(self, channel: Channel) -> None:
         """Serve a new api process."""
         self._link.attach(channel)
+        self._tokens.read()  # with an empty list, the api would tell users that their tokens are revoked
         self._state_tokens()
 
     def release(self) -> Channel | None:

@@ -40,6 +40,18 @@ def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
     assert recognise(door, f"Bearer {text}") == 401
 
 
+def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> None:
+    """A client tries again, instead of ending its session; a request without a token is rejected at once."""
+    row, text = make_token("alice", "viewer", now=time.time(), seconds=60)
+    door = TokenAuthenticator(10, lambda _token: None)
+    assert recognise(door, f"Bearer {text}") == 503
+    assert recognise(door, None) == 401
+    door.state([])
+    assert recognise(door, f"Bearer {text}") == 401
+    door.state([kept(row)])
+    assert recognise(door, f"Bearer {text}").name == "alice"
+
+
 def test_an_expired_token_is_refused() -> None:
     """A token is refused after its expiry, even if it was recognised before."""
     row, text = make_token("a", "viewer", now=time.time() - 100, seconds=50)
