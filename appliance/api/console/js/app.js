@@ -17,33 +17,40 @@ import { Monitors } from "./monitors/view.js";
 import { Now } from "./now/view.js";
 import { PolicyView } from "./policy/view.js";
 import { Recordings } from "./recordings/view.js";
+import { PairBanner } from "./standby/pair.js";
+import { StandbyPage } from "./standby/page.js";
+import { passive } from "./standby/passive.js";
 import { NotLive } from "./standing.js";
 
 const SHOWN = { now: Now, graph: GraphView, audit: Audit, policy: PolicyView, monitors: Monitors, hosts: Hosts, recordings: Recordings };
 
 export function App() {
   const { current, locked, number } = useStore(session);
-  return html`${!current && (locked ? html`<${Lock} key="lock" />` : html`<${Door} key="door" />`)}
-    ${(current || locked) && html`<div key=${number} hidden=${!current}><${Shell} /></div>`}`;
+  const standby = useStore(passive, (one) => one.active !== "") && current !== null;
+  return html`${standby && html`<${StandbyPage} />`}${!current && (locked ? html`<${Lock} key="lock" />` : html`<${Door} key="door" />`)}
+    ${(current || locked) && html`<div key=${number} hidden=${!current || standby}><${Shell} standby=${standby} /></div>`}`;
 }
 
-function Shell() {
+/** The navigation and the view. A standby has nothing to follow: unsaved work is kept until it is active again. @param {{standby: boolean}} given */
+function Shell({ standby }) {
   const { view } = useStore(place);
   useEffect(() => {
-    start({ graph: view === "graph" });
-  }, [view]);
+    if (!standby) start({ graph: view === "graph" });
+  }, [view, standby]);
   useEffect(() => {
+    if (standby) return undefined;
     startNotable();
     return () => {
       stop();
       stopNotable();
       clearToasts();
     };
-  }, []);
+  }, [standby]);
   useEffect(() => {
+    if (standby) return;
     document.title = `${view[0].toUpperCase()}${view.slice(1)} · ROSRV`;
     scrollTo(0, 0);
-  }, [view]);
+  }, [view, standby]);
   const help = useShortcuts();
   const View = SHOWN[/** @type {keyof typeof SHOWN} */ (view)];
   const skip = (/** @type {Event} */ event) => {
@@ -52,6 +59,6 @@ function Shell() {
   };
   return html`<a class="skip" href="#main" onClick=${skip}>Skip to the view</a>
     <div class="shell"><${Nav} />
-      <main class="main" id="main" tabindex="-1"><${NotLive} /><${View} /></main></div>
+      <main class="main" id="main" tabindex="-1"><${NotLive} /><${PairBanner} /><${View} /></main></div>
     <${Toasts} />${help}`;
 }

@@ -14,6 +14,12 @@ export class Problem extends Error {
     /** @type {{where: string, text: string}[]} */
     this.errors = Array.isArray(body.errors) ? body.errors : [];
     this.retryAfter = retryAfter;
+    this.active = body.active ?? "";
+  }
+
+  /** The kind of the problem: the end of its type. */
+  get kind() {
+    return this.type.split(":").pop();
   }
 
   /** Whether the same request may succeed later. */

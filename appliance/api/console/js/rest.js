@@ -3,6 +3,7 @@
 import { proof, readingKey } from "./keys.js";
 import { Problem } from "./problem.js";
 import { end, session, unlocked } from "./session.js";
+import { passive } from "./standby/passive.js";
 
 /**
  * @typedef {{query?: Record<string, any>, json?: any, text?: string, match?: string, token?: string,
@@ -43,6 +44,7 @@ export async function send(method, path, { query, json, text, match, token, head
   if (response.ok) return response;
   const problem = await problemOf(response);
   if (problem.status === 401 && !token && holder && holder === session.get().current?.token) end(problem.message);
+  if (problem.kind === "standby") passive.update({ active: problem.active });
   throw problem;
 }
 

@@ -10,6 +10,7 @@ import { By, Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
+import { Pair } from "../standby/pair.js";
 import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { Alarms, placeOf } from "./alarms.js";
@@ -37,7 +38,7 @@ export function Now() {
     <div class="now-grid">
       <div class="now-alarms"><${Alarms} alarms=${alarms} incidents=${incidents} /></div>
       <div class="now-main stack"><${Curves} /><${Refusals} /><${Doings} /></div>
-      <div class="now-processes"><${Processes} status=${status} /></div>
+      <div class="now-processes stack">${status.standby && html`<${Pair} state=${status.standby} orders />`}<${Processes} status=${status} /></div>
     </div>`;
 }
 

@@ -1,0 +1,34 @@
+/** The page of a standby: its state, and the way to the active appliance's console. */
+
+import { html, useEffect } from "../html.js";
+import { Given } from "../parts/given.js";
+import { Mark } from "../parts/icon.js";
+import { Failure, Loading } from "../parts/notice.js";
+import { useResource } from "../parts/resource.js";
+import { get } from "../rest.js";
+import { end } from "../session.js";
+import { useStore } from "../store.js";
+import { Pair } from "./pair.js";
+import { passive } from "./passive.js";
+
+const EVERY = 3000; // milliseconds
+
+export function StandbyPage() {
+  const { active } = useStore(passive);
+  const { value, error, again } = useResource((signal) => get("/v1/standby", {}, signal), []);
+  useEffect(() => {
+    document.title = "Standby · ROSRV";
+    const timer = setInterval(again, EVERY);
+    return () => clearInterval(timer);
+  }, []);
+  useEffect(() => {
+    if (value?.role === "active") passive.update({ active: "" });
+  }, [value]);
+  const there = `${location.protocol}//${active}${location.port && `:${location.port}`}/console/now`;
+  return html`<main class="door" id="main"><div class="door-box standby">
+    <div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">Standby</h1><div class="brand-sub">${value && !value.other.connected ? "The other appliance is away." : "The robot's nodes use the other appliance."}</div></div></div>
+    <a class="button primary" href=${there} rel="noreferrer"><span>Open the console of ${value ? html`<${Given} value=${value.other.name} most=${40} />` : "the active appliance"}</span></a>
+    ${value ? html`<${Pair} state=${value} />` : error ? html`<${Failure} error=${error} />` : html`<section class="panel"><${Loading} rows=${3} /></section>`}
+    <div class="row row-apart"><span class="muted small"><${Given} value=${there} mono /></span><button class="button small" onClick=${() => end(null)}>Sign out</button></div>
+  </div></main>`;
+}

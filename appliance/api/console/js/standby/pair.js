@@ -1,0 +1,68 @@
+/** The two appliances and the witness: a panel, and a banner on every view while something is wrong. */
+
+import { html } from "../html.js";
+import { live } from "../live.js";
+import { lasting, Moment } from "../moments.js";
+import { counted } from "../numbers.js";
+import { Badge } from "../parts/badge.js";
+import { Given } from "../parts/given.js";
+import { Icon } from "../parts/icon.js";
+import { useStore } from "../store.js";
+import { SwitchOver } from "./switch.js";
+
+const SILENT = 5; // seconds, as in channel/standby_summary.py
+const GRAVE = ["both-active", "standby-away", "standby-behind", "witness-silent"];
+
+/** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */
+export function Pair({ state, orders = false }) {
+  const { other, witness } = state;
+  const active = state.role === "active";
+  return html`<section class="panel" aria-labelledby="pair"><div class="panel-head"><h2 id="pair">Two appliances</h2>
+      ${orders && html`<span class="end"><${SwitchOver} state=${state} /></span>`}</div>
+    <div class="table-wrap"><table class="table"><thead><tr><th>Appliance</th><th>State</th></tr></thead><tbody>
+      <tr><${Name} name=${state.name} address=${state.address} more="this one" /><td><${Badge} word=${state.role} tone=${active ? "allow" : "note"} /><div class="muted small">since <${Moment} at=${state.since} />, epoch ${state.epoch}</div></td></tr>
+      <tr><${Name} name=${other.name} address=${other.address} /><td>${active ? html`<${Follower} other=${other} />` : html`<${Leader} other=${other} />`}</td></tr>
+      <tr><${Name} name="Witness" address=${witness.address} more="on the robot" /><td><${Witness} witness=${witness} name=${state.name} active=${active} /></td></tr>
+    </tbody></table></div>
+    <div class="panel-body small muted">Nodes reach the active appliance at <${Given} value=${state.fixed} mono />.${active ? ` ${waits(state)}` : ""}</div></section>`;
+}
+
+/** The most urgent condition of the two appliances. */
+export function PairBanner() {
+  const alarm = useStore(live, (one) => one.alarms.find(({ kind }) => GRAVE.includes(kind)));
+  return alarm ? html`<div class="banner" role="status"><${Icon} name="warn" /><span><${Given} value=${alarm.text} most=${400} /></span></div>` : null;
+}
+
+function Name(/** @type {{name: string, address: string, more?: string}} */ { name, address, more }) {
+  return html`<td class="first"><strong><${Given} value=${name} most=${40} /></strong>${more && html` <span class="muted small">${more}</span>`}<div class="small"><${Given} value=${address} mono /></div></td>`;
+}
+
+/** The standby, as the active appliance sees it. */
+function Follower(/** @type {{other: any}} */ { other }) {
+  if (!other.connected) return html`<${Away} other=${other} />`;
+  if (other.in_sync) return html`<${Badge} word="in sync" tone="allow" /><div class="muted small">can take over</div>`;
+  const lag = other.behind_changes ? `${counted(other.behind_changes, "change")}, ${counted(other.behind_bytes, "byte")}` : "the last changes";
+  return html`<${Badge} word="behind" tone="warn" /><div class="muted small">lacks ${lag}; cannot take over</div>`;
+}
+
+/** The active appliance, as the standby sees it. */
+function Leader(/** @type {{other: any}} */ { other }) {
+  return other.connected ? html`<${Badge} word="active" tone="allow" /><div class="muted small">connected: its changes arrive here</div>` : html`<${Away} other=${other} />`;
+}
+
+function Away(/** @type {{other: any}} */ { other }) {
+  return html`<${Badge} word="away" tone="deny" /><div class="muted small">${other.trouble_seconds === null ? "" : `for ${lasting(other.trouble_seconds)}`}${other.reason && html`: <${Given} value=${other.reason} most=${200} />`}</div>`;
+}
+
+function Witness(/** @type {{witness: any, name: string, active: boolean}} */ { witness, name, active }) {
+  const { answered_seconds: seconds, holder } = witness;
+  const silent = seconds === null || seconds >= SILENT;
+  const wrong = active && !silent && holder !== "" && holder !== name;
+  const words = silent ? (seconds === null ? "it has never answered" : `no answer for ${lasting(seconds)}`) : holder ? html`the lease is held by <${Given} value=${holder} most=${40} />` : "no appliance holds the lease";
+  return html`<${Badge} word=${silent ? "silent" : wrong ? "names the other" : "answers"} tone=${silent || wrong ? "deny" : "allow"} /><div class="muted small">${words}</div>`;
+}
+
+function waits(/** @type {any} */ state) {
+  if (state.wait === "none") return "Answers do not wait for the standby (availability.wait: none).";
+  return state.answers_alone ? "Answers do not wait for the standby, because it is not in sync." : "Answers wait until the standby has stored each change.";
+}

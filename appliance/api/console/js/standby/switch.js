@@ -1,0 +1,42 @@
+/** The planned switchover, after confirmation. */
+
+import { html, useState } from "../html.js";
+import { Button } from "../parts/button.js";
+import { Dialog } from "../parts/dialog.js";
+import { Given } from "../parts/given.js";
+import { Failure } from "../parts/notice.js";
+import { done } from "../parts/toast.js";
+import { Problem } from "../problem.js";
+import { ask } from "../rest.js";
+
+/** The button that opens the dialog. @param {{state: any}} given */
+export function SwitchOver({ state }) {
+  const [open, setOpen] = useState(false);
+  const { other } = state;
+  const ready = other.connected && other.in_sync;
+  return html`<${Button} small role="admin" disabled=${!ready} why=${`${other.name} does not have all changes`} onClick=${() => setOpen(true)}>Switch over…</${Button}>
+    ${open && html`<${Confirm} name=${state.name} other=${other} close=${() => setOpen(false)} />`}`;
+}
+
+function Confirm(/** @type {{name: string, other: any, close: () => void}} */ { name, other, close }) {
+  const [error, setError] = useState(/** @type {unknown} */ (null));
+  const go = async () => {
+    setError(null);
+    try {
+      await ask("POST", "/v1/standby/promote", { match: "*" });
+    } catch (failure) {
+      if (!isLost(failure)) return setError(failure);
+    }
+    done("The switchover is ordered", `${other.name} becomes the active appliance.`);
+    close();
+  };
+  const foot = html`<button class="button" onClick=${close}>Not now</button><${Button} role="admin" tone="danger" onClick=${go}>Switch over</${Button}>`;
+  return html`<${Dialog} title=${`Switch over to ${other.name}?`} close=${close} foot=${foot}><${Failure} error=${error} />
+    <p><${Given} value=${other.name} most=${40} /> becomes the active appliance and <${Given} value=${name} most=${40} /> its standby, for example before an update of this machine.</p>
+    <p>Nodes reconnect automatically: their topics and services pause for a moment. This console then links to that of <${Given} value=${other.name} most=${40} />.</p></${Dialog}>`;
+}
+
+/** Whether the answer of the order was lost, because the switchover ends the process that answers. */
+function isLost(/** @type {unknown} */ failure) {
+  return failure instanceof Problem && (failure.status === 0 || failure.kind === "standby" || (failure.status === 503 && failure.retryAfter !== null));
+}

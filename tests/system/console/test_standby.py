@@ -1,0 +1,189 @@
+"""Two appliances in the console: the panel, the banner, the switchover, and the page of the standby."""
+
+import functools
+import json
+import re
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, Playwright, expect
+
+from examples.landshark.lab import Host as LabHost
+from examples.landshark.lab import Lab
+from tests.support.requirements import need_root
+from tests.support.rest import Rest
+from tests.support.standby_site import ADDRESSES, StandbySite
+from tests.support.waiting import eventually
+from tests.system.console.conftest import launch
+from tests.system.console.reader import LIMIT, Reader
+
+PORT = 8443
+SETTINGS = f"""\
+api: 0.0.0.0:{PORT}
+api_networks: [10.79.0.0/24]
+api_limits: {{requests_per_second: 500, burst: 2000}}
+"""
+
+
+class PairConsoles:
+    """The consoles of both appliances, in a browser on an operator's machine."""
+
+    def __init__(self, site: StandbySite, browser: Browser, tokens: dict[str, str]) -> None:
+        self.site = site
+        self.browser = browser
+        self.tokens = tokens
+        self.windows = ExitStack()
+
+    def url(self, name: str) -> str:
+        """Return the URL of an appliance's REST."""
+        return f"https://{ADDRESSES[name]}:{PORT}"
+
+    def open(self, name: str, role: str, **look: Any) -> Reader:
+        """Open the console of an appliance, with a token of this role."""
+        return self.windows.enter_context(Reader(self.browser, self.url(name), self.tokens[role], **look))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
+    """Run two appliances, of which `a` is active, and the witness."""
+    need_root()
+    home = tmp_path_factory.mktemp("pair")
+    with Lab("rosrv-console") as lab, StandbySite(lab, home, settings=SETTINGS) as site:
+        site.start_witness()
+        site.start("a")
+        site.start("b")
+        site.until_both_in_sync()
+        yield site
+
+
+@pytest.fixture(scope="module")
+def tokens(site: StandbySite) -> dict[str, str]:
+    """Return a token of each role, made on the active appliance, and known to the api of the standby."""
+    made = {}
+    for role in ("viewer", "operator", "admin"):
+        done = site.appliances["a"].rosrv(
+            "token", "add", f"some-{role}", "--role", role, "--expires", "1d", "--json"
+        )
+        made[role] = str(json.loads(done.stdout)["token"])
+    standby = site.appliances["b"]
+    assert isinstance(standby.host, LabHost)
+    rest = Rest(f"https://127.0.0.1:{PORT}", made["admin"], standby.state / "api" / "certificate.pem")
+    known = functools.partial(standby.host.run, lambda: rest.get("/v1/standby").status == 200)
+    eventually(known, "the standby knows the tokens")
+    return made
+
+
+@pytest.fixture(scope="module")
+def remote_browser(
+    site: StandbySite, chromium: str, playwright: Playwright, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Browser]:
+    """Start the browser on an operator's machine: the robot itself cannot reach the standby."""
+    host = site.lab.host("browser", "10.79.0.30/24")
+    program = tmp_path_factory.mktemp("browser") / "chromium"
+    program.write_text(f'#!/bin/sh\nexec ip netns exec {host.namespace.name} {chromium} "$@"\n')
+    program.chmod(0o755)
+    started = launch(playwright, str(program))
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def pair(site: StandbySite, remote_browser: Browser, tokens: dict[str, str]) -> Iterator[PairConsoles]:
+    """Return the consoles; the windows are closed and checked after the test."""
+    consoles = PairConsoles(site, remote_browser, tokens)
+    with consoles.windows:
+        yield consoles
+
+
+def panel(page: Page) -> Any:
+    """Return the panel with the two appliances."""
+    return page.get_by_role("region", name="Two appliances")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_both_appliances_are_shown(pair: PairConsoles, theme: str, width: int) -> None:
+    """The active appliance shows the standby in sync; the standby shows its state, and links to the active one.
+
+    Both pages are accessible, and no wider than the window.
+    """
+    reader = pair.open("a", "viewer", theme=theme, width=width)
+    page = reader.go("now")
+    rows = panel(page).get_by_role("row")
+    for row, words in (
+        (1, r"^a this one.*10\.79\.0\.2.*active"),
+        (2, r"^b.*10\.79\.0\.3.*in sync"),
+        (3, "answers"),
+    ):
+        expect(rows.nth(row)).to_have_text(re.compile(words))
+    assert reader.axe() == []
+    reader.fits()
+    other = pair.open("b", "viewer", theme=theme, width=width)
+    other.page.goto(f"{other.url}/console/policy")
+    expect(other.page.get_by_role("heading", level=1, name="Standby")).to_be_visible()
+    expect(panel(other.page).get_by_role("row").nth(1)).to_have_text(re.compile("^b this one.*standby"))
+    link = other.page.get_by_role("link", name="Open the console of a")
+    expect(link).to_have_attribute("href", f"{pair.url('a')}/console/now")
+    assert other.axe() == []
+    other.fits()
+
+
+def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
+    """The banner and the open alarm give the reason and the next step; they end when the witness answers."""
+    page = pair.open("a", "viewer").go("graph")
+    banner = page.locator(".banner")
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+    expect(banner).to_have_count(0)
+    assert pair.site.witness is not None
+    pair.site.witness.stop()
+    expect(banner).to_contain_text("the witness on the robot (10.79.0.10) has not answered")
+    page.get_by_role("link", name="Now").click()
+    expect(page.get_by_role("region", name="Open alarms")).to_contain_text("systemctl status rosrv-witness")
+    expect(panel(page).get_by_role("row").nth(3)).to_contain_text("silent")
+    pair.site.start_witness()
+    expect(banner).to_have_count(0)
+    expect(panel(page).get_by_role("row").nth(3)).to_contain_text("answers")
+
+
+def test_only_admins_switch_over(pair: PairConsoles) -> None:
+    """An operator sees the button with the role that it needs; it opens no dialog."""
+    page = pair.open("a", "operator").go("now")
+    button = panel(page).get_by_role("button", name="Switch over…")
+    expect(button).to_have_attribute("aria-disabled", "true")
+    expect(button).to_have_attribute("title", re.compile("For the role admin"))
+    button.click(force=True)
+    expect(page.get_by_role("dialog")).to_have_count(0)
+
+
+def test_a_switchover_leads_to_the_other_console_and_back(pair: PairConsoles) -> None:
+    """After the order, the page becomes that of a standby; the same token opens the other console; the way back is the
+    same, and the first page is live again without a reload. Unsaved work survives.
+    """
+    reader = pair.open("a", "admin")
+    page = reader.go("policy")
+    reader.write("# a draft\n")
+    page.get_by_role("link", name="Now").click()
+    _switch_over(page, "b")
+    expect(page.get_by_role("heading", level=1, name="Standby")).to_be_visible(timeout=2 * LIMIT)
+    other = pair.open("b", "admin").go("now")
+    expect(panel(other).get_by_role("row").nth(1)).to_have_text(re.compile("^b this one.*active"))
+    _switch_over(other, "a")
+    expect(other.get_by_role("heading", level=1, name="Standby")).to_be_visible(timeout=2 * LIMIT)
+    expect(page.get_by_role("heading", level=1, name="Now")).to_be_visible(timeout=2 * LIMIT)
+    expect(page.locator("[data-standing=live]")).to_be_visible(timeout=2 * LIMIT)
+    page.get_by_role("link", name="Policy", exact=True).click()
+    expect(reader.editor()).to_contain_text("# a draft")
+    [ordered] = pair.site.appliances["a"].audit("--event", "switchover ordered")
+    assert ordered["detail"]["who"] == "some-admin"
+
+
+def _switch_over(page: Page, name: str) -> None:
+    """Order the switchover once the standby is in sync."""
+    button = panel(page).get_by_role("button", name="Switch over…")
+    expect(button).not_to_have_attribute("aria-disabled", "true", timeout=2 * LIMIT)
+    button.click()
+    dialog = page.get_by_role("dialog", name=f"Switch over to {name}?")
+    dialog.get_by_role("button", name="Switch over", exact=True).click()
+    expect(dialog).to_have_count(0)
