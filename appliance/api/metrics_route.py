@@ -202,7 +202,8 @@ def _standby(state: StandbyState | None) -> dict[str, _Samples]:
         "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
         "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
         "rosrv_standby_both_active": [((), both_active(state))] if active else [],
-        "rosrv_standby_takeovers_total": [((), state.epoch)],
+        # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
+        "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],
     }
 
 

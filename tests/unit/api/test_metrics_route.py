@@ -9,8 +9,9 @@ from typing import Any
 import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
-from appliance.api.metrics_route import rendered
+from appliance.api.metrics_route import rendered, rendered_standby
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import RecorderState
 from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
@@ -181,3 +182,52 @@ def test_processes_of_one_role_have_separate_series() -> None:
     lines = [one for one in rendered(answer, CALLS).decode().splitlines() if one.startswith("rosrv_process")]
     assert len({line.rsplit(" ", 1)[0] for line in lines}) == len(lines) == 4
     assert 'rosrv_process_restarts_total{role="relay 1"} 2.0' in lines
+
+
+def standby_samples(page: bytes) -> dict[str, float]:
+    """Return the samples about two appliances, without the prefix of their names."""
+    return {
+        line.rsplit(" ", 1)[0].removeprefix("rosrv_standby_"): float(line.rsplit(" ", 1)[1])
+        for line in page.decode().splitlines()
+        if line.startswith("rosrv_standby")
+    }
+
+
+def test_two_appliances_are_measured() -> None:
+    """The active appliance has the lag of the standby; a single appliance has no sample, so that no alert fires."""
+    assert standby_samples(rendered(body(), CALLS)) == {}
+    other = {"name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400}
+    state = example(
+        StandbyState, name="a", role="active", epoch=4, other=other,
+        witness={"answered_seconds": 0.25, "holder": "b"},
+    )  # fmt: skip
+    answer = body()
+    status = msgspec.structs.replace(answer.status, standby=state)
+    assert standby_samples(rendered(msgspec.structs.replace(answer, status=status), CALLS)) == {
+        'role{role="active"}': 1,
+        'role{role="standby"}': 0,
+        "connected": 1,
+        "in_sync": 0,
+        "behind_changes": 12,
+        "behind_bytes": 3400,
+        "witness_age_seconds": 0.25,
+        "both_active": 1,
+        "takeovers_total": 4,
+    }
+
+
+def test_a_standby_has_its_own_metrics() -> None:
+    """A standby exports its role and links and the REST calls; the age of a witness without an answer is infinite."""
+    state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
+    page = rendered_standby(state, CALLS)
+    assert standby_samples(page) == {
+        'role{role="active"}': 0,
+        'role{role="standby"}': 1,
+        "connected": 0,
+        "witness_age_seconds": float("inf"),
+        "takeovers_total": 4,
+    }
+    unknown = msgspec.structs.replace(state, epoch=0)
+    assert "takeovers_total" not in standby_samples(rendered_standby(unknown, CALLS))
+    names = {one.name for one in text_string_to_metric_families(page.decode())}
+    assert {name for name in names if not name.startswith("rosrv_standby_")} == {"rosrv_rest_calls"}
