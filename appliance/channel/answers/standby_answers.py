@@ -36,7 +36,7 @@ class WitnessSeen(msgspec.Struct, frozen=True):
 
 
 class StandbyState(msgspec.Struct, frozen=True):
-    """The state of two appliances, of which one is active."""
+    """The state of two appliances, of which one is active; `since` is when this one took its role."""
 
     name: Annotated[str, doc("this appliance")]
     address: str
@@ -45,7 +45,7 @@ class StandbyState(msgspec.Struct, frozen=True):
         doc("active: the robot's nodes use this appliance; standby: it is ready to take over, or catches up"),
     ]
     epoch: Annotated[int, doc("number of the takeover that this appliance knows last")]
-    since: Annotated[Moment, doc("when it took its role")]
+    since: Moment
     fixed: Annotated[str, doc("the address at which the robot's nodes reach the active appliance")]
     wait: Annotated[
         Literal["standby", "none"],

@@ -69,8 +69,8 @@ def status(
 def promote(appliance: Appliance) -> None:
     """Make the standby the active appliance, for example before an update: a planned switchover.
 
-    Give the order on the active appliance. It waits until the standby is active, at most 20 s. Exit status: 0 switched
-    over, 1 not, with the reason, 2 no appliance runs.
+    Give the order on the active appliance, or on the standby's own machine. It waits until the standby is active, at
+    most 20 s. Exit status: 0 switched over, 1 not, with the reason, 2 no appliance runs.
 
     Example: rosrv standby promote
     """
@@ -83,7 +83,7 @@ def promote(appliance: Appliance) -> None:
         raise usage_error(str(error)) from None
     except NotRunningError as error:
         lost = f" ({printable(str(error))})"  # a switchover ends the process that answers
-    after = _held_by(name, appliance, before.epoch)
+    after = _held_by(name, appliance)
     if after is None:
         text = f"{printable(name)} is not active after {_SWITCH_SECONDS:g} s{lost}; see: rosrv standby status"
         typer.echo(f"{_VERB}: {text}", err=True)
@@ -105,8 +105,8 @@ def _look(appliance: Appliance) -> StatusView:
     return standby_view(appliance.body_or_exit(answer))
 
 
-def _held_by(name: str, appliance: Appliance, epoch: int) -> StandbyState | None:
-    """Return the state once this appliance holds the lease in a later epoch; None if it does not in time."""
+def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
+    """Return the state once the appliance with this name holds the lease; None if it does not in time."""
     pause, until = threading.Event(), time.monotonic() + _SWITCH_SECONDS
     while time.monotonic() < until:
         try:
@@ -115,7 +115,7 @@ def _held_by(name: str, appliance: Appliance, epoch: int) -> StandbyState | None
             answer = None  # the process that answers is being started again
         if answer is not None and answer.ok:
             state = answer.given()
-            if state.witness.holder == name and state.epoch > epoch:
+            if state.witness.holder == name:
                 return state
         pause.wait(_AGAIN_SECONDS)
     return None

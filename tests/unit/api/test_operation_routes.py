@@ -100,6 +100,7 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("DELETE", "/v1/blocks/10.0.0.7", None),
     ("DELETE", "/v1/blocks/fd00%3A%3A7", None),
     ("POST", "/v1/hosts/reload", None),
+    ("POST", "/v1/standby/promote", None),
     ("DELETE", "/v1/hosts/laptop", None),
     ("PUT", "/v1/hosts/laptop/ports", {"state": "closed"}),
     ("PUT", "/v1/hosts/10.0.0.7/ports", {"state": "open", "open": [11311], "checked": 1.5}),
@@ -115,7 +116,7 @@ LEAST = {
         (
             "status", "inventory", "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
             "monitor_revision",
-            "recordings", "recording", "hosts", "host_blocks", "challenge",
+            "recordings", "recording", "hosts", "host_blocks", "challenge", "standby",
         ),
         "viewer",
     ),
@@ -132,7 +133,7 @@ LEAST = {
         (
             "load_policy", "load_monitors", "replace_monitor", "remove_monitors", "remove_monitor",
             "roll_back_monitors", "remove_recording", "tokens", "revoke_token", "enrol_host", "host_token",
-            "new_host_kit", "revoke_host",
+            "new_host_kit", "revoke_host", "promote_standby",
         ),
         "admin",
     ),

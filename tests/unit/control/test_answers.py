@@ -15,6 +15,7 @@ from appliance.control.policies import Policies
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecordingOrders
 from appliance.control.request_methods import request_methods
+from appliance.control.standby_orders import StandbyOrders
 from appliance.control.token_orders import TokenOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
@@ -40,6 +41,7 @@ CLASSES: dict[str, Any] = {
     "recordings": RecordingOrders,
     "blocks": BlockOrders,
     "evidence": EvidenceOrders,
+    "standby": StandbyOrders,
 }
 METHODS = request_methods(**CLASSES)
 REQUESTS: tuple[type[Any], ...] = tuple(
