@@ -3,7 +3,7 @@
     standby_registrar.py MASTER_URI OWN_ADDRESS
 
 Each call is repeated until it is answered, as a careful node does; event `acknowledged` with the number of answered
-calls. For a line `check` on the input it compares the master's state with all answers; event `checked` with the
+calls and the time of the monotonic clock. For a line `check` on the input it compares the master's state with all answers; event `checked` with the
 differences. For a line `time` it repeats `acknowledged` for each call until the next line, otherwise for each 20th.
 """
 
@@ -113,7 +113,7 @@ def main() -> None:
         if number == 1:
             report("ready", name=NAME)
         if each or number % 20 == 0:
-            report("acknowledged", number=number)
+            report("acknowledged", number=number, at=time.monotonic())
         if select.select([sys.stdin], [], [], _PAUSE)[0]:
             line = sys.stdin.readline().strip()
             if not line:

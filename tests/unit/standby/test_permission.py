@@ -1,0 +1,218 @@
+"""The right to answer alone: the lease process, control's replication and the witness in all orders of their messages."""
+
+import asyncio
+import socket
+from collections import deque
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from appliance.channel import messages
+from appliance.control import lease_client, replication
+from appliance.control.lease_client import LeaseClient
+from appliance.control.replication import Replication
+from appliance.standby import process
+from appliance.standby.membership import Membership
+from appliance.standby.process import LeaseProcess
+from appliance.standby.replication_frames import Stored
+from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
+
+ADDRESSES = {"a": "10.0.0.2", "b": "10.0.0.3"}
+KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
+MEMBERSHIP = Membership(
+    name="a", other="b", address=ADDRESSES["a"], other_address=ADDRESSES["b"], fixed="10.0.0.100",
+    witness="10.0.0.1", witness_port=7411, witness_key=KEYS["a"].hex(), peer_key="cc" * 32, certificate="", key="",
+    other_certificate="",
+)  # fmt: skip
+STEPS = (
+    "change", "ship", "acknowledge", "connect", "disconnect", "time", "time", "witness", "answer", "lose",
+    "report", "to lease", "to control", "to control", "restart", "settle", "settle",
+)  # fmt: skip
+
+
+class Feed:
+    """The changes for the standby; the test ships them."""
+
+    size = 0
+
+    def release(self, _number: int) -> None:
+        """Forget changes that the standby has."""
+
+
+class Store:
+    """A database that writes at once."""
+
+    history = "history"
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def follow(self, _notice: object, _room: int) -> Feed:
+        """Return a feed."""
+        return Feed()
+
+    async def settled(self) -> None:
+        """Return at once."""
+
+
+class Pair:
+    """The active appliance `a`, its standby `b`, and the witness, with every message in a queue of the test."""
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self.now = 1000.0
+        for module in (process, lease_client, replication):
+            patch.setattr(module, "boot_time", lambda: self.now)
+        patch.setattr(replication, "replication_context", lambda *_, **__: None)
+        record = LeaseRecord(1, "", ("a", "b"), "boot")
+        self.witness = Witness(
+            record=record, save=lambda _: None, admit=lambda _: None, boot="boot", clock=lambda: self.now
+        )
+        peers = {name: AppliancePeer(ADDRESSES[name], KEYS[name]) for name in ADDRESSES}
+        self.gate = WitnessGate(self.witness, peers, "nonce")
+        self.requests, self.answers = deque[bytes](), deque[bytes]()
+        self.to_lease, self.to_control = deque[Any](), deque[Any]()
+        here, self.supervisor = socket.socketpair()
+        self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
+        parts: Any = self.lease
+        parts._send = lambda datagram, _address, port: self.requests.append(datagram) if port == 7411 else None
+        parts._child = SimpleNamespace(tell=self.to_control.append)
+        self.database = Store()
+        self.standby = 0  # the last change on the standby's disk
+        self.acknowledgements = deque[int]()
+        self.answered = 0
+        self.waiting: set[asyncio.Task[None]] = set()
+        self.control: Replication
+        self.client: LeaseClient
+
+    def start_control(self, *, taken_over: bool) -> None:
+        """Start control: it has no link to the standby, and the lease no report."""
+        for task in self.waiting:
+            task.cancel()
+        self.waiting.clear()
+        self.to_lease.clear()
+        self.to_control.clear()
+        self.acknowledgements.clear()
+        self.client = LeaseClient()
+        client: Any = self.client
+        client.send = self.to_lease.append
+        store: Any = self.database
+        self.control = Replication(
+            MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
+        )
+        self.lease._control_linked()
+
+    def step(self, name: str) -> None:
+        """Let one thing happen."""
+        sender: Any = self.control._sender
+        match name:
+            case "change":
+                self.database.number += 1
+                self.waiting.add(asyncio.ensure_future(self._answer(self.database.number)))
+            case "connect":
+                sender._link = sender._link or SimpleNamespace(cancel=lambda: None)
+            case "disconnect":
+                sender._link = None
+                self.acknowledgements.clear()
+            case "ship" if sender._link is not None:
+                self.standby = sender._sent = max(self.standby, self.database.number)
+                self.acknowledgements.append(self.standby)
+            case "acknowledge" if self.acknowledgements:
+                sender._take(Stored(2, self.database.history, self.acknowledgements.popleft()))
+            case "time":
+                self.now += 0.11
+                self.lease._tick()
+            case "witness" if self.requests:
+                answer = self.gate.answer(self.requests.popleft(), ADDRESSES["a"])
+                assert answer is not None
+                self.answers.append(answer)
+            case "answer" if self.answers:
+                self.lease._received(self.answers.popleft(), "10.0.0.1")
+            case "lose" if self.answers:
+                self.answers.popleft()
+            case "report":
+                self.control._report()
+            case "to lease" if self.to_lease:
+                self.lease._control_said(self.to_lease.popleft())
+            case "to control" if self.to_control:
+                message = self.to_control.popleft()
+                if isinstance(message, messages.LeaseState):
+                    self.client._heard(message)
+            case "restart":
+                self.start_control(taken_over=False)
+            case "settle":
+                for each in ("time", "witness", "answer", "to control", "report", "to lease"):
+                    self.step(each)
+
+    async def _answer(self, number: int) -> None:
+        await self.control.stored()
+        self.answered = max(self.answered, number)
+
+    async def turn(self) -> None:
+        """Let the tasks run, then check the promise."""
+        for _ in range(3):
+            await asyncio.sleep(0)
+        record = self.witness.record
+        assert record is not None
+        if "b" in record.in_sync:
+            assert self.answered <= self.standby, f"change {self.answered} is answered, b has {self.standby}"
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for task in self.waiting:
+            task.cancel()
+        self.supervisor.close()
+        parts: Any = self.lease
+        parts._socket.close()
+        parts._supervisor.close()
+
+
+async def run(pair: Pair, steps: list[str]) -> None:
+    """Become active, then take these steps."""
+    pair.now += EXPIRY
+    pair.start_control(taken_over=True)
+    for step in ["settle"] * 8 + steps:
+        pair.step(step)
+        await pair.turn()
+
+
+@given(st.lists(st.sampled_from(STEPS), min_size=20, max_size=120))
+def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[str]
+) -> None:
+    """In whatever order messages, acknowledgements, losses and restarts of control come."""
+    with pytest.MonkeyPatch.context() as patch:
+        pair = Pair(tmp_path_factory.mktemp("pair"), patch)
+        try:
+            asyncio.run(run(pair, steps))
+        finally:
+            pair.close()
+
+
+def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The steps above reach both: the removal of an absent standby, and its return."""
+    pair = Pair(tmp_path, monkeypatch)
+
+    async def story() -> None:
+        await run(pair, ["change", *["settle"] * 8])
+        assert pair.answered == 1
+        assert pair.witness.record is not None and pair.witness.record.in_sync == ("a",)
+        for step in ("connect", "ship", "acknowledge", *["settle"] * 8):
+            pair.step(step)
+            await pair.turn()
+        assert pair.witness.record.in_sync == ("a", "b")
+        pair.step("change")
+        await pair.turn()
+        assert pair.answered == 1, "it waits for the standby again"
+        for step in ("ship", "acknowledge"):
+            pair.step(step)
+        await pair.turn()
+        assert pair.answered == 2
+
+    try:
+        asyncio.run(story())
+    finally:
+        pair.close()
