@@ -188,7 +188,7 @@ class LeaseProcess:
         state = messages.LeaseState(
             until=lease.valid_until if active else 0.0,
             epoch=lease.epoch,
-            alone=active and self._alone,
+            alone=active and self._alone and lease.answers_alone,  # not after the order to add the standby
             permission=self._permission,
             in_sync=answer is not None and self._membership.other in answer.in_sync,
             holder=answer.holder if answer is not None else "",

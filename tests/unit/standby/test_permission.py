@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from appliance.channel import messages
@@ -79,7 +79,9 @@ class Pair:
         here, self.supervisor = socket.socketpair()
         self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
         parts: Any = self.lease
-        parts._send = lambda datagram, _address, port: self.requests.append(datagram) if port == 7411 else None
+        parts._send = lambda datagram, _address, port: (
+            self.requests.append(datagram) if port == 7411 else None
+        )
         parts._child = SimpleNamespace(tell=self.to_control.append)
         self.database = Store()
         self.standby = 0  # the last change on the standby's disk
@@ -191,6 +193,21 @@ async def run(pair: Pair, steps: list[str]) -> None:
         await pair.turn()
 
 
+# Control restarts after the order to add the standby: it must not learn an earlier permission again.
+@example(
+    steps=[
+        "change",
+        "change",
+        "time",
+        "witness",
+        "back",
+        "settle",
+        "restart",
+        "change",
+        "answer",
+        "to control",
+    ]
+)
 @settings(max_examples=examples(600))
 @given(st.lists(st.sampled_from(STEPS), min_size=10, max_size=60))
 def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
