@@ -144,8 +144,12 @@ def _burn() -> None:
 
 def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
     """Print a table of takeovers."""
-    chance, pauses = random.Random(seed), dict[str, list[float]]()  # noqa: S311  not for secrets
-    with tempfile.TemporaryDirectory() as home, Lab("rosrv-bench") as lab, StandbySite(lab, Path(home)) as site:
+    chance, pauses = random.Random(seed), dict[str, list[float]]()
+    with (
+        tempfile.TemporaryDirectory() as home,
+        Lab("rosrv-bench") as lab,
+        StandbySite(lab, Path(home)) as site,
+    ):
         site.start_witness()
         site.start("a")
         site.until_active("a")
@@ -157,7 +161,7 @@ def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
                 found = one_takeover(site, robot, planned=planned)
                 for name, pause in found.items():
                     pauses.setdefault(name, []).append(pause)
-                print(turn + 1, {name: round(pause, 2) for name, pause in found.items()}, flush=True)  # noqa: T201
+                print(turn + 1, {name: round(pause, 2) for name, pause in found.items()}, flush=True)
             robot.lost_nothing()
     table = Table("seconds without", "least", "median", "most", title=f"{number} takeovers, load {load}")
     pauses["any of them"] = [max(turn) for turn in zip(*pauses.values(), strict=True)]
@@ -196,7 +200,9 @@ def registrations(rounds: int, load: int) -> None:
             for kind, take_turn in turns.items():
                 found = take_turn()
                 times[kind] += found if turn else []  # the first turn opens connections
-    table = Table("appliances", "median", "90 %", "ratio", title=f"milliseconds of a registration, load {load}")
+    table = Table(
+        "appliances", "median", "90 %", "ratio", title=f"milliseconds of a registration, load {load}"
+    )
     single = statistics.median(times["single"])
     for kind, found in times.items():
         middle = statistics.median(found)

@@ -54,7 +54,9 @@ def test_a_full_disk_of_the_standby(site: StandbySite, robot: StandbyRobot) -> N
     moved = one.directory / "moved"
     one.state.rename(moved)
     one.state.mkdir(mode=0o711)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=96m,mode=711", "rosrv-standby", one.state], check=True)
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=96m,mode=711", "rosrv-standby", one.state], check=True
+    )
     try:
         subprocess.run(["cp", "-a", f"{moved}/.", str(one.state)], check=True)
         site.start(passive)
@@ -226,7 +228,11 @@ def record(site: StandbySite, number: int) -> list[bytes]:
             sock.settimeout(10)
             while len(found) < number:
                 frame = sock.recv(2048)
-                if frame[12:14] == b"\x08\x00" and frame[23] == socket.IPPROTO_UDP and port_of(frame) in (PORT, WITNESS_PORT):
+                if (
+                    frame[12:14] == b"\x08\x00"
+                    and frame[23] == socket.IPPROTO_UDP
+                    and port_of(frame) in (PORT, WITNESS_PORT)
+                ):
                     found.append(frame)
         return found
 
