@@ -3,8 +3,8 @@
     standby_registrar.py MASTER_URI OWN_ADDRESS
 
 Each call is repeated until it is answered, as a careful node does; event `acknowledged` with the number of answered
-calls and the time of the monotonic clock. For a line `check` on the input it compares the master's state with all answers; event `checked` with the
-differences. For a line `time` it repeats `acknowledged` for each call until the next line, otherwise for each 20th.
+calls and the time of the monotonic clock. For a line `check` on the input it compares the master's state with all
+answers; event `checked` with the differences. After a line `time` it reports each call, otherwise each 20th.
 """
 
 import http.client
@@ -52,7 +52,7 @@ class Registrar:
                 status, text, value = getattr(self._proxy, method)(NAME, *arguments)
             except (OSError, http.client.HTTPException, ExpatError):
                 self._proxy = xmlrpc.client.ServerProxy(self.master, Transport())
-                time.sleep(_PAUSE)
+                select.select([], [], [], _PAUSE)
                 continue
             if status != 1:
                 raise RuntimeError(f"{method}{arguments}: {text}")

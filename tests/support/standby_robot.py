@@ -1,4 +1,4 @@
-"""The nodes of a robot with two appliances, and what they must notice of a takeover: a short pause, and nothing else."""
+"""The nodes of a robot with two appliances, which notice a takeover only as a short pause."""
 
 import hashlib
 import json

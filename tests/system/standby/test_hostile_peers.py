@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import os
 import secrets
 import signal
@@ -17,16 +18,14 @@ from typing import Any
 
 import pytest
 
+from appliance.standby.kit import WITNESS_PORT
 from appliance.standby.link_certificates import replication_context
-from appliance.standby.membership import load_membership, path_of
+from appliance.standby.membership import PORT, load_membership, path_of
 from appliance.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored
 from examples.landshark.lab import INTERFACE, Host
 from tests.support.standby_robot import StandbyRobot
-from tests.support.standby_site import ADDRESSES, ROBOT, WITNESS_PORT, StandbySite
+from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
-
-PORT = 7412
-LARGEST = 1 << 30
 
 
 @pytest.fixture(autouse=True)
@@ -89,7 +88,7 @@ def grow(robot: StandbyRobot, site: StandbySite, until: Callable[[], bool]) -> N
 def slowest_answer(robot: StandbyRobot, since: float) -> float:
     """Return the longest time that the registrar waited for an answer since then."""
     times = [event["at"] for event in robot.registrar.seen(event="acknowledged") if event["at"] >= since]
-    return max(after - before for before, after in zip(times, times[1:], strict=False))
+    return max(after - before for before, after in itertools.pairwise(times))
 
 
 # ---- A standby that lies

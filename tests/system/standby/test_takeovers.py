@@ -1,7 +1,7 @@
-"""What real nodes notice of failures of the active appliance, the witness and the network: a short pause only.
+"""Failures of the active appliance, the witness and the network, with real nodes: they notice a short pause only.
 
 All tests of the file use the same nodes. After each failure no node has ended, no answered change is lost, the robot
-admits one appliance, and what operators ordered is in force.
+admits one appliance, and the orders of operators are in force.
 """
 
 import os
@@ -23,7 +23,7 @@ ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
 def orders(site: StandbySite, name: str) -> list[Any]:
-    """Return what operators ordered: policies, specifications, tokens."""
+    """Return the orders of operators: policies, specifications, tokens."""
     one = site.appliances[name]
     monitors = one.ask(admin.MonitorsWanted(True))
     return [
@@ -35,7 +35,7 @@ def orders(site: StandbySite, name: str) -> list[Any]:
 
 @pytest.fixture(autouse=True)
 def nothing_is_lost(site: StandbySite, robot: StandbyRobot) -> Iterator[None]:
-    """Check before each test that the site is whole, and after it what the file promises."""
+    """Check before each test that the site is whole, and after it the promises of the file."""
     site.until_both_in_sync()
     before = orders(site, site.pair()[0])
     yield

@@ -1,4 +1,4 @@
-"""The right to answer alone: the lease process, control's replication and the witness in all orders of their messages."""
+"""The right to answer alone: the lease, control's replication and the witness, with messages in all orders."""
 
 import asyncio
 import socket
@@ -107,8 +107,9 @@ class Pair:
             MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
         )
         self.lease._control_linked()
+        self.client.present()
 
-    def step(self, name: str) -> None:
+    def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
         """Let one thing happen."""
         sender: Any = self.control._sender
         match name:

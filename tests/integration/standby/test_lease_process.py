@@ -1,0 +1,205 @@
+"""The process `lease` with real sockets: a witness and another appliance that answer, are silent, or lie."""
+
+import asyncio
+import contextlib
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.standby.lease import PromiseRequest
+from appliance.standby.membership import Membership
+from appliance.standby.peer_link import PeerChannel
+from appliance.standby.process import LeaseProcess, boot_time
+from appliance.standby.witness import AppliancePeer, LeaseRecord, Witness, WitnessGate
+from examples.landshark.lab import Host, Lab
+from tests.support.requirements import need_root
+from tests.support.waiting import eventually
+
+ROBOT, OWN, OTHER, STRANGER = "10.78.0.10", "10.78.0.2", "10.78.0.3", "10.78.0.66"
+KEY, PEER_KEY = b"\xaa" * 32, b"\xcc" * 32
+MEMBERSHIP = Membership(
+    name="a", other="b", address=OWN, other_address=OTHER, fixed="10.78.0.100", witness=ROBOT, witness_port=7411,
+    witness_key=KEY.hex(), peer_key=PEER_KEY.hex(), certificate="", key="", other_certificate="",
+)  # fmt: skip
+
+
+class Site:
+    """The process in a thread, and the ends of its links in the test."""
+
+    def __init__(self, lab: Lab, folder: Path) -> None:
+        self.hosts: dict[str, Host] = {
+            address: lab.host(name, f"{address}/24")
+            for name, address in (("robot", ROBOT), ("own", OWN), ("other", OTHER), ("stranger", STRANGER))
+        }
+        self.epoch = folder / "epoch"
+        self.witness = self._bound(ROBOT, 7411)
+        self.peer = self._bound(OTHER, MEMBERSHIP.port)
+        here, there = socket.socketpair()
+        self.supervisor = Channel(here, messages.Lifeline)
+        self._lifeline = there
+        self.reports: list[Any] = []
+        self.failures: list[BaseException] = []
+        self._thread = threading.Thread(target=lambda: self.hosts[OWN].run(self._run))
+        self.record = LeaseRecord(1, "", ("a", "b"), "boot")
+        self._rules = Witness(
+            record=self.record, save=self._save, admit=lambda _: None, boot="boot", clock=boot_time
+        )
+        peers = {"a": AppliancePeer(OWN, KEY), "b": AppliancePeer(OTHER, b"\xbb" * 32)}
+        self.gate = WitnessGate(self._rules, peers, "nonce")
+
+    def _bound(self, address: str, port: int) -> socket.socket:
+        sock = self.hosts[address].run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        sock.bind((address, port))
+        sock.settimeout(0.05)
+        return sock
+
+    def _save(self, record: LeaseRecord) -> None:
+        self.record = record
+
+    def _run(self) -> None:
+        async def work() -> None:
+            await LeaseProcess(MEMBERSHIP, self._lifeline.detach(), self.epoch).run()
+
+        try:
+            asyncio.run(work())
+        except (OSError, ValueError) as error:
+            self.failures.append(error)
+
+    def start(self) -> None:
+        """Start the process, with a control that is present."""
+        self._thread.start()
+        ours, theirs = socket.socketpair()
+        self.control = Channel(ours, messages.LeaseLink)
+        self.supervisor.send(messages.LinkOpened("control"), (theirs.fileno(),))
+        theirs.close()
+        self.control.send(messages.ControlPresent())
+
+    def serve(self, times: int = 1) -> None:
+        """Answer requests as the witness."""
+        for _ in range(times):
+            with contextlib.suppress(TimeoutError):
+                datagram, address = self.witness.recvfrom(2048)
+                answer = self.gate.answer(datagram, address[0])
+                if answer is not None:
+                    self.witness.sendto(answer, address)
+
+    def until(self, condition: Callable[[], bool], *, serving: bool = True) -> None:
+        """Wait for a condition; meanwhile the witness answers if `serving`."""
+
+        def met() -> bool:
+            if serving:
+                self.serve()
+            self.read()
+            return condition()
+
+        eventually(met, lambda: f"{self.reports[-10:]} {self.failures}")
+
+    def read(self) -> None:
+        """Keep the reports to the supervisor."""
+        with contextlib.suppress(ChannelClosedError):
+            self.reports += [
+                message
+                for message, _ in self.supervisor.receive()
+                if isinstance(message, messages.LeaseHeld | messages.LeaseEnded)
+            ]
+
+    def held(self) -> bool:
+        """Whether the last report says that the lease is held."""
+        return bool(self.reports) and isinstance(self.reports[-1], messages.LeaseHeld)
+
+    def close(self) -> None:
+        """End the process by the end of its lifeline."""
+        self.supervisor.close()
+        if self._thread.is_alive():
+            self._thread.join(30)
+        with contextlib.suppress(AttributeError):
+            self.control.close()
+        for sock in (self.witness, self.peer, self._lifeline):
+            sock.close()
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    """Make the hosts; the process is not started."""
+    need_root()
+    with Lab("rosrv-lease") as lab:
+        made = Site(lab, tmp_path)
+        try:
+            yield made
+        finally:
+            made.close()
+
+
+def test_a_grant_is_reported_with_its_end_and_its_epoch_is_on_the_disk(site: Site) -> None:
+    """The supervisor gets each extension."""
+    site.start()
+    site.until(site.held)
+    assert site.reports[-1].epoch == site.record.epoch == 2
+    assert int(site.epoch.read_text()) == 2
+    assert site.reports[-1].until <= boot_time() + 0.8 * 1.2
+    first = site.reports[-1].until
+    site.until(lambda: site.held() and site.reports[-1].until > first)
+
+
+def test_without_answers_no_extension_follows(site: Site) -> None:
+    """The last report ends in less than an expiry, so the supervisor becomes passive without any message."""
+    site.start()
+    site.until(site.held)
+    site.until(lambda: boot_time() > site.reports[-1].until, serving=False)
+    assert not site.held() or site.reports[-1].until < boot_time()
+
+
+def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
+    """From the witness's address without its key, from the other appliance without the key, and from any host."""
+    site.start()
+    site.until(site.held)
+    stranger = site._bound(STRANGER, 0)
+    forged = PeerChannel("b", "a", b"\xdd" * 32).write(PromiseRequest(99, "s", 1))
+    genuine = PeerChannel("b", "a", PEER_KEY).write(PromiseRequest(99, "s", 1))
+    with stranger:
+        for datagram in (b"", b"\x01b", os.urandom(1000), forged, genuine):
+            stranger.sendto(datagram, (OWN, MEMBERSHIP.port))
+    for datagram in (b"", os.urandom(1000), forged):
+        site.peer.sendto(datagram, (OWN, MEMBERSHIP.port))
+        site.witness.sendto(datagram, (OWN, MEMBERSHIP.port))
+    before = site.reports[-1].until
+    site.until(lambda: site.held() and site.reports[-1].until > before)
+    assert int(site.epoch.read_text()) == 2
+
+
+def test_a_greater_epoch_of_the_other_appliance_ends_its_own(site: Site) -> None:
+    """The epoch is stored, and the request gets its promise."""
+    site.start()
+    site.until(site.held)
+    channel = PeerChannel("b", "a", PEER_KEY)
+    site.peer.sendto(channel.write(PromiseRequest(9, "theirs", 1)), (OWN, MEMBERSHIP.port))
+    site.until(lambda: isinstance(site.reports[-1], messages.LeaseEnded), serving=False)
+    assert int(site.epoch.read_text()) == 9
+
+
+def test_a_damaged_epoch_file_keeps_it_passive(site: Site) -> None:
+    """The process ends with the reason, and claims nothing."""
+    site.epoch.write_text("7x\n")
+    site.start()
+    eventually(lambda: site.failures, "the reason")
+    assert "does not contain an epoch" in str(site.failures[0])
+    site.read()
+    assert not site.reports
+
+
+def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
+    """Its lease was lost or replaced by an older copy."""
+    site.epoch.write_text("40\n")
+    site.start()
+    for _ in range(30):
+        site.serve()
+    site.read()
+    assert not site.held() and site.record.epoch == 1
