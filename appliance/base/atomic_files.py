@@ -46,9 +46,9 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
         )
         try:
             with os.fdopen(descriptor, "wb") as file:
-                if owner is not None:
-                    os.fchown(descriptor, *owner)
                 os.fchmod(descriptor, mode)  # independent of the umask: the folder restricts access
+                if owner is not None:  # last: in a container, root may not change another user's file
+                    os.fchown(descriptor, *owner)
                 file.write(data)
                 file.flush()
                 os.fsync(descriptor)

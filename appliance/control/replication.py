@@ -34,6 +34,7 @@ from appliance.store.writer_thread import Database
 _REPORT_SECONDS = 0.1
 _BACKLOG = 8
 _SETTLE_SECONDS = 2.0
+_ANSWER_SECONDS = 5.0
 
 _log = structlog.get_logger()
 
@@ -187,21 +188,27 @@ class Replication:
         other = OtherAppliance(
             name=self._membership.other,
             address=self._membership.other_address,
-            connected=lag.connected,
+            connected=self._connected(),
             in_sync=self._in_sync(),
             behind_changes=lag.changes,
             behind_bytes=lag.bytes,
             waiting_seconds=None if waiting is None else round(now - waiting, 3),
-            reason="" if lag.connected else lag.reason,
+            reason="" if self._connected() else lag.reason or "it does not answer",
             trouble_seconds=None if trouble is None else round(now - trouble, 3),
         )
         return state_of(
             self._membership, lease, role="active", since=self._since, wait=self._wait, other=other
         )
 
+    def _connected(self) -> bool:
+        """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
+        lease = self._lease.state
+        heard = lease.heard if lease is not None else None
+        return self._sender.lag().connected and heard is not None and boot_time() - heard < _ANSWER_SECONDS
+
     def require_ready(self) -> None:
         """Raise `HandOverError`, with the reason, unless the standby could take over now."""
-        if not self._in_sync() or not self._sender.lag().connected:
+        if not self._in_sync() or not self._connected():
             raise HandOverError(
                 f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
                 " in sync"
@@ -230,7 +237,7 @@ class Replication:
 
     async def _report_always(self) -> None:
         while True:
-            if self._in_sync() and self._sender.lag().connected:
+            if self._in_sync() and self._connected():
                 self._trouble_since = None
             elif self._trouble_since is None:
                 self._trouble_since = asyncio.get_running_loop().time()
