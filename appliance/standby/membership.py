@@ -34,7 +34,8 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     `address` and `other_address` are the IPv4 addresses of the appliances as the robot and each other see them. `fixed`
     is the address at which the robot's nodes reach the active appliance. The keys (hexadecimal) authenticate datagrams
     to the witness and to the other appliance; the certificates (PEM) and the key (PEM) are those of the replication. A
-    process gets only the secrets that it needs; the others are empty.
+    process gets only the secrets that it needs; the others are empty. The sealed certificate and key are those of the
+    tunnels' authority, encrypted by a passphrase; only the file for the other appliance has them.
     """
 
     name: _Name
@@ -50,6 +51,8 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     certificate: str
     key: str
     other_certificate: str
+    sealed_certificate: str = ""
+    sealed_key: str = ""
 
     def __post_init__(self) -> None:
         for text in (self.address, self.other_address, self.fixed, self.witness):
@@ -62,6 +65,10 @@ class Membership(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             )
         if self.witness_key and self.witness_key == self.peer_key:
             raise ValueError("the key of the witness and the key of the other appliance must differ")
+
+    def unsealed(self) -> "Membership":
+        """Return the membership without the tunnels' authority."""
+        return msgspec.structs.replace(self, sealed_certificate="", sealed_key="")
 
     def for_lease(self) -> "Membership":
         """Return the membership with the secrets of the lease only."""

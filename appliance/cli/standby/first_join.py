@@ -1,18 +1,22 @@
 """`rosrv standby join` on the appliance that has all data: make the keys and the files of all machines."""
 
+import contextlib
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 from pathlib import Path
 
 import msgspec
 import typer
+from msgspec.structs import replace
 
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.up_inputs import read_node_ports
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings, load_resolved
+from appliance.ipsec.sealed_authority import sealed_authority
 from appliance.standby.kit import Kits, PairPlan, make_kits
 from appliance.standby.membership import (
     Membership,
@@ -64,6 +68,7 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
         kits = make_kits(plan)
     except ValueError as error:
         raise usage_error(str(error), _VERB) from None
+    kits = kits._replace(other=_with_authority(kits.other, options.state))
     _write_kits(kits, options.out)
     try:
         save_membership(path, kits.own)
@@ -71,6 +76,35 @@ def join_first(options: JoinOptions, *, as_json: bool) -> None:
         shutil.rmtree(options.out)
         raise refused([f"{_VERB}: {path}: {error.strerror}; nothing was changed"]) from None
     _report(plan, options, as_json=as_json)
+
+
+def _with_authority(other: Membership, state: Path) -> Membership:
+    """Add the tunnels' authority to the other appliance's file, if its key is encrypted."""
+    signer = state / "signer"
+    try:
+        with as_owner(signer):
+            sealed = sealed_authority(signer)
+    except FileNotFoundError:
+        return other  # this appliance was never started
+    except OSError as error:
+        raise refused([f"{_VERB}: {error.filename or signer}: {error.strerror}; run this as root"]) from None
+    if sealed is None:
+        return other
+    return replace(other, sealed_certificate=sealed.certificate, sealed_key=sealed.key)
+
+
+@contextlib.contextmanager
+def as_owner(folder: Path) -> Iterator[None]:
+    """Act as the owner of a folder: in a container, root may not use the folders of other users. Raises `OSError`."""
+    owner, own = folder.stat().st_uid, os.geteuid()
+    if owner == own or own != 0:
+        yield
+        return
+    os.seteuid(owner)
+    try:
+        yield
+    finally:
+        os.seteuid(own)
 
 
 def existing_membership(path: Path) -> Membership | None:

@@ -1,5 +1,6 @@
 """`rosrv standby join FILE` on the other appliance, whose state becomes a copy of the first one's."""
 
+import os
 import time
 from pathlib import Path
 
@@ -7,6 +8,7 @@ from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.standby.first_join import existing_membership
+from appliance.ipsec.sealed_authority import SealedAuthority, keep_sealed
 from appliance.standby.membership import (
     LEFT_FILE,
     Membership,
@@ -17,6 +19,7 @@ from appliance.standby.membership import (
 )
 from appliance.standby.process import EPOCH
 from appliance.supervisor.state_directory import StateDirectory
+from appliance.supervisor.users import account_of
 from rosmop.tool.terminal import refused, say
 
 _VERB = "rosrv standby"
@@ -40,6 +43,8 @@ def join_second(file: Path, state: Path, *, again: bool, as_json: bool) -> None:
     say(f"Its registrations, parameters, policy and tokens become those of {membership.other}.")
     if backup is not None:
         say(f"Its own are in {backup}; to use them again: rosrv restore {backup} --state NEW-FOLDER")
+    if membership.sealed_key:
+        say(f"It can sign certificates once it has the same ipsec.ca_passphrase_file as {membership.other}.")
     say(f"Remove {file}: it has private keys.")
 
 
@@ -66,7 +71,7 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     """Write the membership; return the backup, None if there was nothing to lose."""
     path = path_of(state)
     earlier = existing_membership(path)
-    if earlier == membership:
+    if earlier == membership.unsealed():
         return None
     if earlier is not None and not again:
         raise refused(
@@ -87,5 +92,9 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     last = earlier or existing_membership(path.with_name(LEFT_FILE))
     if last is None or last.certificate != membership.certificate:
         (state / "lease" / EPOCH).unlink(missing_ok=True)
-    save_membership(path, membership)
+    if membership.sealed_key:
+        account = account_of("rosrv-signer")
+        sealed = SealedAuthority(membership.sealed_certificate, membership.sealed_key)
+        keep_sealed(state / "signer", sealed, (account.uid, account.gid) if os.geteuid() == 0 else None)
+    save_membership(path, membership.unsealed())
     return backup
