@@ -248,7 +248,7 @@ def _registered(master: str) -> list[float]:
             answer = method("/bench", "/bench/topic", *kind, "http://10.79.0.10:9/")
             times.append(time.monotonic() - began)
             if not isinstance(answer, list) or answer[0] != 1:
-                raise RuntimeError(f"a registration failed: {answer}")
+                raise RuntimeError(f"a registration failed: {answer!r}")
     return times
 
 

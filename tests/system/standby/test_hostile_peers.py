@@ -88,7 +88,7 @@ def grow(robot: StandbyRobot, site: StandbySite, until: Callable[[], bool]) -> N
 def slowest_answer(robot: StandbyRobot, since: float) -> float:
     """Return the longest time that the registrar waited for an answer since then."""
     times = [event["at"] for event in robot.registrar.seen(event="acknowledged") if event["at"] >= since]
-    return max(after - before for before, after in itertools.pairwise(times))
+    return float(max(after - before for before, after in itertools.pairwise(times)))
 
 
 # ---- A standby that lies

@@ -6,7 +6,6 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from appliance.standby.process import boot_time
-from appliance.supervisor import lease_watch
 from appliance.supervisor.lease_watch import LeaseWatch
 from tests.support.processes import LIMIT
 
@@ -42,9 +41,10 @@ def test_it_is_passive_until_the_lease_is_held() -> None:
     """Then it is active in the epoch that was reported."""
 
     async def work(role: Role) -> None:
-        assert not role.watch.active
+        assert role.orders == []
         role.watch.held(boot_time() + 60, 5)
-        assert role.watch.active and role.orders == [5]
+        assert role.orders == [5]
+        assert role.watch.active
 
     run(work)
 
@@ -56,7 +56,8 @@ def test_it_is_passive_when_no_further_report_arrives() -> None:
         until = boot_time() + 0.2
         role.watch.held(until, 5)
         assert await role.until_passive() >= until
-        assert role.orders == [5, "passive"] and not role.watch.active
+        assert role.orders == [5, "passive"]
+        assert not role.watch.active
 
     run(work)
 
@@ -123,7 +124,7 @@ def test_the_time_counts_while_the_machine_sleeps(monkeypatch: pytest.MonkeyPatc
 
     async def work(role: Role) -> None:
         clock = boot_time()
-        monkeypatch.setattr(lease_watch.time, "clock_gettime", lambda _clock: clock)
+        monkeypatch.setattr("appliance.supervisor.lease_watch.time.clock_gettime", lambda _clock: clock)
         role.watch.held(clock + 0.05, 5)
         clock += 3600.0
         await role.until_passive()
