@@ -96,7 +96,7 @@ class Site:
                     self.witness.sendto(answer, address)
 
     def until(self, condition: Callable[[], bool], *, serving: bool = True) -> None:
-        """Wait for a condition; meanwhile the witness answers if `serving`."""
+        """Wait for a condition; the witness answers in the meantime if `serving`."""
 
         def met() -> bool:
             if serving:
