@@ -5,6 +5,7 @@ admits one appliance, and the orders of operators are in force.
 """
 
 import os
+import select
 import signal
 import socket
 import threading
@@ -78,6 +79,9 @@ def test_a_paused_appliance_answers_nothing_when_it_wakes_up(site: StandbySite, 
     try:
         site.until_taken_over(passive)
         robot.works()
+        for pid in site.pids(active, "control"):  # before the supervisor can end it
+            os.kill(pid, signal.SIGCONT)
+        assert not select.select(requests, [], [], EXPIRY)[0]
     finally:
         site.signal(active, signal.SIGCONT)
     assert [answer_to(one) for one in requests] == [b"", b""]
