@@ -101,14 +101,15 @@ class SampleHistory:
         """Sample until cancelled."""
         while True:
             self._sooner.clear()
-            await self._look()
+            await self.look()
             until = BUSY_SECONDS if self._followers else IDLE_SECONDS
             least = min(LEAST_SECONDS, until)
             await asyncio.sleep(least)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._sooner.wait(), until - least)
 
-    async def _look(self) -> None:
+    async def look(self) -> None:
+        """Ask control for the present state, and keep it as the newest sample."""
         status, sample, away, active = None, None, None, ""
         try:
             body = await self._measures()

@@ -23,7 +23,7 @@ class LeaseClient:
         self.state: messages.LeaseState | None = None
         self._listeners: list[Callable[[messages.LeaseState], None]] = []
         self._present = False
-        self._link = Link(self._heard, self._lost)
+        self._link = Link(self.heard, self._lost)
         self._news = asyncio.Event()
         self._handing_over: asyncio.Future[str] | None = None
 
@@ -74,7 +74,8 @@ class LeaseClient:
         if reason:
             raise HandOverError(reason)
 
-    def _heard(self, message: Any) -> None:
+    def heard(self, message: Any) -> None:
+        """Take a message of the lease."""
         match message:
             case messages.LeaseState():
                 self.state = message

@@ -26,6 +26,7 @@ from appliance.control.supervisor_link import ControlLifeline
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership, load_membership
 from appliance.standby.replica import Replica
+from appliance.standby.replica_sync import ReplicaSync
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_receiver import ReplicationReceiver
 from appliance.standby.replication_transport import follow_at
@@ -62,6 +63,7 @@ class PassiveControl:
         )
         self.tunnels = StandbyTunnels()
         endpoint = host_endpoint(settings, membership)
+        self._replica_sync = ReplicaSync(self._replica, self._folder)
         self._receiver = ReplicationReceiver(
             self._replica, self._accepts, lambda: self.tunnels.introduction(endpoint, self._rest.pin)
         )
@@ -85,7 +87,7 @@ class PassiveControl:
         self._lifeline.hear(self._heard)
         active = self._lifeline.hear_tunnels(self.tunnels.answered)
         self._lifeline.say(messages.Ready({"stands_by": True}))
-        self._lease.present()
+        tasks.append(loop.create_task(self._sync()))
         try:
             await until.wait()
         finally:
@@ -98,6 +100,15 @@ class PassiveControl:
                 task.cancel()
             await asyncio.wait([*tasks, stating])
             await asyncio.to_thread(self._replica.close)
+
+    async def _sync(self) -> None:
+        """Keep the replica on the disk, and let the lease claim once it is complete."""
+        while True:
+            try:
+                await self._replica_sync.run(lambda: self._receiver.followed, self._lease.present)
+            except (StoreError, OSError) as error:
+                _log.error("the copy of the state is not on the disk", reason=str(error))
+                await asyncio.sleep(_AGAIN_SECONDS)
 
     def state(self) -> StandbyState:
         """Return the state of both appliances, as this one sees it."""

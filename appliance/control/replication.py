@@ -8,6 +8,7 @@
 """
 
 import asyncio
+import contextlib
 import socket
 import time
 from collections.abc import Callable, Coroutine
@@ -29,9 +30,10 @@ from appliance.standby.replication_frames import Introduction, ReplicationError
 from appliance.standby.replication_sender import ReplicationSender
 from appliance.standby.replication_transport import ReplicationListener
 from appliance.store.state_file import StateStore
-from appliance.store.writer_thread import Database
+from appliance.store.writer_thread import Database, StoreError
 
 _REPORT_SECONDS = 0.1
+_SYNC_SECONDS = 0.1
 _BACKLOG = 8
 _SETTLE_SECONDS = 2.0
 _ANSWER_SECONDS = 5.0
@@ -135,11 +137,9 @@ class Replication:
         self._wait = wait
         self._since = time.time()
         self.switchover_wanted = asyncio.Event()
-        self._sender = ReplicationSender(
-            database, lambda: epoch, switchover_wanted=self.switchover_wanted.set
-        )
+        self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
         self._listener = ReplicationListener(
-            self._sender, replication_context(membership, folder, server=True)
+            self.sender, replication_context(membership, folder, server=True)
         )
         self._permission = 0
         self._trouble_since: float | None = None
@@ -147,7 +147,7 @@ class Replication:
         self._tasks: set[asyncio.Task[None]] = set()
         self._reported: messages.ReplicationReported | None = None
         lease.listen(self._lease_changed)
-        self._report()
+        self.report()
 
     def on_introduction(self, introduced: Callable[[Introduction], Coroutine[Any, Any, None]]) -> None:
         """Call this for each introduction of the standby."""
@@ -157,25 +157,27 @@ class Replication:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        self._sender.on_introduction(start)
+        self.sender.on_introduction(start)
 
     async def run(self) -> None:
         """Serve the standby until cancelled. Raises `OSError` if the port is in use."""
         self._lease.present()
         with socket.create_server(("", self._membership.port), backlog=_BACKLOG) as listening:
-            reports = asyncio.get_running_loop().create_task(self._report_always())
+            loop = asyncio.get_running_loop()
+            tasks = [loop.create_task(self._report_always()), loop.create_task(self._sync_always())]
             try:
                 await self._listener.run(listening)
             finally:
-                reports.cancel()
-                self._sender.close()
+                for task in tasks:
+                    task.cancel()
+                self.sender.close()
 
     async def stored(self) -> None:
         """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
         if self._wait == "standby":
             number = self._database.number
             try:
-                await self._sender.acknowledged(number)
+                await self.sender.acknowledged(number)
             except ReplicationError as error:
                 _log.warning("a change is not answered", reason=str(error))
                 await asyncio.get_running_loop().create_future()  # the supervisor ends this process
@@ -183,7 +185,7 @@ class Replication:
 
     def state(self) -> StandbyState:
         """Return the state of both appliances."""
-        lag, lease, now = self._sender.lag(), self._lease.state, asyncio.get_running_loop().time()
+        lag, lease, now = self.sender.lag(), self._lease.state, asyncio.get_running_loop().time()
         waiting, trouble = lag.waiting_since, self._trouble_since
         other = OtherAppliance(
             name=self._membership.other,
@@ -204,7 +206,7 @@ class Replication:
         """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
         lease = self._lease.state
         heard = lease.heard if lease is not None else None
-        return self._sender.lag().connected and heard is not None and boot_time() - heard < _ANSWER_SECONDS
+        return self.sender.lag().connected and heard is not None and boot_time() - heard < _ANSWER_SECONDS
 
     def require_ready(self) -> None:
         """Raise `HandOverError`, with the reason, unless the standby could take over now."""
@@ -218,7 +220,7 @@ class Replication:
         """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""
         try:
             async with asyncio.timeout(_SETTLE_SECONDS):
-                await self._sender.acknowledged(self._database.number)
+                await self.sender.acknowledged(self._database.number)
         except (TimeoutError, ReplicationError) as error:
             raise HandOverError(
                 f"{self._membership.other} does not store the last changes: {error}"
@@ -228,8 +230,8 @@ class Replication:
     def _lease_changed(self, state: messages.LeaseState) -> None:
         if state.alone and state.permission > self._permission:
             self._permission = state.permission
-            self._sender.answer_alone()
-            self._report()
+            self.sender.answer_alone()
+            self.report()
 
     def _in_sync(self) -> bool:
         lease = self._lease.state
@@ -241,13 +243,24 @@ class Replication:
                 self._trouble_since = None
             elif self._trouble_since is None:
                 self._trouble_since = asyncio.get_running_loop().time()
-            self._report()
+            self.report()
             await asyncio.sleep(_REPORT_SECONDS)
 
-    def _report(self) -> None:
+    async def _sync_always(self) -> None:
+        """Bring changes to this appliance's disk soon after their answers."""
+        synced = 0
+        while True:
+            number = self._database.number
+            if number != synced:
+                with contextlib.suppress(StoreError):  # reported by the store, which tries again
+                    await self._database.settled()
+                    synced = number
+            await asyncio.sleep(_SYNC_SECONDS)
+
+    def report(self) -> None:
         """Report the replication to the lease, if it has changed."""
-        lag = self._sender.lag()
-        self._absent = self._absent and not (lag.connected or self._sender.alone)
+        lag = self.sender.lag()
+        self._absent = self._absent and not (lag.connected or self.sender.alone)
         waiting = lag.waiting_since
         if self._absent:
             waiting = 0.0
@@ -255,7 +268,7 @@ class Replication:
             waiting = boot_time() - (asyncio.get_running_loop().time() - waiting)
         report = messages.ReplicationReported(
             permission=self._permission,
-            caught_up=lag.caught_up and not self._sender.alone,
+            caught_up=lag.caught_up and not self.sender.alone,
             waiting_since=waiting,
         )
         if report != self._reported:

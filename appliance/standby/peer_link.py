@@ -10,7 +10,7 @@ import msgspec
 from appliance.standby.lease import ClaimPromise, PeerMessage, PromiseRequest, TakeOver
 from appliance.standby.witness import HIGHEST, name_in, seal, unseal
 
-_PURPOSES: dict[type[PeerMessage], bytes] = {
+PURPOSES: dict[type[PeerMessage], bytes] = {
     PromiseRequest: b"rosrv promise request 1\0",
     ClaimPromise: b"rosrv promise 1\0",
     TakeOver: b"rosrv take over 1\0",
@@ -28,13 +28,13 @@ class PeerChannel:
 
     def write(self, message: PeerMessage) -> bytes:
         """Return the datagram of a message."""
-        return seal(_PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
+        return seal(PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
 
     def read(self, datagram: bytes) -> PeerMessage | None:
         """Return the message of a datagram; None if it is not authentic, malformed, or was recorded earlier."""
         if name_in(datagram) != self._other:
             return None
-        for kind, purpose in _PURPOSES.items():
+        for kind, purpose in PURPOSES.items():
             body = unseal(purpose, self._key, datagram)
             if body is not None:
                 try:

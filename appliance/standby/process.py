@@ -68,15 +68,15 @@ class LeaseProcess:
         self._lease = ApplianceLease(own, other, session, self._stored, boot_time())
         self._witness = WitnessChannel(own, bytes.fromhex(membership.witness_key), session)
         self._peer = PeerChannel(own, other, bytes.fromhex(membership.peer_key))
-        self._supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
-        self._child = Child(
-            self._supervisor,
+        self.supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self.child = Child(
+            self.supervisor,
             messages.LeaseLink,
-            said=self._control_said,
-            linked=self._control_linked,
-            lost=lambda _reason: self._control_linked(),
+            said=self.control_said,
+            linked=self.control_linked,
+            lost=lambda _reason: self.control_linked(),
         )
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._report = messages.ReplicationReported(0, False, None)
         self._present = False
         self._absent_since = boot_time()
@@ -91,24 +91,25 @@ class LeaseProcess:
 
     async def run(self) -> None:
         """Keep the lease. Raises `OSError` if the epoch cannot be stored: the appliance is then passive."""
-        self._socket.setblocking(False)
-        self._socket.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
+        self.socket.setblocking(False)
+        self.socket.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
         loop = asyncio.get_running_loop()
-        loop.add_reader(self._socket.fileno(), self._readable)
-        self._child.attach(messages.Ready())
-        while not self._child.ended.is_set():
-            self._tick()
+        loop.add_reader(self.socket.fileno(), self._readable)
+        self.child.attach(messages.Ready())
+        while not self.child.ended.is_set():
+            self.tick()
             now = boot_time()
             delay = max(0.005, min(self._lease.next_event(now) - now, _CONTROL_SECONDS))
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), delay)
-        loop.remove_reader(self._socket.fileno())
-        self._socket.close()
+        loop.remove_reader(self.socket.fileno())
+        self.socket.close()
 
     # --- the lease ---
 
-    def _tick(self) -> None:
+    def tick(self) -> None:
+        """Do what is due."""
         lease, report, now = self._lease, self._report, boot_time()
         current = report.permission == self._permission
         waiting = report.waiting_since
@@ -134,30 +135,32 @@ class LeaseProcess:
             self._stored = epoch
         for message in due:
             if isinstance(message, WitnessRequest):
-                self._send(
+                self.send(
                     self._witness.write(message), self._membership.witness, self._membership.witness_port
                 )
             else:
-                self._send(self._peer.write(message), self._membership.other_address, self._membership.port)
+                self.send(self._peer.write(message), self._membership.other_address, self._membership.port)
         self._tell_supervisor()
         self._tell_control()
 
-    def _send(self, datagram: bytes, address: str, port: int) -> None:
+    def send(self, datagram: bytes, address: str, port: int) -> None:
+        """Send a datagram."""
         with contextlib.suppress(OSError):  # no route at present; the lease asks again
-            self._socket.sendto(datagram, (address, port))
+            self.socket.sendto(datagram, (address, port))
 
     def _readable(self) -> None:
         for _ in range(_BATCH):
             try:
-                datagram, (address, _port) = self._socket.recvfrom(_LARGEST)
+                datagram, (address, _port) = self.socket.recvfrom(_LARGEST)
             except BlockingIOError:
                 break
             except OSError:
                 continue  # an earlier datagram was not delivered
-            self._received(datagram, address)
+            self.received(datagram, address)
         self._wake.set()
 
-    def _received(self, datagram: bytes, address: str) -> None:
+    def received(self, datagram: bytes, address: str) -> None:
+        """Take a datagram of the witness or of the other appliance; ignore one of any other host."""
         if address == self._membership.witness:
             found = self._witness.read(datagram)
             if found is not None:
@@ -177,9 +180,9 @@ class LeaseProcess:
             return
         self._held = until
         if lease.held is not None and until:
-            self._supervisor.send(messages.LeaseHeld(until, lease.held))
+            self.supervisor.send(messages.LeaseHeld(until, lease.held))
         else:
-            self._supervisor.send(messages.LeaseEnded())
+            self.supervisor.send(messages.LeaseEnded())
 
     def _tell_control(self) -> None:
         lease, now = self._lease, boot_time()
@@ -198,9 +201,9 @@ class LeaseProcess:
         )
         if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
             self._told, self._told_at = state, now
-            self._child.tell(state)
+            self.child.tell(state)
 
-    def _control_linked(self) -> None:
+    def control_linked(self) -> None:
         """A new control waits for the standby until it gets a new permission."""
         if self._present:
             self._present, self._absent_since = False, boot_time()
@@ -208,7 +211,8 @@ class LeaseProcess:
         self._told = None
         self._wake.set()
 
-    def _control_said(self, message: Any) -> None:
+    def control_said(self, message: Any) -> None:
+        """Take a message of control."""
         match message:
             case messages.ReplicationReported():
                 self._report = message
@@ -228,7 +232,7 @@ class LeaseProcess:
             due = self._lease.switch_over(boot_time())
         except LeaseError as error:
             reason, due = str(error), ()
-        self._child.tell(messages.HandOverAnswered(reason))
+        self.child.tell(messages.HandOverAnswered(reason))
         self._after(due)
 
 

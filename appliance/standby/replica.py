@@ -4,6 +4,9 @@ The active appliance is authenticated, but not believed. It can put and delete r
 the right types; it cannot send SQL, a database file, a trigger, or rows of another table. The file cannot grow beyond
 `LARGEST_STATE`. Changes must follow each other without a gap, and none is accepted from a smaller epoch.
 
+A stored change survives the death of all processes. It is on the disk after the next `sync`: a sync for each answer
+would take longer than the call itself. So after a power cut, a standby must catch up before it takes over.
+
 All tables are copied. None has a secret that must stay on one appliance:
 
 - `token` has salted scrypt hashes, `token_keys` the hash of a reading key and a public key, `enrolment_token` the hash
@@ -16,6 +19,7 @@ Private keys (audit log, certificate authority, REST, this link) are in other fi
 """
 
 import contextlib
+import os
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -54,14 +58,14 @@ class Replica:
         self._rows = 0
         with self._explained():
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
-            self._connection.execute("PRAGMA synchronous=FULL")
+            self._connection.execute("PRAGMA synchronous=NORMAL")
             (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
             self._connection.execute(f"PRAGMA max_page_count={largest // page_size}")
             kept = self._connection.execute("SELECT epoch, history, number FROM journal").fetchone()
         self.position = Stored(*kept) if kept else Stored(0, "", 0)
 
     def take(self, message: FromActive) -> None:
-        """Take a message; then `position` is on the disk.
+        """Take a message; then `position` survives the death of this process.
 
         Raises `ReplicationError` if it is not allowed, and `StoreError` if it cannot be written. The state is then as
         it was before the message, or before the snapshot.
@@ -79,6 +83,14 @@ class Replica:
         with self._lock, self._explained():
             query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
             return bool(self._connection.execute(query).fetchone()[0])
+
+    def sync(self) -> None:
+        """Wait until everything stored is on the disk. Raises `StoreError`."""
+        try:
+            with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
+                os.fsync(log.fileno())
+        except OSError as error:
+            raise StoreError(f"{self._path}: {error}; free space there") from error
 
     def abandon_snapshot(self) -> None:
         """Return to the state before an incomplete snapshot."""

@@ -31,7 +31,7 @@ class ReplicationError(Exception):
 
 
 class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
-    """The standby has all changes up to `number` of this history on its disk; `epoch` is the last it has seen."""
+    """The standby has stored all changes up to `number` of this history; `epoch` is the last it has seen."""
 
     epoch: _Number
     history: _History

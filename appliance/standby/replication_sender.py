@@ -98,20 +98,19 @@ class ReplicationSender:
         self._unanswered = 0
         self._answered = asyncio.Event()
         self._reason = ""
-        self._link: asyncio.Task[None] | None = None
+        self.link: asyncio.Task[None] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
         self.alone = False
         self._introduced: Callable[[Introduction], None] = lambda _introduction: None
 
     async def acknowledged(self, number: int) -> None:
-        """Wait until this appliance and the standby have all changes up to this number on their disks.
+        """Wait until the standby has stored all changes up to this number.
 
         While the standby is away, this waits until it is back, or until this appliance answers alone. Raises
-        `StoreError` if this appliance cannot write, and `ReplicationError` when the sender is closed.
+        `ReplicationError` when the sender is closed.
         """
         if self.alone:
             return
-        await self._database.settled()
         if number > self._acknowledged and not self.alone:
             waiter = self._loop.create_future()
             self._waiting[waiter] = (number, self._loop.time())
@@ -134,7 +133,7 @@ class ReplicationSender:
     def lag(self) -> ReplicationLag:
         """Return how far the standby is behind."""
         return ReplicationLag(
-            self._link is not None,
+            self.link is not None,
             self._database.number - self._acknowledged,
             self._feed.size,
             min((since for _number, since in self._waiting.values()), default=None),
@@ -145,18 +144,18 @@ class ReplicationSender:
         """Send to the standby until the link ends; a new link ends the earlier one. Raises `ReplicationError`."""
         link: ReplicationLink[FromStandby] = ReplicationLink(reader, writer, FromStandby)
         try:
-            while (earlier := self._link) is not None:
+            while (earlier := self.link) is not None:
                 earlier.cancel()
                 await asyncio.wait([earlier])
-                if self._link is earlier:
-                    self._link = None
-            own = self._link = self._loop.create_task(self._serve(link))
+                if self.link is earlier:
+                    self.link = None
+            own = self.link = self._loop.create_task(self._serve(link))
             try:
                 await asyncio.wait([own])
             finally:
                 own.cancel()
-                if self._link is own:
-                    self._link = None
+                if self.link is own:
+                    self.link = None
             if own.cancelled():
                 raise ReplicationError(
                     "the standby opened another link, or this appliance is no longer active"
@@ -175,8 +174,8 @@ class ReplicationSender:
         for waiter in self._waiting:
             if not waiter.done():
                 waiter.set_exception(ReplicationError("this appliance is no longer active"))
-        if self._link is not None:
-            self._link.cancel()
+        if self.link is not None:
+            self.link.cancel()
 
     def _notice(self) -> None:
         if not self._changed.is_set():  # `_send` clears it before it looks for the last changes
@@ -205,7 +204,7 @@ class ReplicationSender:
         self._acknowledged = self._sent = self._unanswered = 0
         if position is not None:
             self._sent = position
-            self._take(begin)
+            self.take(begin)
         ends = [
             self._loop.create_task(self._receive(link)),
             self._loop.create_task(self._send(link, position)),
@@ -233,9 +232,10 @@ class ReplicationSender:
             self._unanswered -= 1
             self._answered.set()
             if message.history == self._database.history:
-                self._take(message)
+                self.take(message)
 
-    def _take(self, stored: Stored) -> None:
+    def take(self, stored: Stored) -> None:
+        """Take an acknowledgement of the standby. Raises `ReplicationError` if it is not possible."""
         if stored.number > self._sent:
             raise ReplicationError(
                 f"the standby acknowledged change {stored.number}, and was sent only {self._sent} changes"
@@ -263,7 +263,7 @@ class ReplicationSender:
                 position = await self._send_snapshot(link)
                 continue
             bodies = [msgspec.Raw(change.body) for change in changes]
-            self._note_sent(position + len(changes))
+            self.note_sent(position + len(changes))
             await self._post(
                 link, EncodedChanges(self._epoch(), self._database.history, position + 1, bodies)
             )
@@ -281,7 +281,7 @@ class ReplicationSender:
         with contextlib.closing(copy):
             found = copy.execute("SELECT number FROM journal").fetchone()
             number = found[0] if found else 0
-            self._note_sent(number)
+            self.note_sent(number)
             await self._post(link, SnapshotBegin(self._epoch(), self._database.history, number))
             rows = 0
             puts = _rows_of(copy, self._database.tables)
@@ -302,7 +302,8 @@ class ReplicationSender:
         self._unanswered += 1
         await link.send(message)
 
-    def _note_sent(self, number: int) -> None:
+    def note_sent(self, number: int) -> None:
+        """Note that all changes up to this number are sent on the present link."""
         self._sent = number
         self._most_sent = max(self._most_sent, number)
 

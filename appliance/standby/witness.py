@@ -1010,7 +1010,7 @@ def follow(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         key=own.key,
         appliances=names,
         session=os.urandom(16).hex(),
-        epoch=_followed_epoch(lease, log),
+        epoch=followed_epoch(lease, log),
         save=lambda epoch: lease.write(LeaseRecord(epoch, "", names, "")),
         admit=enforcement.admit,
         clock=_boot_seconds,
@@ -1049,7 +1049,7 @@ def _boot_seconds() -> float:
     return time.clock_gettime(_CLOCK_BOOTTIME)
 
 
-def _followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
+def followed_epoch(lease: LeaseFile, log: BoundedLog) -> int:
     """Return the greatest epoch that this follower saved. If it is damaged, no answer is new enough."""
     if not os.path.exists(lease.path):
         return 0

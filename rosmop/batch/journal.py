@@ -28,7 +28,7 @@ class _Line(msgspec.Struct):
     result: str
 
 
-class Journal:
+class ResumeJournal:
     """An open journal, locked against other commands. Raises `JournalError`."""
 
     def __init__(self, path: Path) -> None:

@@ -52,9 +52,11 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
 def _paths(one: str) -> Iterator[str]:
     if Path(one).is_dir():
         for folder, _folders, names in os.walk(one):
-            yield from (os.path.join(folder, name) for name in names if name.endswith(ENDINGS))  # noqa: PTH118
+            chosen = (name for name in names if name.endswith(ENDINGS))
+            yield from (str(Path(folder, name)) for name in chosen)
     else:
-        yield from (path for path in glob.glob(one, recursive=True) if not Path(path).is_dir())  # noqa: PTH207
+        found = glob.glob(one, recursive=True)  # noqa: PTH207  Path.glob accepts no absolute pattern
+        yield from (path for path in found if not Path(path).is_dir())
 
 
 def _local(uri: str) -> RecordingName:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from rosmop.batch.executor import Executor, ThisProcess, WorkerDeath, execute
 from rosmop.batch.jobs import Failure, Job, Result, packed, unpacked, work
-from rosmop.batch.journal import Journal
+from rosmop.batch.journal import ResumeJournal
 from rosmop.batch.process_pool import ProcessPool
 from rosmop.batch.ray_cluster import RayCluster
 
@@ -17,7 +17,7 @@ class JobRunner:
     """An executor, and the journal of the command if it has one. `done` gets the number of each job that ended."""
 
     executor: Executor
-    journal: Journal | None
+    journal: ResumeJournal | None
 
     def run(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None

@@ -29,7 +29,7 @@ from rosmop.learn.passes import (
     TimeFacts,
     TimeStep,
 )
-from rosmop.learn.recordings import LearningError, RecordingFacts, RecordingSpan, split
+from rosmop.learn.recordings import LearnedSpan, LearningError, RecordingFacts, split
 from rosmop.learn.rv_writer import on, specifications
 from rosmop.learn.topic_orders import TopicOrders
 from rosmop.learn.topics import MOST_GAPS, TopicContent, TopicRhythm
@@ -54,8 +54,8 @@ class LearningResult:
     """The specification of each candidate, by its key."""
     types: Mapping[str, str]
     """The message types of the topics."""
-    trained: tuple[RecordingSpan, ...]
-    held_out: tuple[RecordingSpan, ...]
+    trained: tuple[LearnedSpan, ...]
+    held_out: tuple[LearnedSpan, ...]
     skipped: tuple[str, ...]
     """Topics whose type cannot be read, with the reason."""
     failed: Mapping[int, str]
@@ -163,7 +163,7 @@ class _Learner:
         return LearntFacts(self._types, self._fields, rhythms, rows, own, seconds, parts * self._each)
 
     @property
-    def _parts(self) -> list[RecordingSpan]:
+    def _parts(self) -> list[LearnedSpan]:
         return [*self._trained, *self._held_out]
 
     def _span(
@@ -238,7 +238,7 @@ class _Learner:
         return "".join(f"// {' '.join(line.split())}\n" for line in lines)
 
 
-def _names(parts: Sequence[RecordingSpan]) -> str:
+def _names(parts: Sequence[LearnedSpan]) -> str:
     most = 6
     names = [part.name for part in parts]
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

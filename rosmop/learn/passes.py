@@ -19,7 +19,7 @@ from rosmop.run.outcomes import Outcome
 from roswire.definitions import Definitions
 
 
-class Step(msgspec.Struct, frozen=True, tag=True):
+class LearningStep(msgspec.Struct, frozen=True, tag=True):
     """The part of a recording from `began` to `ended` (nanoseconds), and the topics to read.
 
     `recording` is its number. It has `windows` windows, of which the first has the number `first_window`.
@@ -40,13 +40,13 @@ class Step(msgspec.Struct, frozen=True, tag=True):
                 yield message, self.first_window + (message[1] - self.began) * self.windows // length
 
 
-class TimeStep(Step, frozen=True):
+class TimeStep(LearningStep, frozen=True):
     """Reads only times; keeps at most `gaps` of each topic for the median."""
 
     gaps: int
 
 
-class ContentStep(Step, frozen=True):
+class ContentStep(LearningStep, frozen=True):
     """Reads the fields of each message. `rhythms` has the period and the interval of each topic."""
 
     rhythms: dict[str, tuple[float, float]]
@@ -54,7 +54,7 @@ class ContentStep(Step, frozen=True):
     """The topics that are compared with each other."""
 
 
-class AlarmStep(Step, frozen=True):
+class AlarmStep(LearningStep, frozen=True):
     """Runs the learnt specifications. `says`, by monitor: a candidate's number, and how its warning begins."""
 
     text: str

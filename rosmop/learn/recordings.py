@@ -39,7 +39,7 @@ class RecordingSource(RecordingFacts, Protocol):
 
 
 @dataclass(frozen=True)
-class RecordingSpan:
+class LearnedSpan:
     """The recording of a number, or the part of it between two times (both included)."""
 
     number: int
@@ -55,13 +55,13 @@ class RecordingSpan:
 
 def split(
     recordings: Sequence[RecordingFacts], held_out: float
-) -> tuple[list[RecordingSpan], list[RecordingSpan]]:
+) -> tuple[list[LearnedSpan], list[LearnedSpan]]:
     """Return the training part and the held-out part: whole recordings, spread evenly, or the end of a single one.
 
     If there is only one recording and it is too short to split, nothing is held out.
     """
     parts = [
-        RecordingSpan(number, recording.name, recording.began, recording.ended)
+        LearnedSpan(number, recording.name, recording.began, recording.ended)
         for number, recording in enumerate(recordings)
     ]
     if held_out <= 0:

@@ -14,7 +14,7 @@ import msgspec
 import typer
 
 from rosmop.batch.jobs import Failure, Job, Result
-from rosmop.batch.journal import Journal, JournalError
+from rosmop.batch.journal import JournalError, ResumeJournal
 from rosmop.batch.ray_cluster import ClusterError
 from rosmop.batch.recording_list import RecordingName, recordings_of
 from rosmop.batch.runner import JobRunner, executor_for
@@ -28,7 +28,7 @@ _INTERRUPTED = 130
 
 
 @dataclass(frozen=True)
-class BatchOptions:
+class RecordingsOptions:
     """The options of a command with recordings."""
 
     bags: Sequence[Path] = ()
@@ -52,7 +52,7 @@ class BatchSession:
 
     program: CommandContext
     recordings: Sequence[RecordingName]
-    options: BatchOptions
+    options: RecordingsOptions
     runner: JobRunner
 
     def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
@@ -109,14 +109,14 @@ class BatchSession:
 
 
 @contextmanager
-def batch_session(program: CommandContext, options: BatchOptions) -> Iterator[BatchSession]:
+def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterator[BatchSession]:
     """Open a block with the recordings of the options. Exits with status 2 if there are none or an option is wrong."""
     if not options.bags and not options.sets:
         raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
     with ExitStack() as opened:
         try:
             recordings = recordings_of(options.bags, options.sets)
-            journal = None if options.resume is None else opened.enter_context(Journal(options.resume))
+            journal = None if options.resume is None else opened.enter_context(ResumeJournal(options.resume))
             executor = opened.enter_context(executor_for(len(recordings), options.workers, options.on))
             yield BatchSession(program, recordings, options, JobRunner(executor, journal))
         except (RecordingError, JournalError, ClusterError) as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from rosmop.tool import check_command, coverage_command, learn_command, run_command
-from rosmop.tool.batch_session import BatchOptions
+from rosmop.tool.batch_session import RecordingsOptions
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.options import (
     SUMMARIES,
@@ -69,7 +69,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         show_progress: ShowProgress = False,
     ) -> None:
         """Exit status 3 if recordings failed: they are in the report, and the others are complete."""
-        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
+        options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         raise typer.Exit(run_command.run(program, files, msg or [], options, output=output, as_json=as_json))
 
     def learn(
@@ -87,7 +87,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         show_progress: ShowProgress = False,
     ) -> None:
         """Exit status 3 if recordings failed: they are reported, and the others were learnt from."""
-        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
+        options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         status = learn_command.learn_monitors(
             program, options, topics or [], out, hold_out=hold_out, as_json=as_json
         )
@@ -108,7 +108,7 @@ def commands_of(program: CommandContext) -> dict[str, Callable[..., None]]:
         show_progress: ShowProgress = False,
     ) -> None:
         """Exit status 3 if recordings failed: they are reported, and not counted."""
-        options = BatchOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
+        options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report, show_progress)
         status = coverage_command.coverage(
             program, files, msg or [], options, fail_under=fail_under, as_json=as_json
         )

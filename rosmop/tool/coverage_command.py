@@ -10,7 +10,7 @@ from rosmop.batch.jobs import Coverage, CoverageJob, Failure
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import CoverageItem, items_of, merged
-from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
+from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import read_definition_files, read_specifications
 from rosmop.tool.tables import table_of
@@ -23,7 +23,7 @@ def coverage(
     program: CommandContext,
     files: list[Path],
     folders: list[Path],
-    options: BatchOptions,
+    options: RecordingsOptions,
     *,
     fail_under: float,
     as_json: bool,

@@ -12,7 +12,7 @@ from rosmop.batch.recording_list import RecordingName
 from rosmop.learn.learner import LearningResult, learn
 from rosmop.learn.passes import AlarmFacts, AnyStep, ContentFacts, ContentStep, Facts, TimeFacts, TimeStep
 from rosmop.learn.recordings import LearningError
-from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
+from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.specification_input import BESIDE
 from rosmop.tool.terminal import counted, say, say_json
@@ -24,7 +24,7 @@ from roswire.standard import standard_definitions
 
 def learn_monitors(
     program: CommandContext,
-    options: BatchOptions,
+    options: RecordingsOptions,
     topics: list[str],
     out: Path | None,
     *,

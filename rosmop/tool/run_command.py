@@ -11,7 +11,7 @@ from rosmop.form.findings import SpecificationError
 from rosmop.recordings.recording import Reader, definitions_of, open_recording
 from rosmop.recordings.replay import OutputBag, refusals, replay
 from rosmop.run.engine import MonitorSet
-from rosmop.tool.batch_session import SOME_FAILED, BatchOptions, BatchSession, batch_session
+from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.progress_bar import progress
@@ -26,7 +26,7 @@ def run(
     program: CommandContext,
     files: list[Path],
     folders: list[Path],
-    options: BatchOptions,
+    options: RecordingsOptions,
     *,
     output: Path | None,
     as_json: bool,

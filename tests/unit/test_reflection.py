@@ -38,6 +38,7 @@ ALLOWED = {
     "appliance/master/calls/call.py _type_name": TEXT,
     "appliance/relay/grant_table.py _fact": "a statement and its withdrawal have the same key",
     "appliance/supervisor/child_entry.py _call": IMPORTED,
+    "rosmop/batch/ray_cluster.py _first_line": TEXT,
     "rosmop/check/reachable_types.py _plain": FIELDS,
     "rosmop/fast/serialization.py _made": TEXT,
     "rosmop/fast/serialization.py _plain": TEXT,

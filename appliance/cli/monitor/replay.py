@@ -14,7 +14,7 @@ from appliance.cli.monitor.recorder_input import Piece, Span, gaps, pieces_of, r
 from appliance.cli.output import say_json
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
-from rosmop.tool.batch_session import BatchOptions, batch_session
+from rosmop.tool.batch_session import RecordingsOptions, batch_session
 from rosmop.tool.monitor_output import BILLION
 from rosmop.tool.options import BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
 from rosmop.tool.replay_report import ReplayReport
@@ -86,7 +86,7 @@ def replay_monitor(
         raise MONITOR.usage_error(
             "give --bag FILE or --bags DIR (repeatable), or --since and --until for the flight recorder"
         )
-    options = BatchOptions(bags or [], sets or [], workers, on, resume, report_file, show_progress)
+    options = RecordingsOptions(bags or [], sets or [], workers, on, resume, report_file, show_progress)
     report = ReplayReport(most, as_json=appliance.as_json)
     patterns = topics or ["*"]
     try:

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer
 from typer.testing import CliRunner
 
 from rosmop.batch.executor import ThisProcess
-from rosmop.batch.journal import Journal, JournalError
+from rosmop.batch.journal import JournalError, ResumeJournal
 from rosmop.tests.acting import message
 from rosmop.tests.batch.works import counted_work
 from rosmop.tool.command import app
@@ -196,20 +196,20 @@ def test_a_journal_is_bound_to_specifications_and_recordings(
 def test_a_journal_that_was_cut_off_is_continued(tmp_path: Path) -> None:
     """Half a line is ignored and overwritten; another file is rejected; two commands cannot use one journal."""
     path = tmp_path / "journal"
-    with Journal(path) as journal:
+    with ResumeJournal(path) as journal:
         journal.add(b"one", b"1")
         journal.add(b"two", b"2" * 1000)
         with pytest.raises(JournalError, match="in use"):
-            Journal(path)
+            ResumeJournal(path)
     os.truncate(path, path.stat().st_size - 100)
-    with Journal(path) as journal:
+    with ResumeJournal(path) as journal:
         assert (journal.result(b"one"), journal.result(b"two"), len(journal)) == (b"1", None, 1)
         journal.add(b"three", b"3")
-    with Journal(path) as journal:
+    with ResumeJournal(path) as journal:
         assert (journal.result(b"one"), journal.result(b"three")) == (b"1", b"3")
     shutil.copy(__file__, path)
     with pytest.raises(JournalError, match="not a journal"):
-        Journal(path)
+        ResumeJournal(path)
 
 
 def test_the_cluster_is_checked_first(folder: Path) -> None:

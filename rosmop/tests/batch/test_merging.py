@@ -1,4 +1,4 @@
-"""What recordings teach is merged in any order, by facts as they come from workers."""
+"""Facts learned from recordings are merged in any order, as they come from workers."""
 
 import math
 import random

@@ -39,8 +39,8 @@ class Site:
             for name, address in (("robot", ROBOT), ("own", OWN), ("other", OTHER), ("stranger", STRANGER))
         }
         self.epoch = folder / "epoch"
-        self.witness = self._bound(ROBOT, 7411)
-        self.peer = self._bound(OTHER, MEMBERSHIP.port)
+        self.witness = self.bound(ROBOT, 7411)
+        self.peer = self.bound(OTHER, MEMBERSHIP.port)
         here, there = socket.socketpair()
         self.supervisor = Channel(here, messages.Lifeline)
         self._lifeline = there
@@ -54,7 +54,8 @@ class Site:
         peers = {"a": AppliancePeer(OWN, KEY), "b": AppliancePeer(OTHER, b"\xbb" * 32)}
         self.gate = WitnessGate(self._rules, peers, "nonce")
 
-    def _bound(self, address: str, port: int) -> socket.socket:
+    def bound(self, address: str, port: int) -> socket.socket:
+        """Return a socket with this address."""
         sock = self.hosts[address].run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         sock.bind((address, port))
         sock.settimeout(0.05)
@@ -69,8 +70,8 @@ class Site:
             try:
                 await process.run()
             finally:  # a real process ends here
-                process._child.close()
-                process._supervisor.close()
+                process.child.close()
+                process.supervisor.close()
 
         try:
             asyncio.run(work())
@@ -167,7 +168,7 @@ def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
     """From the witness's address without its key, from the other appliance without the key, and from any host."""
     site.start()
     site.until(site.held)
-    stranger = site._bound(STRANGER, 0)
+    stranger = site.bound(STRANGER, 0)
     forged = PeerChannel("b", "a", b"\xdd" * 32).write(PromiseRequest(99, "s", 1))
     genuine = PeerChannel("b", "a", PEER_KEY).write(PromiseRequest(99, "s", 1))
     with stranger:

@@ -148,7 +148,7 @@ def test_a_standby_that_lies(site: StandbySite, robot: StandbyRobot, tmp_path: P
             lambda _history: "garbage",
             lambda _history: b"\x93" * 4096,
         ):
-            assert liar.run(lambda link, lie=false: lied(link, lie)) is True  # type: ignore[misc]
+            assert liar.run(lambda link, lie=false: lied(link, lie)) is True  # type: ignore[misc]  # mypy infers no type for a lambda's default
         robot.works()
         assert site.in_sync() == {active}
         liar.run(lambda link: reads_nothing(link, robot))

@@ -65,7 +65,7 @@ def test_the_death_of_one_process(site: StandbySite, robot: StandbyRobot) -> Non
         active, _ = site.pair()
         for pid in site.pids(active, role):
             os.kill(pid, signal.SIGKILL)
-        eventually(lambda name=active, title=role: site.pids(name, title), site.story)  # type: ignore[misc]
+        eventually(lambda name=active, title=role: site.pids(name, title), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
         robot.lost_nothing()
         site.until_both_in_sync()
         assert role == "lease" or site.holder() == active, role

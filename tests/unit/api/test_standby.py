@@ -58,7 +58,7 @@ def gate() -> RequestGate:
     )
     door.state([TokenKept(ROW.id, ROW.name, ROW.role, ROW.salt, ROW.hash, ROW.expires)])
     history = SampleHistory(lambda: measures_of(control))
-    asyncio.run(history._look())
+    asyncio.run(history.look())
     app = build_app(Services(Settings(), control, door, journal, asyncio.Event(), history))
     return RequestGate(app, limits=ApiLimits(), doorkeeper=door, journal=journal, names=["api"])
 

@@ -328,11 +328,11 @@ def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
     """The log has the reason and the commands; a missing one is that of a new follower."""
     lines: list[str] = []
     log, file = BoundedLog(lines.append, lambda: 0.0), LeaseFile(str(tmp_path / "epoch"), BOTH)
-    assert witness._followed_epoch(file, log) == 0
+    assert witness.followed_epoch(file, log) == 0
     file.write(LeaseRecord(7, "", BOTH, ""))
-    assert witness._followed_epoch(file, log) == 7
+    assert witness.followed_epoch(file, log) == 7
     (tmp_path / "epoch").write_bytes(b"damaged")
-    robot = Robot(epoch=witness._followed_epoch(file, log))
+    robot = Robot(epoch=witness.followed_epoch(file, log))
     assert "systemctl restart rosrv-witness-follow" in lines[0]
     robot.claim("a")
     for _ in range(2):

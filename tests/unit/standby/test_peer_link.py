@@ -69,7 +69,7 @@ def test_garbage_is_not_read(datagram: bytes) -> None:
 def test_an_authentic_but_malformed_message_is_not_read(body: dict[str, object]) -> None:
     """The other appliance is not believed blindly, and never ends the process."""
     _, there = ends()
-    for purpose in peer_link._PURPOSES.values():
+    for purpose in peer_link.PURPOSES.values():
         assert there.read(seal(purpose, "a", KEY, body)) is None
 
 

@@ -79,10 +79,8 @@ class Pair:
         here, self.supervisor = socket.socketpair()
         self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
         parts: Any = self.lease
-        parts._send = lambda datagram, _address, port: (
-            self.requests.append(datagram) if port == 7411 else None
-        )
-        parts._child = SimpleNamespace(tell=self.to_control.append)
+        parts.send = lambda datagram, _address, port: self.requests.append(datagram) if port == 7411 else None
+        parts.child = SimpleNamespace(tell=self.to_control.append)
         self.database = Store()
         self.standby = 0  # the last change on the standby's disk
         self.acknowledgements = deque[int]()
@@ -106,45 +104,46 @@ class Pair:
         self.control = Replication(
             MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
         )
-        self.lease._control_linked()
+        self.lease.control_linked()
         self.client.present()
 
     def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
         """Let one thing happen."""
-        sender: Any = self.control._sender
+        sender: Any = self.control.sender
         match name:
             case "change":
                 self.database.number += 1
                 self.waiting.add(asyncio.ensure_future(self._answer(self.database.number)))
             case "connect":
-                sender._link = sender._link or SimpleNamespace(cancel=lambda: None)
+                sender.link = sender.link or SimpleNamespace(cancel=lambda: None)
             case "disconnect":
-                sender._link = None
+                sender.link = None
                 self.acknowledgements.clear()
-            case "ship" if sender._link is not None:
-                self.standby = sender._sent = max(self.standby, self.database.number)
+            case "ship" if sender.link is not None:
+                self.standby = max(self.standby, self.database.number)
+                sender.note_sent(self.standby)
                 self.acknowledgements.append(self.standby)
             case "acknowledge" if self.acknowledgements:
-                sender._take(Stored(2, self.database.history, self.acknowledgements.popleft()))
+                sender.take(Stored(2, self.database.history, self.acknowledgements.popleft()))
             case "time":
                 self.now += 0.31
-                self.lease._tick()
+                self.lease.tick()
             case "witness" if self.requests:
                 answer = self.gate.answer(self.requests.popleft(), ADDRESSES["a"])
                 assert answer is not None
                 self.answers.append(answer)
             case "answer" if self.answers:
-                self.lease._received(self.answers.popleft(), "10.0.0.1")
+                self.lease.received(self.answers.popleft(), "10.0.0.1")
             case "lose" if self.answers:
                 self.answers.popleft()
             case "report":
-                self.control._report()
+                self.control.report()
             case "to lease" if self.to_lease:
-                self.lease._control_said(self.to_lease.popleft())
+                self.lease.control_said(self.to_lease.popleft())
             case "to control" if self.to_control:
                 message = self.to_control.popleft()
                 if isinstance(message, messages.LeaseState):
-                    self.client._heard(message)
+                    self.client.heard(message)
             case "restart":
                 self.start_control(taken_over=False)
             case "settle":
@@ -184,8 +183,8 @@ class Pair:
             task.cancel()
         self.supervisor.close()
         parts: Any = self.lease
-        parts._socket.close()
-        parts._supervisor.close()
+        parts.socket.close()
+        parts.supervisor.close()
 
 
 async def run(pair: Pair, steps: list[str]) -> None:

@@ -1,6 +1,7 @@
 """A standby's state file, and an active appliance that does not keep to the rules."""
 
 import contextlib
+import os
 import sqlite3
 import subprocess
 from collections.abc import Iterator
@@ -75,21 +76,17 @@ def test_changes_and_their_number_are_stored_together(tmp_path: Path) -> None:
     again.close()
 
 
-def test_each_commit_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SQLite's log is synchronized in each transaction, so an acknowledged change survives a power failure."""
-    connections: list[sqlite3.Connection] = []
-    connect = sqlite3.connect
-
-    def noted(*arguments: Any, **options: Any) -> sqlite3.Connection:
-        connections.append(connect(*arguments, **options))
-        return connections[-1]
-
-    monkeypatch.setattr(sqlite3, "connect", noted)
+def test_a_sync_brings_what_is_stored_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A commit does not wait for the disk, because an answer waits for it; `sync` synchronizes SQLite's log."""
+    synced: list[str] = []
     replica = begun(tmp_path)
-    modes = [
-        connections[-1].execute(f"PRAGMA {mode}").fetchone()[0] for mode in ("synchronous", "journal_mode")
-    ]
-    assert modes == [2, "wal"]
+    monkeypatch.setattr(
+        os, "fsync", lambda file: synced.append(str(Path(f"/proc/self/fd/{file}").readlink()))
+    )
+    replica.take(changes(thing("a")))
+    assert synced == []
+    replica.sync()
+    assert [Path(name).name for name in synced] == ["state.db-wal"]
     replica.close()
 
 

@@ -87,6 +87,7 @@ async def test_changes_arrive_and_are_acknowledged(tmp_path: Path) -> None:
             assert standby.replica.position.number == active.database.number
             assert active.sender.lag()[:4] == (True, 0, 0, None)
             assert active.sender.lag().caught_up
+            await active.database.settled()
             require_equal(tmp_path)
         assert not standby.ends
 
