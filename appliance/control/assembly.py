@@ -8,6 +8,7 @@ from appliance.control.endpoints import Endpoints, make_endpoints
 from appliance.control.foundation import INNER, RVMASTER, Foundation
 from appliance.control.listener_limits import value_limits
 from appliance.control.monitor_states import published_now
+from appliance.control.replication import answered_when_stored
 from appliance.master import rosout
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_execution import Execution
@@ -108,7 +109,11 @@ def assemble(base: Foundation) -> Parts:
         port,
     )
     node_table = served(NODE_CALLS.values(), node_calls)
-    ends.handler.set(lambda incarnation: pipeline.handler(node_table, target=incarnation))
+    ends.handler.set(
+        lambda incarnation: answered_when_stored(
+            base.replication, pipeline.handler(node_table, target=incarnation)
+        )
+    )
     return Parts(
         core=core,
         endpoints=ends,
@@ -201,6 +206,5 @@ def _make_calls(
         offload=offload,
         bulk=bulk_turns(base.quota_class),
         processor=base.listener_limits.time,
-        stored=base.replication.stored if base.replication is not None else None,
     )
     return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

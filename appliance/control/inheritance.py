@@ -6,15 +6,13 @@ planned switchover, the relays first drop all messages and leave their state, wh
 up. After any other takeover the state is lost: monitors that act by their state hold their topics.
 """
 
-import asyncio
 from collections.abc import Callable
 
 import msgspec
 
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Pair
-from appliance.master.endpoints.relay_control import RelayControl
-from appliance.specifications.rollout import InheritedState
+from appliance.specifications.rollout import InheritedState, Rollout
 from appliance.store.state_file import StateStore
 
 _ACTIVE = "active appliance"
@@ -47,11 +45,10 @@ def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Call
     ), taken
 
 
-async def leave_state(pair: Pair, store: StateStore, relay: RelayControl) -> None:
+async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
     """Stop the relays, and store the state of their monitors. Raises `HandOverError` if a relay does not answer."""
     try:
-        async with asyncio.timeout(_LEAVE_SECONDS):
-            contents = await relay.leave()
+        contents = await rollout.leave(_LEAVE_SECONDS)
     except (TimeoutError, ConnectionError) as error:
         raise HandOverError("a relay does not answer; try again") from error
     for index, content in enumerate(contents):

@@ -31,7 +31,7 @@ from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
 from appliance.control.policies import PolicyRefusedError
-from appliance.control.replication import Pair
+from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import SpareMemory
 from appliance.control.standby_orders import begin_epoch, standby_source
@@ -137,7 +137,8 @@ class _Control:
         """Serve all listeners, handle the supervisor's messages, and start the background tasks."""
         base, parts, operators = self._base, self._parts, self._operators
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
-        await listener_limits.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
+        calls = answered_when_stored(base.replication, parts.pipeline.handler(parts.table))
+        await listener_limits.open(sockets[RVMASTER], calls, guarded=True)
         await listener_limits.open(sockets[OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         # Do not keep connections alive: at each call, the ROS master queries the kernel about every open connection.
         await listener_limits.open(

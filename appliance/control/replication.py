@@ -23,6 +23,7 @@ from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.control.standby_tunnels import StandbyTunnels
+from appliance.rpc.server import Handler, HttpRequest
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership
 from appliance.standby.process import boot_time
@@ -70,6 +71,20 @@ def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -
         taken_over=pair.taken_over,
         folder=settings.state / "control",
     )
+
+
+def answered_when_stored(replication: "Replication | None", handler: Handler) -> Handler:
+    """Return a handler whose answers wait until all earlier changes may be answered."""
+    if replication is None:
+        return handler
+    stored = replication.stored
+
+    async def handle(request: HttpRequest) -> bytes:
+        answer = await handler(request)
+        await stored()
+        return answer
+
+    return handle
 
 
 def state_of(

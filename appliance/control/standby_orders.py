@@ -99,12 +99,12 @@ async def begin_epoch(base: Foundation, parts: Parts) -> TakeoverRecorder | None
 
 def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | None) -> StandbySource:
     """Return the source of an appliance in service; `recorder` records its hand-over."""
-    pair, replication, relay = base.pair, base.replication, parts.endpoints.relay
+    pair, replication, rollout = base.pair, base.replication, parts.monitors.rollout
     if pair is None or replication is None or recorder is None:
         return SingleAppliance()
 
     async def leaving() -> None:
-        await leave_state(pair, base.store, relay)
+        await leave_state(pair, base.store, rollout)
         base.store.save_parameters(parts.core.parameters.tree)
         try:
             async with asyncio.timeout(_SEAL_SECONDS):
@@ -112,7 +112,7 @@ def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | 
         except TimeoutError:
             _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
-    return ActiveAppliance(replication, leaving, relay.pass_again)
+    return ActiveAppliance(replication, leaving, rollout.pass_again)
 
 
 class StandbyOrders:

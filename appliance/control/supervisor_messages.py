@@ -16,6 +16,7 @@ from appliance.control.foundation import Foundation
 from appliance.control.operators import Operators
 from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.hosts.host_table import HostRefusedError
+from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC
 from appliance.store.writer_thread import StoreError
 
@@ -91,14 +92,19 @@ class SupervisorMessages:
                 sock.close()
 
     def _relay_link(self, index: int, channel: Channel) -> None:
-        ends = self._parts.endpoints
+        ends, graph = self._parts.endpoints, self._parts.core.graph
         ends.relay.attach(index, channel)
+
+        def carried(topic: str) -> bool:
+            return ends.relay.carries(index, TOPIC, topic)
+
         pair = self._base.pair
-        told = self._parts.core.graph.tell_everybody(
-            lambda topic: ends.relay.carries(index, TOPIC, topic),
-            renewed=pair is not None and pair.taken_over,
-        )
-        ends.enactor.carry_out(told)
+        if pair is not None and pair.taken_over:
+            # Every connection ended, and roscpp may have given up: subscribers drop all publishers first.
+            for kind, topic, _holders in list(self._parts.core.registry.resources()):
+                if kind is Kind.SUBSCRIPTION and carried(topic):
+                    ends.enactor.carry_out(graph.renew_all(topic))
+        ends.enactor.carry_out(graph.tell_everybody(carried))
         self._parts.reminders.begin()
 
     async def _reload(self) -> None:

@@ -115,8 +115,12 @@ class DataPlane:
             self._state(message, descriptors)
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
-        elif isinstance(message, messages.ForMonitors):
-            self._to_monitors(message)
+        elif isinstance(message, messages.SpecificationsStated | messages.StateWanted):
+            self.interceptor.state(message)
+        elif isinstance(message, messages.MonitorSwitched):
+            self.interceptor.switch(message.name, message.enabled)
+        elif isinstance(message, messages.MonitorResumed):
+            self._ask_for_latched(self.interceptor.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._tap(message)
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
@@ -128,17 +132,6 @@ class DataPlane:
         else:
             self._table.withdraw(message)
             self._withdrawn(message)
-
-    def _to_monitors(self, message: messages.ForMonitors) -> None:
-        match message:
-            case messages.SpecificationsStated():
-                self.interceptor.state(message)
-            case messages.StateWanted():
-                self._reporter.send(messages.StateLeft(self.interceptor.leave()))
-            case messages.MonitorSwitched(name, enabled):
-                self.interceptor.switch(name, enabled)
-            case messages.MonitorResumed(name):
-                self._ask_for_latched(self.interceptor.resume(name))
 
     def close(self) -> None:
         """Close all connections."""

@@ -110,6 +110,7 @@ class Rollout:
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _inherited: InheritedState = field(default_factory=InheritedState)
     _heirs: set[int] = field(default_factory=set)  # relays that have not taken the inherited state yet
+    _left: list[asyncio.Future[bytes]] = field(default_factory=list)
     _inheritance_taken: Callable[[], None] = lambda: None
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
@@ -140,6 +141,23 @@ class Rollout:
         # control may have died during a change after storing its allocation: adapt the allocation as little as possible
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
         await self._make(now, self.allocation.of_file)
+
+    async def leave(self, seconds: float) -> list[bytes]:
+        """Make all relays drop all messages; return the states of their monitors.
+
+        Raises `ConnectionError` if a relay is away, and `TimeoutError` if one does not answer within `seconds`.
+        """
+        loop, relays = asyncio.get_running_loop(), range(self.allocation.relays)
+        self._left = [loop.create_future() for _ in relays]
+        if not all(self.relays.send(messages.StateWanted(relay), relay) for relay in relays):
+            raise ConnectionError("a relay is being restarted")
+        async with asyncio.timeout(seconds):
+            return [await left for left in self._left]
+
+    def pass_again(self) -> None:
+        """Make all relays pass messages again after `leave`."""
+        for relay in range(self.allocation.relays):
+            self.relays.send(self.statement(relay), relay)
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
         """Give each relay the state of the other appliance's monitors; call `taken` once all relays have it."""
@@ -336,7 +354,7 @@ class Rollout:
             revision.number,
             self.compiled_parts[revision.checked.compiled, names] if names.monitors else b"",
             {name: states[name] is not False for name in names.monitors},
-            restarted,
+            restarted or bool(inherited.lost),
             self.on_fault,
             tuple(name for name in names.monitors if files[name] in moved),
             next(self._numbers),
@@ -354,6 +372,9 @@ class Rollout:
         match message:
             case messages.SpecificationsTaken():
                 self._taken(relay, message)
+            case messages.StateLeft(number, content) if number < len(self._left):
+                if not self._left[number].done():
+                    self._left[number].set_result(content)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
             case messages.MonitorsCounted(rows):

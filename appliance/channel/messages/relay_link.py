@@ -322,10 +322,16 @@ class SpecificationsStated(Message):
 class StateWanted(Message):
     """Control of an appliance that hands over asks a relay to drop all messages from now on, and for `StateLeft`."""
 
+    number: int
+
 
 class StateLeft(Message):
-    """A relay passes no messages any more. `content` is the state of its monitors (empty: it has none)."""
+    """A relay passes no messages any more. `content` is the state of its monitors (empty: it has none).
 
+    `number` is that of the `StateWanted`.
+    """
+
+    number: int
     content: bytes
 
 
@@ -514,6 +520,3 @@ RelayLink = (
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
 )  # fmt: skip
-
-ForMonitors = SpecificationsStated | StateWanted | MonitorSwitched | MonitorResumed
-"""The messages about a relay's monitors."""

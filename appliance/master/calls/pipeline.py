@@ -4,7 +4,6 @@ The Master API and the proxy endpoints are served in the same way, with differen
 """
 
 import time
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 import structlog
@@ -34,7 +33,6 @@ class Pipeline:
     """Serve requests by a table of calls.
 
     Bodies and answers over `offload` bytes are parsed and written in threads. Hosts take turns for this (`bulk`).
-    `stored()` waits until all changes made so far may be answered; None: answers do not wait.
     """
 
     execution: Execution
@@ -45,7 +43,6 @@ class Pipeline:
     offload: int
     bulk: Turns
     processor: ProcessorTime
-    stored: Callable[[], Awaitable[None]] | None = None
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
         """Return the handler of a listener with this table. `own`: the listener is for the appliance's own nodes."""
@@ -68,8 +65,6 @@ class Pipeline:
             return self._not_understood(visit.caller, body, error)
         try:
             answer = await self._answer(visit, call)
-            if self.stored is not None:
-                await self.stored()
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
             self.trail.meter.called(call.method if known else "unknown", seconds)

@@ -46,7 +46,6 @@ class RelayOutbox(Link):
         super().__init__(heard, lost)
         self.index = index
         self.placed: set[str] = set()  # the keys of incarnations whose port this relay has
-        self.left: asyncio.Future[bytes] | None = None  # the state that the relay leaves
         self._epoch = 0
         self._orders: deque[asyncio.Future[None]] = deque()
 
@@ -54,8 +53,6 @@ class RelayOutbox(Link):
         """Close the link. Nothing waits any longer for the relay's orders."""
         super().close()
         self.placed.clear()
-        if self.left is not None and not self.left.done():
-            self.left.set_exception(ConnectionError("the relay ended"))
         while self._orders:
             self.carried_out()
 
@@ -68,13 +65,6 @@ class RelayOutbox(Link):
             return []
         self._orders.append(asyncio.get_running_loop().create_future())
         return [self._orders[-1]]
-
-    def answered_order(self, answer: messages.StateLeft | messages.OrdersCarriedOut) -> None:
-        """Handle the relay's answer to `StateWanted` or `OrdersAsked`."""
-        if isinstance(answer, messages.OrdersCarriedOut):
-            self.carried_out()
-        elif self.left is not None and not self.left.done():
-            self.left.set_result(answer.content)
 
     def carried_out(self) -> None:
         """Handle the relay's answer to the oldest question: it has carried out its orders."""
@@ -168,20 +158,6 @@ class RelayControl:
         """Wait until every relay has carried out its orders. A relay that starts in the meantime begins with them."""
         if waiting := [order for post in self._posts for order in post.orders()]:
             await asyncio.wait(waiting)
-
-    async def leave(self) -> list[bytes]:
-        """Make all relays drop all messages; return the states of their monitors. Raises `ConnectionError`."""
-        loop = asyncio.get_running_loop()
-        for post in self._posts:
-            post.left = loop.create_future()
-            if not post.send(messages.StateWanted()):
-                raise ConnectionError("a relay is being restarted")
-        return list(await asyncio.gather(*(post.left for post in self._posts if post.left is not None)))
-
-    def pass_again(self) -> None:
-        """Make all relays pass messages again after `leave`."""
-        for post in self._posts:
-            post.send(self.monitors().statement(post.index))
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
@@ -336,8 +312,8 @@ class RelayControl:
                 self.carried.closed(post.index, message)
             case messages.ConnectionRefused():
                 self.carried.refused(message)
-            case messages.StateLeft() | messages.OrdersCarriedOut():
-                post.answered_order(message)
+            case messages.OrdersCarriedOut():
+                post.carried_out()
             case messages.MessageSeen():
                 self._taps.seen(message)
             case messages.PublicationRefused():

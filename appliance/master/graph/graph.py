@@ -274,12 +274,9 @@ class RosGraph:
             for effect in self._tell_one(subscriber, topic, always=always)
         ]
 
-    def tell_everybody(
-        self, concerned: Callable[[str], bool] = lambda _topic: True, *, renewed: bool = False
-    ) -> Effects:
+    def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> Effects:
         """Send all subscribers the lists of all `concerned` topics: after a rebuild, for a new relay or control.
 
-        With `renewed` they drop all publishers first: every connection ended, and roscpp may have given up by now.
         The list of a revoked topic is empty. It is sent again, because control may have died before it was delivered.
         """
         topics = {
@@ -288,10 +285,7 @@ class RosGraph:
             if registration.kind is Kind.SUBSCRIPTION
         }
         effects = [
-            effect
-            for topic in sorted(topics)
-            if concerned(topic)
-            for effect in (self.renew_all(topic) if renewed else self.tell(topic, always=True))
+            effect for topic in sorted(topics) if concerned(topic) for effect in self.tell(topic, always=True)
         ]
         for node in self.registry.live():
             for kind, topic in node.shelf:

@@ -26,6 +26,7 @@ from appliance.channel.messages import (
     SpecificationsRefused,
     SpecificationsStated,
     SpecificationsTaken,
+    StateWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
 from appliance.relay.monitors.loader import Loader, Result
@@ -33,7 +34,7 @@ from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoin
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, dropped, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
-from appliance.relay.monitors.state_keeper import StateKeeper, received_states
+from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, start_outcome, state_left
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
-_LEAVING = "the other appliance takes over"
-_NO_MEMORY = "the previous relay process exited, and the state of monitors is not kept"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +117,14 @@ class Interceptor:
 
     # --- control's statements ---
 
-    def state(self, message: SpecificationsStated) -> None:
-        """Apply these specifications, at once or when they are loaded; unchanged monitors keep their state."""
+    def state(self, message: SpecificationsStated | StateWanted) -> None:
+        """Apply these specifications, at once or when they are loaded; unchanged monitors keep their state.
+
+        With `StateWanted`, drop all messages from now on, and send the state of the monitors.
+        """
+        if isinstance(message, StateWanted):
+            self._leave(message.number)
+            return
         self._switches = dict(message.enabled)
         if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
@@ -147,7 +152,7 @@ class Interceptor:
         result.explain_when(self.observer.asks, self._shadow_observer.asks)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
-            outcome = self._start_outcome(result, now, message, restarted=first and message.restarted)
+            outcome = start_outcome(result, message, self._keeper, now, restarted=first and message.restarted)
         else:
             incomplete = self.shadow.settle()
             outcome = result.succeed(before, now, incomplete)
@@ -168,29 +173,11 @@ class Interceptor:
         anew = None if first else result.replaced_topics(before)
         self._taken(message, began, anew)
 
-    def _start_outcome(
-        self, monitors: MonitorSet, now: int, message: SpecificationsStated, *, restarted: bool
-    ) -> Outcome:
-        """Start the first monitors of this process, with the state of an earlier process if any."""
-        if message.lost:
-            return monitors.recover((), {"": message.lost}, now, restarted=True)
-        if message.left:
-            received = received_states(message.left, now)
-            return monitors.recover(received.groups, received.lost, now)
-        left = self._keeper.recovered() if self._keeper is not None else None
-        if left is not None:
-            return monitors.recover(left.groups, left.lost, now, restarted=restarted)
-        if restarted and self._keeper is None:
-            return monitors.recover((), {"": _NO_MEMORY}, now, restarted=True)
-        return monitors.start(now, restarted=restarted)
-
-    def leave(self) -> bytes:
-        """Drop all messages from now on; return the state of the monitors for the other appliance's relays."""
-        self.blocked = _LEAVING
+    def _leave(self, number: int) -> None:
+        self.blocked = LEAVING
         self.invalidate_prepared()
-        self.keep_all()
         self._changed(None)
-        return b"" if self._keeper is None else self._keeper.content()
+        self._reporter.send(state_left(number, self._keeper))
 
     def holder_of(self, source: int) -> str:
         """Return the host that is charged for the slices created by messages of this source."""

@@ -15,15 +15,20 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from appliance.channel.messages import StateGiven
+from appliance.channel.messages import SpecificationsStated, StateGiven, StateLeft
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, StoredState, read
 
 if TYPE_CHECKING:
     from rosmop.run.engine import KeptGroup, MonitorSet
+    from rosmop.run.outcomes import Outcome
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
 _AHEAD = "the clock of the other appliance is ahead of this machine's"
+LEAVING = "the other appliance takes over"
+"""Why a relay drops all messages whose appliance hands over."""
+
+_NO_MEMORY = "the previous relay process exited, and the state of monitors is not kept"
 _STEP = 1_000_000_000  # nanoseconds; a larger difference means that the clock was set
 
 
@@ -218,6 +223,36 @@ class StateKeeper:
                 groups += [_GroupHead([name], _NO_CELLS) for name in entry.group.part_names]
         head = _Head(self._given.boot, self.offset, self.offset + time.monotonic_ns(), groups, lost)
         return msgspec.msgpack.encode(head)
+
+
+def state_left(number: int, keeper: StateKeeper | None) -> StateLeft:
+    """Return the answer to `StateWanted` with this number."""
+    return StateLeft(number, b"" if keeper is None else keeper.content())
+
+
+def start_outcome(
+    monitors: "MonitorSet",
+    message: SpecificationsStated,
+    keeper: StateKeeper | None,
+    now: int,
+    *,
+    restarted: bool,
+) -> "Outcome":
+    """Start the first monitors of a relay, with the state of an earlier process or of the other appliance if any.
+
+    After a takeover, `message` has the other appliance's states, or the reason why they are lost. `restarted`: this
+    relay replaces one that died. `now` is the machine's time (ns).
+    """
+    left = keeper.recovered() if keeper is not None else None
+    if message.lost:
+        left = RecoveredState(lost={"": message.lost})
+    elif message.left:
+        left = received_states(message.left, now)
+    elif keeper is None and restarted:
+        left = RecoveredState(lost={"": _NO_MEMORY})
+    if left is None:
+        return monitors.start(now, restarted=restarted)
+    return monitors.recover(left.groups, left.lost, now, restarted=restarted)
 
 
 def received_states(contents: Sequence[bytes], now: int) -> RecoveredState:
