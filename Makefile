@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := appliance roswire rosmop tests examples benchmarks distribution
+CHECKED := appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
 LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
 # What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.

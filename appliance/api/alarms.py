@@ -82,6 +82,10 @@ def _system(status: Status) -> Iterator[_Condition]:
     if forwarding is not None and forwarding.trouble:
         where = f"the audit log is not forwarded to {forwarding.to}, {forwarding.behind} records wait"
         yield "warning", "audit-not-forwarded", "audit", f"{where}: {forwarding.trouble}"
+    collector = audit.collector
+    if collector is not None and collector.trouble:
+        where = f"the audit log is not collected by {collector.to}, {collector.behind} sealed records wait"
+        yield "warning", "audit-not-collected", "audit", f"{where}: {collector.trouble}"
 
 
 def _policy(status: Status) -> Iterator[_Condition]:

@@ -160,7 +160,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_audit_lag_seconds": [((), audit.lag_seconds)],
         "rosrv_audit_failed": [((), audit.failed is not None)],
         "rosrv_audit_degraded": [((), audit.degraded is not None)],
-        **_forwarding(audit.forwarding),
+        **_forwarding("syslog", audit.forwarding),
+        **_forwarding("collector", audit.collector),
         "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
         "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
         "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
@@ -176,16 +177,16 @@ def _samples(body: Measures) -> dict[str, _Samples]:
     }
 
 
-def _forwarding(forwarding: ForwardingState | None) -> dict[str, _Samples]:
+def _forwarding(to: str, forwarding: ForwardingState | None) -> dict[str, _Samples]:
     if forwarding is None:
         names = ("up", "sent_total", "lag_records", "lag_seconds", "missed_total")
-        return {f"rosrv_syslog_{name}": [] for name in names}
+        return {f"rosrv_{to}_{name}": [] for name in names}
     return {
-        "rosrv_syslog_up": [((), not forwarding.trouble)],
-        "rosrv_syslog_sent_total": [((), forwarding.sent)],
-        "rosrv_syslog_lag_records": [((), forwarding.behind)],
-        "rosrv_syslog_lag_seconds": [((), forwarding.seconds)],
-        "rosrv_syslog_missed_total": [((), forwarding.missed)],
+        f"rosrv_{to}_up": [((), not forwarding.trouble)],
+        f"rosrv_{to}_sent_total": [((), forwarding.sent)],
+        f"rosrv_{to}_lag_records": [((), forwarding.behind)],
+        f"rosrv_{to}_lag_seconds": [((), forwarding.seconds)],
+        f"rosrv_{to}_missed_total": [((), forwarding.missed)],
     }
 
 

@@ -78,7 +78,7 @@ def conditions(wanted: Filter) -> list[Condition]:
         names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
         found.append(Condition(f"severity IN ({', '.join('?' * len(names))})", names, "record_severity"))
     if wanted.rule is not None:
-        pattern = _checked("rule", wanted.rule)
+        pattern = checked_pattern("rule", wanted.rule)
         found.append(
             Condition(
                 "(rule IS NOT NULL AND (rule GLOB ? OR rule_key GLOB ? OR rule_key = ?))",
@@ -87,7 +87,7 @@ def conditions(wanted: Filter) -> list[Condition]:
             )
         )
     if wanted.who is not None:
-        found.append(Condition(f"({_WHO}) GLOB ?", (_checked("who", wanted.who),)))
+        found.append(Condition(f"({_WHO}) GLOB ?", (checked_pattern("who", wanted.who),)))
     if wanted.without_looks:
         found.append(Condition(_NO_LOOK, ()))
     if wanted.since is not None:
@@ -98,13 +98,14 @@ def conditions(wanted: Filter) -> list[Condition]:
 
 
 def _match(column: str, value: str) -> Condition:
-    value = _checked(column, value)
+    value = checked_pattern(column, value)
     operator = "GLOB" if any(sign in value for sign in "*?[") else "="
     present = "" if column == "event" else f" AND {column} IS NOT NULL"
     return Condition(f"({column} {operator} ?{present})", (value,), f"record_{column}")
 
 
-def _checked(name: str, value: str) -> str:
+def checked_pattern(name: str, value: str) -> str:
+    """Return a pattern that is short, simple and valid Unicode. Raises `FilterError`."""
     if len(value) > _LONGEST_PATTERN:
         raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
     if value.count("*") > _MOST_STARS:
@@ -118,7 +119,7 @@ def _checked(name: str, value: str) -> str:
 
 def text_condition(text: str) -> Condition:
     """Return the condition that searches a text in each row."""
-    escaped = _checked("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
+    escaped = checked_pattern("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
     return Condition(f"({TEXT_OF_RECORD}) LIKE ? ESCAPE '\\'", (f"%{escaped}%",))
 
 

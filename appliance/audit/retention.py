@@ -22,6 +22,21 @@ _UNKNOWN_HOSTS = "(unknown hosts)"
 _DAY = 86_400_000_000_000
 
 
+class ReceiptFloor:
+    """The last record that the collector has a receipt for, if retention by age waits for it (None: it does not).
+
+    One thread writes it, another reads it.
+    """
+
+    def __init__(self, *, waits: bool = False) -> None:
+        self.through: int | None = 0 if waits else None
+
+    def received(self, sequence: int) -> None:
+        """Note that the collector has all records up to this sequence."""
+        if self.through is not None:
+            self.through = sequence
+
+
 @dataclass(frozen=True)
 class Retention:
     """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any)."""

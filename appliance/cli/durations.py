@@ -1,14 +1,9 @@
 """Parse times on the command line: points in time, and durations such as `30s`, `5m`, `1.5h`, `90d`, `52w`."""
 
 import re
-from typing import Annotated
-
-import typer
 
 from appliance.cli.output import usage_error
 
-Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
-Until = Annotated[str | None, typer.Option("--until", help="Before this time")]
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 _SPAN = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)([smhdw])")
 

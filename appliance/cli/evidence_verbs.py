@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import typer
 
+from appliance.audit.filter_options import Since, Until
 from appliance.audit.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
@@ -20,7 +21,6 @@ from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.durations import Since, Until
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.evidence import bundle_verifier as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export

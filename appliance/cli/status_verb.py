@@ -186,6 +186,8 @@ def _grid(body: Status) -> Table:
     grid.add_row("hosts' ports", _ports(body.ipsec.ports))
     forwarding = audit.forwarding
     forwarded = "" if forwarding is None else f", {forwarding.behind} to be forwarded to {forwarding.to}"
+    if audit.collector is not None:
+        forwarded += f", {audit.collector.behind} to be collected by {audit.collector.to}"
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
     if body.recorder is not None:
         kept = body.recorder

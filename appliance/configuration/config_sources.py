@@ -40,6 +40,7 @@ _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
     ("ipsec", "ca_passphrase_file"),
     ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
+    ("fleet", "ca"), ("fleet", "certificate"), ("fleet", "key"), ("fleet", "receipt_key"),
 )  # fmt: skip
 KeyPath = tuple[str | int, ...]
 _SHORT_NAMES: dict[str, KeyPath] = {

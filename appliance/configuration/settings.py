@@ -115,6 +115,20 @@ def split_receiver(text: str) -> tuple[str, str, int]:
     return protocol, host, port
 
 
+def split_collector(text: str) -> tuple[str, int]:
+    """Parse `https://ADDRESS:PORT`. Raises `ValueError`."""
+    protocol, _slashes, place = text.partition("://")
+    if protocol != "https" or place.endswith("/"):
+        raise ValueError(f"{text!r} is not https://ADDRESS:PORT, for example https://10.0.0.9:8444")
+    _protocol, host, port = split_receiver(f"tls://{place}")
+    return host, port
+
+
+def _checked_collector(text: str) -> str:
+    split_collector(text)
+    return text
+
+
 def _checked_receiver(text: str) -> str:
     split_receiver(text)
     return text
@@ -249,6 +263,47 @@ class Syslog:
     def destination(self) -> tuple[str, str, int]:
         """`to` as protocol, address and port; only where it is given."""
         return split_receiver(self.to or "")
+
+
+@_section
+class FleetSection:
+    """The collector of many appliances, to which sealed segments of the audit log are pushed; off by default."""
+
+    collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
+        default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
+    )
+    ca: Path | None = key(default=None, description="authority of the collector's certificate (PEM)")
+    certificate: Path | None = key(
+        default=None, description="client certificate, enrolled at the collector (PEM)"
+    )
+    receipt_key: Path | None = key(
+        default=None,
+        description="public key of the collector's receipts (PEM); `rosrv-fleet init` prints its file",
+    )
+    retention_waits: bool = key(
+        default=False,
+        description="records that are older than `audit.retention_days` stay until the collector has them;"
+        " `audit.retention_bytes` and a full disk remove them nevertheless",
+    )
+    key: Path | None = key(default=None, description="key of `certificate`; readable by user rosrv-fleet")
+
+    def __post_init__(self) -> None:
+        files = {
+            "ca": self.ca,
+            "certificate": self.certificate,
+            "key": self.key,
+            "receipt_key": self.receipt_key,
+        }
+        missing = [name for name, value in files.items() if value is None]
+        if self.collector is not None and missing:
+            raise ValueError(f"{', '.join(missing)} must be given with collector")
+        if self.collector is None and (len(missing) < len(files) or self.retention_waits):
+            raise ValueError("the section has no effect without collector")
+
+    @property
+    def destination(self) -> tuple[str, int]:
+        """`collector` as address and port; only where it is given."""
+        return split_collector(self.collector or "")
 
 
 @_section
@@ -561,6 +616,7 @@ class Settings:
     advertise: list[Advertisement] = key(default=[])
     limits: LimitsSection = LimitsSection()
     audit: Audit = Audit()
+    fleet: FleetSection = FleetSection()
     liveness: LivenessSection = LivenessSection()
     relay: Relay = Relay()
     recorder: RecorderRules = RecorderRules()
@@ -570,12 +626,18 @@ class Settings:
     api_limits: ApiLimits = ApiLimits()
 
     def __post_init__(self) -> None:
-        to = self.audit.syslog.to
-        if to is not None and self.isolation == "netns" and is_loopback(split_receiver(to)[1]):
-            raise ValueError(
-                f"audit.syslog.to: {to} is the loopback of the appliance's own namespace (isolation: netns);"
-                " for a receiver on this machine, use another of its addresses"
-            )
+        to, collector = self.audit.syslog.to, self.fleet.collector
+        for name, url, address in (
+            ("audit.syslog.to", to, to and split_receiver(to)[1]),
+            ("fleet.collector", collector, collector and split_collector(collector)[0]),
+        ):
+            if address and self.isolation == "netns" and is_loopback(address):
+                raise ValueError(
+                    f"{name}: {url} is the loopback of the appliance's own namespace (isolation: netns);"
+                    " for a receiver on this machine, use another of its addresses"
+                )
+        if self.fleet.retention_waits and self.audit.retention_days is None:
+            raise ValueError("fleet.retention_waits has no effect without audit.retention_days")
 
     @property
     def listen_address(self) -> tuple[str, int]:

@@ -1,23 +1,35 @@
-"""Handle the reports of the audit log's forwarder, for status, metrics and audit records."""
+"""Handle the reports of the audit log's forwarders, for status, metrics and audit records."""
 
 import asyncio
+from collections.abc import Callable
 
 import msgspec
 
 from appliance.channel import messages
 from appliance.channel.answers.status import ForwardingState
 from appliance.channel.link import Link
-from appliance.configuration.settings import Syslog
 from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0  # a shorter failure, such as the restart of a receiver, is not recorded
 
 
 class ForwarderLink:
-    """The link to the forwarder, and its last report. `wanted` is the configuration of the forwarder."""
+    """The link to a forwarder, and its last report.
 
-    def __init__(self, wanted: Syslog, trail: AuditTrail) -> None:
-        self._wanted = wanted
+    `to` is the receiver (None: not configured), `send` the kind of records that it gets. `received` is called with the
+    last sequence that the receiver has, after each report.
+    """
+
+    def __init__(
+        self,
+        to: str | None,
+        send: str,
+        trail: AuditTrail,
+        received: Callable[[int], None] = lambda _sequence: None,
+    ) -> None:
+        self._to = to
+        self._send = send
+        self._received = received
         self._trail = trail
         self.link = Link(self._heard)
         self._report: messages.ForwardingReported | None = None
@@ -26,23 +38,24 @@ class ForwarderLink:
 
     def status(self) -> ForwardingState | None:
         """Return the state for `rosrv status` and the metrics, or None if no forwarding is configured."""
-        if self._wanted.to is None:
+        if self._to is None:
             return None
         report = self._report or messages.ForwardingReported()
         trouble = report.trouble
         if self.link.channel is None or self._report is None:
             trouble = trouble or "the forwarder is not running yet"
         fields = msgspec.structs.asdict(report) | {"trouble": trouble}
-        return ForwardingState(**fields, to=self._wanted.to, send=self._wanted.send)
+        return ForwardingState(**fields, to=self._to, send=self._send)
 
     def _heard(self, report: messages.ForwardingReported) -> None:
         before = self._report
         self._report = report
+        self._received(report.sequence)
         if before is not None and report.missed > before.missed:
             count = report.missed - before.missed
             self._trail.happened(
                 "forwarding gap",
-                f"retention removed {count} records before {self._wanted.to} received them",
+                f"retention removed {count} records before {self._to} received them",
                 count=count,
             )
         if report.trouble and self._failing is None:
@@ -54,7 +67,7 @@ class ForwarderLink:
             if self._failure_recorded:
                 self._failure_recorded = False
                 self._trail.happened(
-                    "forwarding resumed", f"{self._wanted.to} receives the log again", behind=report.behind
+                    "forwarding resumed", f"{self._to} receives the log again", behind=report.behind
                 )
 
     def _still_failing(self) -> None:
@@ -62,7 +75,7 @@ class ForwarderLink:
         self._failure_recorded = True
         self._trail.happened(
             "forwarding failed",
-            f"{self._wanted.to}: {self._report.trouble}",
+            f"{self._to}: {self._report.trouble}",
             behind=self._report.behind,
             missed=self._report.missed,
         )

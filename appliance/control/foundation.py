@@ -10,6 +10,7 @@ import structlog
 
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
+from appliance.audit.retention import ReceiptFloor
 from appliance.configuration.settings import Settings
 from appliance.control.host_authority import HostAuthority, make_host_authority
 from appliance.control.host_blocks import BlockTable
@@ -74,6 +75,7 @@ class Foundation:
     signing: SignerRequests
     host_authority: HostAuthority
     audit: AuditLog
+    receipts: ReceiptFloor
     trail: AuditTrail
     plan: RecordingPlan
     store: StateStore
@@ -112,7 +114,9 @@ async def make_foundation(
     """
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
-    audit.set(open_audit(settings, signing, lifeline.log_held(), lambda host: _class_of(quota_class, host)))
+    receipts = ReceiptFloor(waits=settings.fleet.retention_waits)
+    held_by = lifeline.log_held()
+    audit.set(open_audit(settings, signing, held_by, lambda host: _class_of(quota_class, host), receipts))
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
         audit(),
@@ -156,6 +160,7 @@ async def make_foundation(
         signing=signing,
         host_authority=host_authority,
         audit=audit(),
+        receipts=receipts,
         trail=trail,
         plan=plan,
         store=store,

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
-from appliance.audit.retention import Retention
+from appliance.audit.retention import ReceiptFloor, Retention
 from appliance.configuration.settings import Settings
 from appliance.control.signer_requests import SignerRequests
 from appliance.quotas.pool import QuotaClass
@@ -18,8 +18,10 @@ def open_audit(
     signing: SignerRequests,
     held_by: Callable[[list[int]], None],
     class_of: Callable[[str], QuotaClass],
+    receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Return the audit log. `class_of` returns a host's quota class; `held_by` gets processes that lock it."""
+    """Return the audit log. `class_of` returns a host's quota class; `held_by` gets processes that lock it;
+    `receipts` holds back retention."""
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE
@@ -34,6 +36,7 @@ def open_audit(
         held_by=held_by,
         budget=Budget(class_of, reserve=reserve),
         reserve=reserve.whole,
+        receipts=receipts,
         retention=Retention(
             days=audit.retention_days,
             size=None if audit.retention_bytes is None else int(audit.retention_bytes),

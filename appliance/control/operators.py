@@ -32,6 +32,7 @@ class Operators:
     tokens: TokenOrders
     clock: ClockCheck
     forwarded: ForwarderLink
+    collected: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
     standby: StandbyOrders
@@ -63,7 +64,9 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     rest = Current[RestLink]()
     tokens = TokenOrders(base.store, trail, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
-    forwarded = ForwarderLink(settings.audit.syslog, trail)
+    syslog = settings.audit.syslog
+    forwarded = ForwarderLink(syslog.to, syslog.send, trail)
+    collected = ForwarderLink(settings.fleet.collector, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
@@ -85,7 +88,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         base.policies,
         hosts,
         base.lifeline.surroundings,
-        audit=partial(_audit_state, base, forwarded),
+        audit=partial(_audit_state, base, forwarded, collected),
         clock=clock.state,
         recorder=ends.recordings.state,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
@@ -127,6 +130,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         tokens=tokens,
         clock=clock,
         forwarded=forwarded,
+        collected=collected,
         switched_off=switched_off,
         blocks=blocks,
         standby=orders,
@@ -142,11 +146,12 @@ async def _durable(base: Foundation) -> None:
         await base.replication.stored()
 
 
-def _audit_state(base: Foundation, forwarded: ForwarderLink) -> AuditState:
+def _audit_state(base: Foundation, forwarded: ForwarderLink, collected: ForwarderLink) -> AuditState:
     return AuditState(
         *base.audit.lag,
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
         forwarding=forwarded.status(),
+        collector=collected.status(),
     )

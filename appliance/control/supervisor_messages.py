@@ -85,6 +85,8 @@ class SupervisorMessages:
                 self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
             case "syslog":
                 self._operators.forwarded.link.attach(Channel(sock, messages.ForwardingLink))
+            case "fleet":
+                self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
             case "recorder":
                 self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:

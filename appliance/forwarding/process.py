@@ -10,7 +10,7 @@ import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -26,13 +26,28 @@ _LAST_SECONDS = 1.0
 
 def main(lifeline_fd: int, config: Path) -> None:
     """Forward the log until the supervisor ends the process."""
-    asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
+    forwarder = make_forwarder(load_resolved(config), Path.cwd() / "position.json")
+    asyncio.run(ForwardingProcess(forwarder, lifeline_fd).run())
 
 
-class _Process:
+class Forwarder(Protocol):
+    """The work of a forwarding process; one thread calls `step` and `close`."""
+
+    @property
+    def progress(self) -> messages.ForwardingReported:
+        """Return the progress so far; any thread reads it."""
+
+    def step(self) -> float:
+        """Forward a part; return the seconds to wait before the next call."""
+
+    def close(self) -> None:
+        """Close the connection."""
+
+
+class ForwardingProcess:
     """The process: it connects the lifeline, the reports to control and the forwarding thread."""
 
-    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+    def __init__(self, forwarder: Forwarder, lifeline_fd: int) -> None:
         lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
         self._child = Child(
             lifeline,
@@ -42,7 +57,7 @@ class _Process:
         )
         self._reports = ProgressReports(self._child.tell)
         self._ending = threading.Event()
-        self._forwarder = make_forwarder(settings, Path.cwd() / "position.json")
+        self._forwarder = forwarder
 
     async def run(self) -> None:
         """Forward until the supervisor stops the process."""

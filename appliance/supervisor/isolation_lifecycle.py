@@ -68,6 +68,7 @@ class AppliancePorts:
     own: int | None = None  # the port of the own node's master
     standby: StandbyAccess | None = None  # on one of two appliances
     syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
+    collector: tuple[str, int] | None = None  # address and port of the fleet's collector
 
 
 class NoIsolation:
@@ -311,6 +312,7 @@ class ContainerIsolation(NoIsolation):
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
             forwarder=self._forwarder(),
+            collector_clients=self._collector_clients(),
             standby=self._ports.standby,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
@@ -324,6 +326,12 @@ class ContainerIsolation(NoIsolation):
     def _neighbours(self) -> tuple[str, ...]:
         """Return the addresses that on the link to the appliance only the machine itself may use."""
         return ()
+
+    def _collector_clients(self) -> tuple[ForwarderAccess, ...]:
+        """Return the users that may reach the fleet's collector, and nothing else."""
+        if self._ports.collector is None:
+            return ()
+        return (ForwarderAccess(account_of("rosrv-fleet").uid, *self._ports.collector, name="segments"),)
 
     def _forwarder(self) -> ForwarderAccess | None:
         if self._ports.syslog is None:

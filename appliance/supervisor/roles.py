@@ -37,6 +37,8 @@ class Facts:
     control_reads: tuple[Path, ...] = ()
     syslog_reads: tuple[Path, ...] = ()
     syslog_port: int | None = None  # the TCP port of the audit log's receiver
+    fleet_reads: tuple[Path, ...] = ()
+    collector_port: int | None = None
 
     def part(self, name: str) -> Path:
         """Return the part of the state directory with this name."""
@@ -159,7 +161,7 @@ ROLES = (
     _ours(
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
-        links=("relay", "signer", "compiler", "api", "charon", "syslog", "recorder", "lease"),
+        links=("relay", "signer", "compiler", "api", "charon", "syslog", "fleet", "recorder", "lease"),
         readable_by="rosrv-api",
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, families=ROUTES, reads=(*folders_of(*facts.control_reads), str(DPKG)), binds=None,
@@ -213,6 +215,16 @@ ROLES = (
         ),
     ),
     _ours(
+        "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
+        ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        sandbox=lambda facts: SandboxPlan(
+            allowlist=True,
+            families=ROUTES,
+            reads=(str(facts.part("control")), *folders_of(*facts.fleet_reads)),
+            connects=None if facts.collector_port is None else (facts.collector_port,),
+        ),
+    ),
+    _ours(
         "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
         ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
         network=False,
@@ -223,11 +235,16 @@ ROLES = (
 
 
 def roles_of(
-    *, api: bool = True, syslog: bool = False, recorder: bool = False, lease: bool = False
+    *,
+    api: bool = True,
+    syslog: bool = False,
+    fleet: bool = False,
+    recorder: bool = False,
+    lease: bool = False,
 ) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
-    wanted = {"api": api, "syslog": syslog, "recorder": recorder, "lease": lease}
+    wanted = {"api": api, "syslog": syslog, "fleet": fleet, "recorder": recorder, "lease": lease}
     return tuple(role for role in ROLES if wanted.get(role.name, True))
 
 

@@ -103,6 +103,7 @@ def _run(
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(network) for network in settings.api_networks),
             syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
+            collector=settings.fleet.destination if settings.fleet.collector is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
             standby=_standby_access(standby.membership) if standby is not None else None,
         )
@@ -149,6 +150,11 @@ def _standby_access(membership: Membership) -> StandbyAccess:
 def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
     to = settings.audit.syslog
     return tuple(filter(None, (to.ca, to.certificate, to.key)))
+
+
+def _files_of_fleet(settings: Settings) -> tuple[Path, ...]:
+    fleet = settings.fleet
+    return tuple(filter(None, (fleet.ca, fleet.certificate, fleet.key, fleet.receipt_key)))
 
 
 def _port_of_syslog(settings: Settings) -> int | None:
@@ -242,6 +248,8 @@ def _supervise(
                 control_reads=tuple(filter(None, (settings.policy, settings.monitors, settings.hosts))),
                 syslog_reads=_files_of_syslog(settings),
                 syslog_port=_port_of_syslog(settings),
+                fleet_reads=_files_of_fleet(settings),
+                collector_port=settings.fleet.destination[1] if settings.fleet.collector is not None else None,
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
             ),
             admin=state.open_admin_socket(),

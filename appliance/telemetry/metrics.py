@@ -120,6 +120,13 @@ METRICS = (
     _gauge("rosrv_syslog_lag_seconds", "how long the oldest such record has waited"),
     _counter("rosrv_syslog_missed_total", "records that retention removed before they were forwarded"),
     _gauge(
+        "rosrv_collector_up", "1 while segments are pushed to the collector; absent if none is configured"
+    ),
+    _counter("rosrv_collector_sent_total", "segments with a receipt since the pusher started"),
+    _gauge("rosrv_collector_lag_records", "sealed audit records that the collector does not have"),
+    _gauge("rosrv_collector_lag_seconds", "how long the oldest such record has waited"),
+    _counter("rosrv_collector_missed_total", "records that retention removed before the collector had them"),
+    _gauge(
         "rosrv_clock_synchronised",
         "1 while a time service synchronises the machine's clock, 0 while none does, -1 if not known",
     ),

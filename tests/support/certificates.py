@@ -22,12 +22,14 @@ class Certificates:
     key: Path
 
 
-def make_certificates(folder: Path, address: str = "127.0.0.1") -> Certificates:
-    """Make an authority, and a certificate for a server or client with this address."""
+def make_certificates(
+    folder: Path, address: str = "127.0.0.1", authority: str = "test authority"
+) -> Certificates:
+    """Make an authority with this name, and a certificate for a server or client with this address."""
     folder.mkdir(parents=True)
     now = datetime.datetime.now(datetime.UTC)
     keys = {name: ec.generate_private_key(ec.SECP256R1()) for name in ("ca", "peer")}
-    issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "test authority")])
+    issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, authority)])
 
     def made(name: str, subject: x509.Name, extensions: list[Any]) -> Path:
         builder = x509.CertificateBuilder(

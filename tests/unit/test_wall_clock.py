@@ -30,7 +30,7 @@ READERS = {
         "base/age_clock.py", "base/shipped.py", "control/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/alarms.py", "api/moments.py", "cli/audit/filter.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
+        "api/alarms.py", "api/moments.py", "audit/filter_options.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
         "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
         "cli/status_verb.py", "cli/topic_verbs.py",
     ],

@@ -152,6 +152,9 @@ class AuditState(msgspec.Struct, frozen=True):
     on_failure: Literal["deny", "allow"]
     degraded: str | None
     forwarding: Annotated[ForwardingState | None, doc("null: forwarding is not configured")]
+    collector: Annotated[
+        ForwardingState | None, doc("segments pushed to the collector; null: none is configured")
+    ] = None
 
 
 class RecorderState(msgspec.Struct, frozen=True):

@@ -6,13 +6,12 @@ from typing import Annotated
 import typer
 
 from appliance.audit.denial_summary import LARGEST_SUMMARY, DenialSummary, HostDenials
+from appliance.audit.filter_options import Since, Until, times_given
 from appliance.audit.query import Filter
 from appliance.audit.record_format import printable
 from appliance.cli.audit.audit_errors import Errors
-from appliance.cli.audit.filter import times_given
 from appliance.cli.audit.record_table import write
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.durations import Since, Until
 from appliance.cli.output import say_json
 from rosmop.tool.terminal import counted
 

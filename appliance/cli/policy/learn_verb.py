@@ -9,12 +9,12 @@ from typing import Annotated
 
 import typer
 
+from appliance.audit.filter_options import Since
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.cli.durations import Since
 from appliance.cli.output import say_json
 from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
 from appliance.policy.learn import LearnedPolicy, Observation, learn

@@ -212,18 +212,19 @@ class PacketRule:
 
 @dataclass(frozen=True)
 class ForwarderAccess:
-    """The local user that forwards the audit log, and the only receiver that it may reach."""
+    """A local user that sends to one receiver, such as the audit log's forwarder, and may reach nothing else."""
 
     uid: int
     address: str
     port: int
     datagrams: bool = False  # True: UDP; False: TCP
+    name: str = "audit log's forwarder"
 
     def __post_init__(self) -> None:
         PortRange.one(self.port)
         family_of(self.address)
         if self.uid < 0:
-            raise ValueError(f"forwarder: {self.uid} is not a user id")
+            raise ValueError(f"{self.name}: {self.uid} is not a user id")
 
 
 @dataclass(frozen=True)
@@ -287,6 +288,7 @@ class FirewallSettings:
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
     forwarder: ForwarderAccess | None = None
+    collector_clients: tuple[ForwarderAccess, ...] = ()
     standby: StandbyAccess | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
@@ -338,6 +340,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         *_rosmaster(settings),
         *_own_node(settings),
         *_forwarding(settings.forwarder),
+        *(rule for client in settings.collector_clients for rule in _forwarding(client)),
         *_standby(settings.standby),
         *_api(settings),
         *_rate_limits(settings),
@@ -432,20 +435,20 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
 
 
 def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
-    """Let the forwarder's user send to its receiver only."""
+    """Let a forwarder's user send to its receiver only."""
     if forwarder is None:
         return ()
     sending = partial(_sending, uid=forwarder.uid)
     ports = PortRange.one(forwarder.port)
     return (
         sending(
-            "audit log's forwarder: its receiver",
+            f"{forwarder.name}: its receiver",
             PacketVerdict.RETURN,
             destination=forwarder.address,
             tcp_ports=None if forwarder.datagrams else ports,
             udp_ports=ports if forwarder.datagrams else None,
         ),
-        sending("audit log's forwarder: no other user", PacketVerdict.DROP),
+        sending(f"{forwarder.name}: no other destination", PacketVerdict.DROP),
     )
 
 

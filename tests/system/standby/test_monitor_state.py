@@ -36,7 +36,7 @@ def monitor(site: StandbySite, name: str) -> dict[str, Any] | None:
     """Return the row of the monitor in `rosrv monitor list` of an appliance, once that is active."""
     done = site.appliances[name].rosrv("monitor", "list", "--json", check=False)
     rows = [json.loads(line) for line in done.stdout.splitlines()]
-    return next((row for row in rows if row.get("name") == "stop"), None)
+    return next((row for row in rows if row["name"] == "stop"), None)
 
 
 def dropped(site: StandbySite, name: str, least: int) -> bool:

@@ -131,6 +131,35 @@ def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: 
         read({"audit": {"syslog": syslog}})
 
 
+_FLEET = {"collector": "https://10.0.0.9:8444", "ca": "a", "certificate": "b", "key": "c", "receipt_key": "d"}
+
+
+def test_a_collector() -> None:
+    """A collector has an address and a port, and needs all files."""
+    assert read({"fleet": _FLEET}).fleet.destination == ("10.0.0.9", 8444)
+
+
+@pytest.mark.parametrize(
+    ("fleet", "why"),
+    [
+        (_FLEET | {"collector": "http://10.0.0.9:8444"}, "is not https://"),
+        (_FLEET | {"collector": "https://10.0.0.9:8444/"}, "is not https://"),
+        (_FLEET | {"collector": "https://fleet.example:8444"}, "names are not looked up"),
+        (_FLEET | {"collector": "https://127.0.0.1:8444"}, "loopback of the appliance's own namespace"),
+        (
+            {name: value for name, value in _FLEET.items() if name != "receipt_key"},
+            "receipt_key must be given",
+        ),
+        ({"ca": "x.pem"}, "no effect without collector"),
+        (_FLEET | {"retention_waits": True}, "no effect without audit.retention_days"),
+    ],
+)
+def test_an_invalid_collector_is_rejected(fleet: dict[str, object], why: str) -> None:
+    """A useless or impossible setting is an error with its key and the reason."""
+    with pytest.raises(ValidationError, match=why):
+        read({"fleet": fleet})
+
+
 @pytest.mark.parametrize(
     ("pool", "said"),
     [

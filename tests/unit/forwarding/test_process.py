@@ -7,7 +7,6 @@ import pytest
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.configuration.settings import Syslog
 from appliance.control.forwarder_link import ForwarderLink
 from appliance.forwarding.process import ProgressReports
 from appliance.telemetry.audit_trail import AuditTrail
@@ -20,7 +19,7 @@ class Control:
 
     def __init__(self) -> None:
         self.gaps: list[int] = []
-        self.forwarded = ForwarderLink(Syslog(to="udp://127.0.0.1:514"), cast(AuditTrail, self))
+        self.forwarded = ForwarderLink("udp://127.0.0.1:514", "all", cast(AuditTrail, self))
         self.hears: Callable[[object, tuple[int, ...]], None] = lambda _message, _descriptors: None
 
     def happened(self, event: str, _text: str, **detail: Any) -> None:

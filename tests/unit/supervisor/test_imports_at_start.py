@@ -19,6 +19,7 @@ ALSO: Final = {
     "signer": _NO_SETTINGS, "control": _BARE,
     "relay": _NO_SETTINGS | {"cryptography", "roswire.definitions"},
     "charon": _NO_SETTINGS, "compiler": _LINKED | {"pydantic"}, "syslog": _LINKED,
+    "fleet": _LINKED,
     "recorder": {"appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},
 }  # fmt: skip

@@ -1,0 +1,239 @@
+"""Push the log's sealed segments to the collector: in order, until each has a receipt.
+
+Invariants:
+
+1. The database is only read, so pushing never delays the log or loses its records.
+2. Memory is bounded: one record. The segment at work is a compressed file in this process's folder.
+3. A segment counts only with a receipt that the collector's key signed, and that is on this disk.
+4. After each failure the collector reports what it has; repeating a segment is harmless.
+5. Records that retention removed before they had a receipt are counted and reported (`missed`).
+6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
+"""
+
+import gzip
+import os
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from appliance.audit.copies import signed_checkpoints
+from appliance.audit.log_database import LogUnreadableError, reading
+from appliance.audit.segments import SegmentSummary, next_segment, write_segment
+from appliance.base.atomic_files import write_whole
+from appliance.channel.messages import ForwardingReported
+from appliance.forwarding.collector_connection import CollectorLink, CollectorRefusedError
+from appliance.signing.receipts import SegmentReceipt
+from appliance.signing.signed_statements import checkpoint_hash
+
+_IDLE_SECONDS = 1.0
+_FIRST_PAUSE = 0.5
+_LONGEST_PAUSE = 60.0
+_LONGEST_ASKED = 3600.0
+_RECEIPTS_BYTES = 16 << 20
+_LARGEST_SEGMENT = 1 << 30
+_log = structlog.get_logger()
+
+
+class PushPosition(msgspec.Struct, frozen=True):
+    """The last segment with a receipt: its log, the number of its checkpoint, and its last sequence."""
+
+    log: str
+    number: int = 0
+    sequence: int = 0
+
+
+@dataclass(slots=True)
+class SegmentPusher:
+    """A pusher of the database `log`; it keeps its files in `folder`, and trusts receipts of `receipt_key` (raw)."""
+
+    log: Path
+    folder: Path
+    collector: CollectorLink
+    receipt_key: bytes
+    jitter: Callable[[], float] = random.random
+    clock: Callable[[], int] = time.time_ns
+    progress: ForwardingReported = field(default_factory=ForwardingReported)
+    _position: PushPosition | None = None
+    _failures: int = 0
+
+    def step(self) -> float:
+        """Push the next segment; return the seconds to wait before the next call."""
+        try:
+            position = self._position or self._begin()
+            more = self._push_next(position)
+        except (LogUnreadableError, OSError, ValueError) as error:
+            return self._failed(error)
+        if self._failures:
+            _log.warning("segments are pushed to the collector again")
+        self._failures = 0
+        return 0.0 if more else _IDLE_SECONDS
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.collector.close()
+
+    def _begin(self) -> PushPosition:
+        """Return the position after the last checkpoint that the collector and the log both have."""
+        log, upto = _newest_signed(self.log)
+        lowest = next_segment(self.log, 0) or 1
+        position, step = PushPosition(log), 1
+        while upto > 0:
+            head = self.collector.head(log, upto)
+            if head.number < lowest:  # the log has no such checkpoint (any more)
+                position = PushPosition(log, head.number, self._kept_sequence(log, head.number))
+                break
+            sequence = _sequence_of(self.log, head.number, head.hashes)
+            if sequence is not None:
+                position = PushPosition(log, head.number, sequence)
+                break
+            upto, step = head.number - step, 2 * step
+        self._position = position
+        self._look(position)
+        return position
+
+    def _kept_sequence(self, log: str, number: int) -> int:
+        """Return the last sequence of segment `number` if it had the last receipt; 0: not known."""
+        try:
+            kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
+        except (FileNotFoundError, msgspec.DecodeError):
+            return 0
+        return kept.sequence if (kept.log, kept.number) == (log, number) else 0
+
+    def _push_next(self, position: PushPosition) -> bool:
+        """Push the segment after `position`; return whether there was one."""
+        log, _newest = _newest_signed(self.log)
+        if log != position.log:
+            self._position = None
+            raise LogUnreadableError(f"{self.log}: another log than before; the collector is asked for it")
+        number = next_segment(self.log, position.number)
+        if number is None:
+            self.collector.close()  # the next segment comes in a minute: the collector would close it
+            self._look(position)
+            return False
+        file = self.folder / "segment.gz"
+        summary = self._write(file, number)
+        if summary is None:
+            self._look(position)
+            return False
+        try:
+            with file.open("rb") as body:
+                size = file.stat().st_size
+                receipt = self.collector.push(log, number, summary.name, body, size)
+        finally:
+            file.unlink()
+        self._check(receipt, log, number, summary)
+        self._keep(receipt)
+        self._advance(position, summary)
+        return True
+
+    def _write(self, file: Path, number: int) -> SegmentSummary | None:
+        """Write a segment to a file; None, without a file, if it is not signed yet."""
+        left = _LARGEST_SEGMENT
+        try:
+            with (
+                file.open("wb") as raw,
+                gzip.GzipFile(fileobj=raw, mode="wb", mtime=0, filename="") as packed,
+            ):
+
+                def write(line: bytes) -> None:
+                    nonlocal left
+                    left -= len(line)
+                    if left < 0:
+                        raise ValueError(f"segment {number} has more than {_LARGEST_SEGMENT} bytes")
+                    packed.write(line)
+
+                summary = write_segment(self.log, number, write)
+        except BaseException:
+            file.unlink(missing_ok=True)
+            raise
+        if summary is None:
+            file.unlink()
+        return summary
+
+    def _check(self, receipt: SegmentReceipt, log: str, number: int, summary: SegmentSummary) -> None:
+        expected = (log, number, summary.name, summary.first, summary.last)
+        if (receipt.log, receipt.number, receipt.segment, receipt.first, receipt.last) != expected:
+            raise ValueError(f"the collector's receipt is not for segment {number}")
+        if not receipt.is_signed(self.receipt_key):
+            raise ValueError(
+                "the collector's receipt has a wrong signature: fleet.receipt_key is another collector's"
+            )
+
+    def _keep(self, receipt: SegmentReceipt) -> None:
+        """Append the receipt; the last 16 to 32 MiB are kept."""
+        file = self.folder / "receipts.ndjson"
+        with file.open("ab") as kept:
+            kept.write(msgspec.json.encode(receipt) + b"\n")
+            kept.flush()
+            os.fsync(kept.fileno())
+        if file.stat().st_size > _RECEIPTS_BYTES:
+            file.replace(file.with_name("receipts.1.ndjson"))
+
+    def _advance(self, position: PushPosition, summary: SegmentSummary) -> None:
+        missed = max(0, summary.first - position.sequence - 1) if position.sequence else 0
+        if missed:
+            _log.error("retention removed records before the collector had them", count=missed)
+        end = summary.header.end
+        self._position = PushPosition(position.log, end.number, end.sequence)
+        write_whole(self.folder / "position.json", msgspec.json.encode(self._position), 0o600)
+        self.progress = msgspec.structs.replace(
+            self.progress, sent=self.progress.sent + 1, missed=self.progress.missed + missed
+        )
+        self._look(self._position)
+
+    def _look(self, position: PushPosition) -> None:
+        """Report how many sealed records wait, and since when the oldest."""
+        sealed, oldest = _waiting(self.log, position.sequence)
+        self.progress = msgspec.structs.replace(
+            self.progress,
+            sequence=position.sequence,
+            checkpoint=position.number,
+            behind=max(0, sealed - position.sequence),
+            seconds=max(0.0, (self.clock() - oldest) / 1e9) if oldest else 0.0,
+            trouble="",
+        )
+
+    def _failed(self, error: Exception) -> float:
+        """Report the failure; return a pause that grows, with jitter, so that robots do not return together."""
+        self.collector.close()
+        self._position = None
+        reason = str(error) or type(error).__name__
+        if not self._failures:
+            _log.error("segments are not pushed to the collector; it is tried again and again", reason=reason)
+        pause = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2.0 ** min(self._failures, 10))
+        if isinstance(error, CollectorRefusedError):
+            pause = max(pause, min(error.wait, _LONGEST_ASKED))
+        self._failures += 1
+        self.progress = msgspec.structs.replace(self.progress, trouble=reason)
+        return pause * (0.5 + self.jitter())
+
+
+def _newest_signed(log: Path) -> tuple[str, int]:
+    """Return the log's id, and the number of its newest signed checkpoint. Raises `LogUnreadableError`."""
+    with reading(log, advice="") as connection:
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
+        query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE signature IS NOT NULL"
+        (number,) = connection.execute(query).fetchone()
+    return str(log_id), int(number)
+
+
+def _sequence_of(log: Path, number: int, hashes: list[str]) -> int | None:
+    """Return the sequence of the log's checkpoint `number` if its hash is one of `hashes`, or None."""
+    found = signed_checkpoints(log, number - 1, 1) if number else []
+    same = found and found[0].number == number and checkpoint_hash(found[0].text()) in hashes
+    return found[0].sequence if same else None
+
+
+def _waiting(log: Path, sequence: int) -> tuple[int, int]:
+    """Return the last sealed sequence, and the time of the first sealed record after `sequence` (0: none)."""
+    with reading(log, advice="") as connection:
+        query = "SELECT coalesce(max(sequence), 0) FROM checkpoint WHERE signature IS NOT NULL"
+        (sealed,) = connection.execute(query).fetchone()
+        query = "SELECT time FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence LIMIT 1"
+        row = connection.execute(query, (sequence, sealed)).fetchone()
+    return int(sealed), 0 if row is None else int(row[0])

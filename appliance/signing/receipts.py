@@ -1,0 +1,44 @@
+"""Write and verify receipts: the collector's signed statement that it has a segment on its disk. No I/O.
+
+A receipt has exactly one valid text, like the other signed statements.
+"""
+
+import msgspec
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+
+class SegmentReceipt(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A receipt; hash and signature are in hexadecimal.
+
+    The collector has the segment `segment` of the log `log` of the robot `robot` (its name there): the records from
+    sequence `first` to `last`, sealed by checkpoint `number`. `time` is in nanoseconds since the epoch.
+    """
+
+    robot: str
+    log: str
+    number: int
+    segment: str
+    first: int
+    last: int
+    time: int
+    signature: str = ""
+
+    def text(self) -> bytes:
+        """Return the text that is signed."""
+        return (
+            f"rosrv fleet receipt 1\nrobot {self.robot}\nlog {self.log}\nnumber {self.number}\n"
+            f"segment {self.segment}\nfirst {self.first}\nlast {self.last}\ntime {self.time}\n"
+        ).encode()
+
+    def signed(self, key: Ed25519PrivateKey) -> "SegmentReceipt":
+        """Return the receipt with its signature."""
+        return msgspec.structs.replace(self, signature=key.sign(self.text()).hex())
+
+    def is_signed(self, key: bytes) -> bool:
+        """Whether the collector with the raw public key `key` signed this receipt."""
+        try:
+            Ed25519PublicKey.from_public_bytes(key).verify(bytes.fromhex(self.signature), self.text())
+        except (InvalidSignature, ValueError):
+            return False
+        return True

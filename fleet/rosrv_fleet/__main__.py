@@ -1,0 +1,5 @@
+"""Run the command `rosrv-fleet`."""
+
+from rosrv_fleet.cli import main
+
+main()

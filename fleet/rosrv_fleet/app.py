@@ -1,0 +1,44 @@
+"""Make the REST application of the collector. Each part of the API is a router of its own."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from fastapi import APIRouter, FastAPI
+
+from rosrv_fleet.collector import Collector
+from rosrv_fleet.console_routes import console_router
+from rosrv_fleet.health_routes import health_router
+from rosrv_fleet.push_routes import push_router
+from rosrv_fleet.search_routes import search_router
+
+ROUTERS: tuple[Callable[[Collector], APIRouter], ...] = (
+    push_router,
+    search_router,
+    health_router,
+    console_router,
+)
+"""The parts of the API. To add one, write a function that returns its router, and name it here."""
+
+
+def make_app(collector: Collector) -> FastAPI:
+    """Return the application; its lifespan runs the indexer and the database's connections."""
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        collector.store.remove_unfinished()
+        collector.database.open()
+        indexing = threading.Thread(target=collector.indexer.run, name="indexer", daemon=True)
+        indexing.start()
+        try:
+            yield
+        finally:
+            collector.indexer.stop()
+            await asyncio.to_thread(indexing.join, 30.0)
+            collector.database.close()
+
+    app = FastAPI(title="ROSRV fleet collector", lifespan=lifespan, docs_url=None, redoc_url=None)
+    for make_router in ROUTERS:
+        app.include_router(make_router(collector))
+    return app

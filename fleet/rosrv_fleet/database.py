@@ -1,0 +1,84 @@
+"""Connect to PostgreSQL and apply the migrations.
+
+The rows are an index of the stored segments: `rosrv-fleet reindex` rebuilds them. A migration is a file
+`migrations/NNNN_name.sql`; each runs once, in order, in one transaction. Applied files never change.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psycopg
+import structlog
+from psycopg_pool import ConnectionPool
+
+MIGRATIONS = Path(__file__).with_name("migrations")
+_MIGRATION_LOCK = 0x726F7372  # one collector migrates at a time
+_CONNECT_SECONDS = 5.0
+_log = structlog.get_logger()
+
+Connection = psycopg.Connection[tuple[Any, ...]]
+
+
+class Database:
+    """A bounded pool of connections to the index. Thread-safe."""
+
+    def __init__(self, conninfo: str, *, connections: int, statement_seconds: float) -> None:
+        """Prepare the pool; it connects in the background after `open`.
+
+        `connections` is the largest number of connections; `statement_seconds` the longest statement of `reading`.
+        """
+        self._statement_ms = int(statement_seconds * 1000)
+        self._pool: ConnectionPool[Connection] = ConnectionPool(
+            conninfo,
+            kwargs={"connect_timeout": int(_CONNECT_SECONDS), "application_name": "rosrv-fleet"},
+            min_size=0,
+            max_size=connections,
+            timeout=_CONNECT_SECONDS,
+            max_idle=60.0,
+            check=ConnectionPool.check_connection,
+            open=False,
+        )
+
+    def open(self) -> None:
+        """Start the pool. A database that is down is not an error."""
+        self._pool.open(wait=False)
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._pool.close()
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """Run a block in one transaction. Raises `psycopg.Error`; then nothing was written."""
+        with self._pool.connection() as connection:
+            yield connection
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Run a block in one read-only transaction with the time limit of searches. Raises `psycopg.Error`."""
+        with self._pool.connection() as connection:
+            connection.execute("SET TRANSACTION READ ONLY")
+            connection.execute("SELECT set_config('statement_timeout', %s, true)", (str(self._statement_ms),))
+            yield connection
+
+
+def migrate(connection: Connection, folder: Path = MIGRATIONS) -> list[str]:
+    """Apply the migrations that the database does not have; return their names. Raises `psycopg.Error`."""
+    applied: list[str] = []
+    with connection.transaction():
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (_MIGRATION_LOCK,))
+        connection.execute(
+            "CREATE TABLE IF NOT EXISTS migration (name text PRIMARY KEY, applied timestamptz NOT NULL DEFAULT now())"
+        )
+        known = {name for (name,) in connection.execute("SELECT name FROM migration")}
+        for file in sorted(folder.glob("[0-9]*.sql")):
+            if file.stem not in known:
+                # The text is a file of this package, never input.
+                connection.execute(file.read_bytes())
+                connection.execute("INSERT INTO migration (name) VALUES (%s)", (file.stem,))
+                applied.append(file.stem)
+    if applied:
+        _log.info("the database was migrated", applied=applied)
+    return applied

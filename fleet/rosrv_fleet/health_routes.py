@@ -1,0 +1,72 @@
+"""Health over REST, and metrics in Prometheus's format."""
+
+from collections.abc import Iterator
+
+import msgspec
+from fastapi import APIRouter, Depends, Response
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector as MetricSource
+
+from rosrv_fleet.access import holder_of
+from rosrv_fleet.collector import Collector
+from rosrv_fleet.health import FleetHealth, health_of
+from rosrv_fleet.tokens import FleetRole
+
+
+def health_router(collector: Collector) -> APIRouter:
+    """Return the routes of health and metrics."""
+    router = APIRouter()
+    viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
+
+    @router.get("/healthz")
+    def alive() -> dict[str, bool]:
+        """Return that the collector answers; for load balancers, without a token."""
+        return {"ok": True}
+
+    @router.get("/v1/health", dependencies=viewer)
+    def health() -> Response:
+        """Return the state of the robots, the store and the index."""
+        return Response(msgspec.json.encode(health_of(collector)), media_type="application/json")
+
+    @router.get("/metrics", dependencies=viewer)
+    def metrics() -> Response:
+        """Return the same state as metrics."""
+        registry = CollectorRegistry()
+        registry.register(_Source(health_of(collector)))
+        return Response(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    return router
+
+
+class _Source(MetricSource):
+    """The metrics of one scrape."""
+
+    def __init__(self, health: FleetHealth) -> None:
+        self._health = health
+
+    def collect(self) -> Iterator[Metric]:
+        def gauge(name: str, help_text: str) -> GaugeMetricFamily:
+            return GaugeMetricFamily(f"rosrv_fleet_{name}", help_text, labels=["robot"])
+
+        health = self._health
+        age = gauge("segment_age_seconds", "seconds since the robot's newest segment arrived")
+        silent = gauge("robot_silent", "1 while the robot sent nothing for silent_seconds")
+        gaps = gauge("gaps", "places where segments of the robot are missing")
+        forks = gauge("forks", "segments of the robot with a number that another one has")
+        for robot in health.robots:
+            if robot.age_seconds is not None:
+                age.add_metric([robot.name], robot.age_seconds)
+            silent.add_metric([robot.name], robot.silent)
+            gaps.add_metric([robot.name], robot.gaps)
+            forks.add_metric([robot.name], robot.forks)
+        yield from (age, silent, gaps, forks)
+        yield GaugeMetricFamily(
+            "rosrv_fleet_waiting", "stored segments that the index does not have", health.waiting
+        )
+        yield GaugeMetricFamily(
+            "rosrv_fleet_index_up", "1 while segments are indexed", health.trouble is None
+        )
+        yield GaugeMetricFamily(
+            "rosrv_fleet_disk_up", "1 while there is room for segments", health.disk is None
+        )

@@ -1,0 +1,77 @@
+"""Search the index of all robots."""
+
+from typing import Any
+
+import msgspec
+import psycopg
+from psycopg_pool import PoolTimeout
+
+from appliance.audit.chain import StoredColumns
+from appliance.audit.columns import from_columns
+from appliance.audit.query import FilterError
+from appliance.audit.record_format import LogEntry, as_object
+from rosrv_fleet.database import Database
+from rosrv_fleet.search_sql import FleetFilter, SearchCursor, days_statement, parse_cursor, search_statement
+
+LARGEST_FLEET_PAGE = 1000
+
+
+class SearchTooLongError(Exception):
+    """A search took longer than its limit."""
+
+
+class IndexDownError(Exception):
+    """The database cannot be reached, or all connections are in use."""
+
+
+class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
+    """A page: the records with `robot` and `log`, newest first, and the cursor of the next page; None at the end.
+
+    `waiting` is the number of stored segments that the index did not have, at most 1,000: a search misses these.
+    """
+
+    records: list[dict[str, Any]]
+    cursor: str | None
+    waiting: int
+
+
+def search_fleet(
+    database: Database, wanted: FleetFilter, cursor: str | None, limit: int, waiting: int
+) -> FleetPage:
+    """Return a page of at most `limit` records.
+
+    Raises `FilterError`, `SearchTooLongError` and `IndexDownError`.
+    """
+    after = None if cursor is None else parse_cursor(cursor)
+    try:
+        rows = _rows(database, wanted, after, limit + 1)
+    except psycopg.errors.QueryCanceled as error:
+        raise SearchTooLongError(
+            "the search took too long: give a shorter time with since and until, or an exact name"
+        ) from error
+    except psycopg.errors.InvalidRegularExpression as error:
+        raise FilterError("a glob has a set such as [z-a] that matches nothing") from error
+    except (psycopg.OperationalError, PoolTimeout, psycopg.errors.UndefinedTable) as error:
+        raise IndexDownError(
+            "the index cannot be searched now: try again; segments are still stored"
+        ) from error
+    records = [_record(row) for row in rows[:limit]]
+    last = rows[limit - 1] if len(rows) > limit else None
+    more = None if last is None else SearchCursor(last[4], last[0], last[3]).text()
+    return FleetPage(records=records, cursor=more, waiting=waiting)
+
+
+def _rows(
+    database: Database, wanted: FleetFilter, after: SearchCursor | None, limit: int
+) -> list[tuple[Any, ...]]:
+    with database.reading() as connection:
+        of_days, days = days_statement(wanted.record), None
+        if of_days is not None:
+            days = [day for (day,) in connection.execute(*of_days)]
+        return connection.execute(*search_statement(wanted, after, limit, days)).fetchall()
+
+
+def _record(row: tuple[Any, ...]) -> dict[str, Any]:
+    robot, log, *columns, detail = row
+    stored = StoredColumns._make((*columns, detail.encode()))
+    return {"robot": robot, "log": log} | as_object(LogEntry(stored.sequence, from_columns(stored)))

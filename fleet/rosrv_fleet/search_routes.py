@@ -1,0 +1,54 @@
+"""Search over REST: the parameters are the words of `rosrv audit search`, and `robot`."""
+
+import functools
+from typing import Annotated, Any
+
+import msgspec
+from fastapi import APIRouter, Depends, HTTPException, Query, Response
+
+from appliance.audit.filter_options import filter_given
+from appliance.audit.query import Filter, FilterError
+from appliance.base.timestamps import TimestampError
+from rosrv_fleet.access import holder_of
+from rosrv_fleet.collector import Collector
+from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
+from rosrv_fleet.search_sql import FleetFilter
+from rosrv_fleet.tokens import FleetRole
+
+MOST_WAITING = 1000
+
+
+@functools.wraps(filter_given)
+def filter_asked(**words: Any) -> Filter:
+    """Return the filter of a request's parameters, which are those of `filter_given`; answer 422 for invalid ones."""
+    try:
+        return filter_given(**words)
+    except TimestampError as error:
+        raise HTTPException(422, str(error)) from error
+
+
+def search_router(collector: Collector) -> APIRouter:
+    """Return the route of searches."""
+    router = APIRouter()
+    viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
+
+    @router.get("/v1/search", dependencies=viewer)
+    def search(
+        wanted: Annotated[Filter, Depends(filter_asked)],
+        robot: Annotated[str | None, Query(description="name of the robot; a glob")] = None,
+        cursor: Annotated[str | None, Query(max_length=1024)] = None,
+        limit: Annotated[int, Query(ge=1, le=LARGEST_FLEET_PAGE)] = 100,
+    ) -> Response:
+        """Return the records of all robots that match, newest first."""
+        waiting = len(collector.store.marked("pending", MOST_WAITING))
+        try:
+            page = search_fleet(collector.database, FleetFilter(robot, wanted), cursor, limit, waiting)
+        except FilterError as error:
+            raise HTTPException(422, str(error)) from error
+        except SearchTooLongError as error:
+            raise HTTPException(422, str(error)) from error
+        except IndexDownError as error:
+            raise HTTPException(503, str(error), {"Retry-After": "5"}) from error
+        return Response(msgspec.json.encode(page), media_type="application/json")
+
+    return router

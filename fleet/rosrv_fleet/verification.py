@@ -1,0 +1,117 @@
+"""Prove from the stored segments that no record of a robot is missing.
+
+Each segment is read and verified again with the robot's key. A log is complete if its segments form one chain: each
+begins with the checkpoint that ends the one before. The first begins at the log's beginning, or after records whose
+removal by retention the signer signed.
+"""
+
+import gzip
+import zlib
+from collections.abc import Callable
+
+import msgspec
+
+from appliance.audit.segments import SegmentError, SegmentHeader, SegmentReader
+from rosrv_fleet.robots import Robot
+from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+
+_UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
+
+
+class LogProof(msgspec.Struct, kw_only=True):
+    """The result for one log: `records` in `segments` are proven, up to sequence `last`.
+
+    `begins_after` is the last record that retention removed before the collector had it. `missing` is the number of
+    records that no segment has; `findings` are sentences about these, and about damaged and forked segments.
+    """
+
+    robot: str
+    log: str
+    segments: int = 0
+    records: int = 0
+    begins_after: int = 0
+    last: int = 0
+    missing: int = 0
+    findings: list[str] = []
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is missing or wrong."""
+        return not self.findings
+
+
+def prove(
+    store: SegmentStore,
+    robot: Robot,
+    segment_bytes: int,
+    progress: Callable[[int], None] = lambda _records: None,
+) -> list[LogProof]:
+    """Verify all stored segments of a robot; one result for each log. `progress` gets the number of records."""
+    return [_prove_log(store, robot, log, segment_bytes, progress) for log in store.logs(robot.name)]
+
+
+def _prove_log(
+    store: SegmentStore, robot: Robot, log: str, segment_bytes: int, progress: Callable[[int], None]
+) -> LogProof:
+    proof = LogProof(robot=robot.name, log=log)
+    ends: dict[int, list[SegmentHeader]] = {}
+    removed = 0
+    for place in store.segments(robot.name, log):
+        header = _read(store, robot, place, segment_bytes, proof)
+        if header is None:
+            continue
+        proof.segments += 1
+        previous = ends.get(place.number - 1, [])
+        if place.number in ends:
+            proof.findings.append(
+                f"checkpoint {place.number} seals two histories: the log was restored from a copy, or rewritten with"
+                " the robot's key"
+            )
+        elif place.number != 1 and not any(map(header.follows, previous)):
+            _note_missing(proof, header)
+        if place.number not in ends:
+            ends = {number: found for number, found in ends.items() if number == place.number - 1}
+        ends.setdefault(place.number, []).append(header)
+        proof.records += header.end.sequence - header.start[0]
+        proof.last = max(proof.last, header.end.sequence)
+        removed = max(removed, header.end.removed or 0)
+        progress(proof.records)
+    if proof.begins_after > removed:
+        proof.missing += proof.begins_after
+        proof.findings.insert(
+            0, f"records 1 to {proof.begins_after} are missing: their removal is not signed"
+        )
+    return proof
+
+
+def _read(
+    store: SegmentStore, robot: Robot, place: SegmentPlace, segment_bytes: int, proof: LogProof
+) -> SegmentHeader | None:
+    try:
+        with gzip.open(store.path(place)) as file:
+            summary = SegmentReader(file, robot.public_key, segment_bytes).summary()
+    except _UNREADABLE as error:
+        proof.findings.append(f"{store.path(place)}: damaged: {error}")
+        return None
+    end = summary.header.end
+    if (end.log, end.number, summary.name) != (place.log, place.number, place.name):
+        proof.findings.append(
+            f"{store.path(place)}: damaged: its content is segment {end.number} {summary.name}"
+        )
+        return None
+    return summary.header
+
+
+def _note_missing(proof: LogProof, header: SegmentHeader) -> None:
+    """Note the records between the proven ones and the beginning of a segment."""
+    begin = header.start[0]
+    if header.begin is None and proof.last == 0:
+        proof.begins_after = begin
+        return
+    count = max(0, begin - proof.last)
+    proof.missing += count
+    proof.findings.append(
+        f"records {proof.last + 1} to {begin} are missing"
+        if count
+        else f"checkpoint {header.end.number} does not continue the segment before it"
+    )

@@ -1,0 +1,57 @@
+"""Fixtures of the collector's tests: a real PostgreSQL 15, and a database for each test."""
+
+import secrets
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
+from tests.system.fleet.postgres import PostgresCluster, postgres
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[PostgresCluster]:
+    """Return a running PostgreSQL 15 that the tests of a worker share."""
+    with postgres() as running:
+        yield running
+
+
+@pytest.fixture
+def database(cluster: PostgresCluster) -> str:
+    """Return the connection string of an empty database."""
+    return cluster.create(f"test_{secrets.token_hex(6)}")
+
+
+@pytest.fixture
+def site(database: str, tmp_path: Path) -> Iterator[FleetSite]:
+    """Return a running collector with a database of its own."""
+    with running(FleetSite(tmp_path / "site", database)) as found:
+        yield found
+
+
+@pytest.fixture
+def make_robot(site: FleetSite) -> Iterator[Callable[..., FleetRobot]]:
+    """Return a function that makes robots of the collector; they are closed after the test."""
+    made: list[FleetRobot] = []
+
+    def make(name: str, **settings: object) -> FleetRobot:
+        made.append(FleetRobot(site, name, **settings))  # type: ignore[arg-type]  # as the test says
+        return made[-1]
+
+    yield make
+    for robot in made:
+        robot.close()
+
+
+@pytest.fixture(scope="module")
+def shared(cluster: PostgresCluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetSite]:
+    """Return a running collector with a hundred decisions of one robot, for tests that only read."""
+    database = cluster.create(f"test_{secrets.token_hex(6)}")
+    with running(FleetSite(tmp_path_factory.mktemp("shared") / "site", database)) as found:
+        robot = FleetRobot(found, "arm1")
+        robot.record(100)
+        robot.push()
+        robot.close()
+        found.indexed()
+        yield found

@@ -1,0 +1,246 @@
+"""A collector as a process of its own, and robots that push real logs with the appliance's client."""
+
+import asyncio
+import os
+import signal
+import socket
+import sqlite3
+import ssl
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import yaml
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from rosrv_fleet.robots import Robots
+
+from appliance.audit.copies import signed_checkpoints
+from appliance.audit.log import AuditLog
+from appliance.audit.signatures import read_public_key, write_public_key
+from appliance.forwarding.collector_connection import https_collector
+from appliance.forwarding.segment_pusher import SegmentPusher
+from tests.support.audit import decision, settle
+from tests.support.certificates import Certificates, make_certificates
+from tests.support.sources import ROOT
+from tests.support.waiting import eventually
+
+
+@dataclass
+class FleetSite:
+    """A collector's folder and process."""
+
+    folder: Path
+    database: str
+    limits: dict[str, Any] = field(default_factory=dict)
+    data: Path | None = None
+
+    def __post_init__(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.data = self.data or self.folder / "data"
+        self.server = make_certificates(self.folder / "server")
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.write_config()
+        self._process: subprocess.Popen[bytes] | None = None
+        self.run("init")
+        self.token = self.run("token", "add", "tester").stdout.strip()
+
+    def write_config(self, **changes: Any) -> None:
+        """Write the configuration."""
+        config = {
+            "data": str(self.data), "listen": f"127.0.0.1:{self.port}", "certificate": str(self.server.certificate),
+            "key": str(self.server.key), "database": self.database, "limits": {"reserve_bytes": 1} | self.limits,
+        }  # fmt: skip
+        (self.folder / "fleet.yaml").write_text(yaml.safe_dump(config | changes))
+
+    def command(self, *arguments: str) -> list[str]:
+        """Return a command line of `rosrv-fleet`."""
+        return [sys.executable, "-m", "rosrv_fleet", *arguments, "--config", str(self.folder / "fleet.yaml")]
+
+    def run(self, *arguments: str, status: int = 0) -> subprocess.CompletedProcess[str]:
+        """Run a verb and check its exit status."""
+        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
+        done = subprocess.run(
+            self.command(*arguments), capture_output=True, text=True, check=False, env=environment
+        )
+        assert done.returncode == status, f"{arguments}: {done.returncode}\n{done.stdout}\n{done.stderr}"
+        return done
+
+    def start(self) -> None:
+        """Start the collector and wait until it answers."""
+        environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
+        with (self.folder / "log").open("ab") as log:
+            self._process = subprocess.Popen(self.command("serve"), stderr=log, env=environment)
+        eventually(
+            self._answers, lambda: f"the collector answers: {(self.folder / 'log').read_text()[-2000:]}"
+        )
+
+    def _answers(self) -> bool:
+        assert self._process is None or self._process.poll() is None, (self.folder / "log").read_text()[
+            -3000:
+        ]
+        try:
+            return self.get("/healthz", token=None).status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def stop(self, with_signal: int = signal.SIGTERM) -> None:
+        """End the collector."""
+        if self._process is not None:
+            self._process.send_signal(with_signal)
+            self._process.wait(60)
+            self._process = None
+
+    def kill(self) -> None:
+        """Kill the collector."""
+        self.stop(signal.SIGKILL)
+
+    def get(self, path: str, token: str | None = "", **parameters: Any) -> httpx.Response:
+        """Ask the collector; `token` "" is that of a viewer, None is none."""
+        headers = {} if token is None else {"Authorization": f"Bearer {token or self.token}"}
+        with self.client() as client:
+            return client.get(path, headers=headers, params=parameters)
+
+    def client(self, robot: Certificates | None = None) -> httpx.Client:
+        """Return an HTTP client, with a robot's certificate or without one."""
+        context = ssl.create_default_context(cafile=self.server.ca)
+        if robot is not None:
+            context.load_cert_chain(robot.certificate, robot.key)
+        return httpx.Client(base_url=f"https://127.0.0.1:{self.port}", verify=context, timeout=60)
+
+    def search(self, **words: Any) -> list[dict[str, Any]]:
+        """Return the records of a search."""
+        answer = self.get("/v1/search", **words)
+        assert answer.status_code == 200, answer.text
+        records: list[dict[str, Any]] = answer.json()["records"]
+        return records
+
+    def all(self, **words: Any) -> list[dict[str, Any]]:
+        """Return the records of all pages of a search."""
+        found: list[dict[str, Any]] = []
+        more: dict[str, str] = {}
+        while True:
+            page = self.get("/v1/search", limit=1000, **words, **more).json()
+            found += page["records"]
+            if page["cursor"] is None:
+                return found
+            more = {"cursor": page["cursor"]}
+
+    def stored(self) -> int:
+        """Return the number of stored segments."""
+        assert self.data is not None
+        return sum(1 for _file in (self.data / "segments").rglob("*.gz"))
+
+    def health(self) -> dict[str, Any]:
+        """Return the health."""
+        answer = self.get("/v1/health")
+        assert answer.status_code == 200, answer.text
+        return dict(answer.json())
+
+    def indexed(self) -> None:
+        """Wait until every stored segment is indexed."""
+        eventually(
+            lambda: self.health()["waiting"] == 0 and self.health()["trouble"] is None, "all is indexed"
+        )
+
+    @property
+    def receipt_key(self) -> bytes:
+        """Return the public key of receipts."""
+        assert self.data is not None
+        return read_public_key(self.data / "receipts.pub")
+
+
+class FleetRobot:
+    """A robot: a real audit log with a signer's key, a certificate, and the appliance's pusher."""
+
+    def __init__(self, site: FleetSite, name: str, *, enrolled: bool = True, every: int = 10) -> None:
+        self.site, self.name = site, name
+        self.folder = site.folder / "robots" / name
+        self.folder.mkdir(parents=True)
+        (self.folder / "state").mkdir()
+        self.log_file = self.folder / "audit.db"
+        self.key = Ed25519PrivateKey.generate()
+        self.public = self.key.public_key().public_bytes_raw()
+        self.certificates = make_certificates(self.folder / "tls", authority=f"authority of {name}")
+        write_public_key(self.folder / "audit.pub.pem", self.public)
+        self._every = every
+        self._open()
+        if enrolled:
+            assert site.data is not None
+            key, certificate = self.folder / "audit.pub.pem", self.certificates.certificate
+            Robots(site.data / "robots").add(name, key.read_bytes(), certificate.read_bytes())
+            eventually(self._trusted, "the running collector notices the robot")
+
+    def _open(self) -> None:
+        self.log = AuditLog(self.log_file, checkpoint_every=self._every, signer=self._sign)
+        self.log.request_signatures()
+
+    def rewind(self, number: int) -> None:
+        """Cut the closed log off after checkpoint `number`, as an old copy would be, and open it again."""
+        with sqlite3.connect(self.log_file) as log:
+            (sequence,) = log.execute(
+                "SELECT sequence FROM checkpoint WHERE number = ?", (number,)
+            ).fetchone()
+            log.execute("DELETE FROM checkpoint WHERE number > ?", (number,))
+            log.execute("DELETE FROM record WHERE sequence > ?", (sequence,))
+        log.close()
+        self._open()
+
+    def _trusted(self) -> bool:
+        try:
+            with self.site.client(self.certificates) as client:
+                return client.get(f"/v1/logs/{'0' * 32}").status_code == 200
+        except httpx.TransportError:
+            return False
+
+    def _sign(self, number: int, text: bytes) -> None:
+        log = getattr(self, "log", None)
+        if log is not None:
+            log.signed(number, self.key.sign(text), self.public)
+
+    def record(self, count: int, **changes: Any) -> None:
+        """Record decisions, and seal them with a signed checkpoint."""
+        for number in range(count):
+            self.log.record(decision(self.log, number, **changes))
+            if number % 10 == 9:
+                settle(self.log)
+        asyncio.run(asyncio.wait_for(self.log.wait_signed(), 60))
+
+    def sealed(self) -> int:
+        """Return the last sequence that a signed checkpoint seals."""
+        return signed_checkpoints(self.log_file, 0, 1_000_000)[-1].sequence
+
+    def pusher(self) -> SegmentPusher:
+        """Return the appliance's client for this robot."""
+        tls = self.certificates
+        link = https_collector(("127.0.0.1", self.site.port), self.site.server.ca, tls.certificate, tls.key)
+        return SegmentPusher(self.log_file, self.folder / "state", link, self.site.receipt_key)
+
+    def push(self) -> SegmentPusher:
+        """Push all sealed segments; fail with the first trouble."""
+        pusher = self.pusher()
+        while pusher.step() == 0:
+            pass
+        assert not pusher.progress.trouble, pusher.progress.trouble
+        pusher.close()
+        return pusher
+
+    def close(self) -> None:
+        """Close the log."""
+        self.log.close()
+
+
+@contextmanager
+def running(site: FleetSite) -> Iterator[FleetSite]:
+    """Run a collector in a `with` block."""
+    try:
+        site.start()
+        yield site
+    finally:
+        site.kill()

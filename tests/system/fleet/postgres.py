@@ -1,0 +1,100 @@
+"""A private PostgreSQL 15 for tests: a cluster in a temporary folder, on a Unix socket only, as user postgres."""
+
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psycopg
+
+from tests.support.waiting import eventually
+
+_PROGRAMS = Path("/usr/lib/postgresql/15/bin")
+
+
+class PostgresCluster:
+    """A cluster of its own, which a test can stop, kill and start again."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        account = pwd.getpwnam("postgres")
+        self._as_postgres = {"user": account.pw_uid, "group": account.pw_gid, "extra_groups": []}
+        os.chown(folder, account.pw_uid, account.pw_gid)
+
+    @property
+    def data(self) -> Path:
+        """Return the data directory."""
+        return self.folder / "data"
+
+    def database(self, name: str) -> str:
+        """Return the connection string of a database."""
+        return f"host={self.folder} user=postgres dbname={name}"
+
+    def make(self) -> None:
+        """Create the cluster; quick, as its files need not survive a power cut."""
+        command = [
+            _PROGRAMS / "initdb",
+            "--auth=trust",
+            "--encoding=UTF8",
+            "--locale=C.UTF-8",
+            "--no-sync",
+            "-D",
+            self.data,
+        ]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd="/", **self._as_postgres)  # type: ignore[call-overload]  # user, group
+
+    def start(self, **settings: object) -> None:
+        """Start the server and wait until it accepts connections."""
+        options = {"listen_addresses": "", "unix_socket_directories": self.folder, "fsync": "off", **settings}
+        given = [part for name, value in options.items() for part in ("-c", f"{name}={value}")]
+        with (self.folder / "log").open("ab") as log:
+            self._process = subprocess.Popen(
+                [_PROGRAMS / "postgres", "-D", self.data, *given],
+                stdout=log, stderr=log, cwd="/", start_new_session=True, **self._as_postgres,  # type: ignore[call-overload]  # user, group
+            )  # fmt: skip
+        eventually(
+            self._answers,
+            lambda: f"PostgreSQL accepts connections: {(self.folder / 'log').read_text()[-2000:]}",
+        )
+
+    def _answers(self) -> bool:
+        try:
+            psycopg.connect(self.database("postgres")).close()
+        except psycopg.OperationalError:
+            return False
+        return True
+
+    def kill(self) -> None:
+        """Kill the server and all its processes, as a power cut would end them."""
+        if self._process is not None:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
+            self._process = None
+            (self.data / "postmaster.pid").unlink(missing_ok=True)
+
+    def create(self, name: str) -> str:
+        """Create a database and return its connection string."""
+        with psycopg.connect(self.database("postgres"), autocommit=True) as connection:
+            connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(name)))
+        return self.database(name)
+
+
+@contextmanager
+def postgres() -> Iterator[PostgresCluster]:
+    """Run a cluster; everything is removed at the end."""
+    # A short path: the name of a Unix socket has at most 107 bytes.
+    folder = Path(tempfile.mkdtemp(prefix="rosrv-pg-", dir="/tmp"))
+    cluster = PostgresCluster(folder)
+    try:
+        cluster.make()
+        cluster.start()
+        yield cluster
+    finally:
+        cluster.kill()
+        shutil.rmtree(folder)

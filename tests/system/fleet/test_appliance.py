@@ -1,0 +1,85 @@
+"""A real appliance pushes its log to a real collector."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.certificates import make_certificates
+from tests.support.rosmaster import master_at
+from tests.support.waiting import eventually
+from tests.system.fleet.fleet_site import FleetSite
+
+PUSHER = (61021, 61014)  # its user, in the group that may read the log
+
+
+def pushing(site: FleetSite, folder: Path) -> dict[str, Any]:
+    """Return the settings of an appliance that pushes to the collector; the files are readable by its user."""
+    assert site.data is not None
+    own = make_certificates(folder / "fleet", authority="authority of arm1")
+    shutil.copy(site.server.ca, folder / "fleet" / "collector-ca.pem")
+    shutil.copy(site.data / "receipts.pub", folder / "fleet" / "receipts.pub")
+    for file in (folder / "fleet").iterdir():
+        file.chmod(0o644)
+    (folder / "fleet").chmod(0o755)
+    return {
+        "collector": f"https://127.0.0.1:{site.port}", "ca": "fleet/collector-ca.pem", "certificate": "fleet/peer.pem",
+        "key": str(own.key), "receipt_key": "fleet/receipts.pub", "retention_waits": True,
+    }  # fmt: skip
+
+
+def collector_state(appliance: Appliance) -> dict[str, Any]:
+    """Return the state of the collector in `rosrv status`."""
+    return dict(json.loads(appliance.rosrv("status", "--json", check=False).stdout)["audit"]["collector"])
+
+
+def work(appliance: Appliance, count: int) -> None:
+    """Make calls of a node, each of which is a record."""
+    with master_at(appliance.master_uri) as master:
+        for number in range(count):
+            assert master.setParam("/worker", f"/value{number}", number)[0] == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="the appliance's processes have users of their own")
+def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
+    """After enrolment every record is collected and proven, also through kills of the process and the collector."""
+    appliance = Appliance()
+    (appliance.directory / "appliance.yaml").write_text(
+        json.dumps(
+            {
+                "audit": {"checkpoint_seconds": 1, "retention_days": 30},
+                "fleet": pushing(site, appliance.directory),
+            }
+        )
+    )
+    appliance.options = ("--config", str(appliance.directory / "appliance.yaml"))
+    with appliance:
+        work(appliance, 20)
+        eventually(
+            lambda: collector_state(appliance)["trouble"], "without enrolment the status reports the trouble"
+        )
+        eventually((appliance.state / "control" / "audit.pub").exists, "the log's key is pinned")
+        key = str(appliance.state / "control" / "audit.pub")
+        certificate = str(appliance.directory / "fleet" / "peer.pem")
+        site.run("robot", "add", "arm1", "--key", key, "--certificate", certificate)
+        eventually(lambda: not collector_state(appliance)["trouble"], "segments are pushed")
+        (pid,) = appliance.pids("fleet")
+        owner = Path(f"/proc/{pid}").stat()
+        assert (owner.st_uid, owner.st_gid) == PUSHER
+        os.kill(pid, 9)
+        site.kill()
+        work(appliance, 20)
+        site.start()
+        exported = map(json.loads, appliance.rosrv("audit", "export").stdout.splitlines())
+        last = max(
+            one["sequence"] for one in exported if one["event"] != "checkpoint"
+        )  # the next one seals that
+        eventually(lambda: collector_state(appliance)["sequence"] >= last, "every record is collected")
+        assert "rosrv_collector_up 1.0" in appliance.rest().get("/metrics").body.decode()
+    (proof,) = map(json.loads, site.run("verify", "--json").stdout.splitlines())
+    assert (proof["ok"], proof["missing"]) == (True, 0)
+    assert proof["last"] >= last

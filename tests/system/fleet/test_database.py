@@ -1,0 +1,37 @@
+"""The migrations of the collector's database."""
+
+from pathlib import Path
+
+import psycopg
+import pytest
+from rosrv_fleet.database import MIGRATIONS, Database, migrate
+
+
+def test_migrations_run_once_and_in_order(database: str) -> None:
+    """An empty database gets every migration; a second run applies none."""
+    with psycopg.connect(database) as connection:
+        assert migrate(connection) == sorted(file.stem for file in MIGRATIONS.glob("*.sql"))
+        assert migrate(connection) == []
+
+
+def test_a_failed_migration_changes_nothing(database: str, tmp_path: Path) -> None:
+    """If one migration fails, those before it in the same run are rolled back too."""
+    (tmp_path / "0001_a.sql").write_text("CREATE TABLE a (x int)")
+    (tmp_path / "0002_b.sql").write_text("CREATE TABLE a (x int)")
+    with psycopg.connect(database) as connection:
+        with pytest.raises(psycopg.errors.DuplicateTable):
+            migrate(connection, tmp_path)
+        assert connection.execute("SELECT to_regclass('a')").fetchone() == (None,)
+
+
+def test_a_reading_transaction_is_limited_and_cannot_write(database: str) -> None:
+    """A search that takes too long is cancelled, and its transaction writes nothing."""
+    index = Database(database, connections=1, statement_seconds=0.2)
+    index.open()
+    try:
+        with pytest.raises(psycopg.errors.QueryCanceled), index.reading() as connection:
+            connection.execute("SELECT pg_sleep(60)")
+        with pytest.raises(psycopg.errors.ReadOnlySqlTransaction), index.reading() as connection:
+            connection.execute("CREATE TABLE t (x int)")
+    finally:
+        index.close()
