@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.channel.answers.field_docs import doc
-from appliance.channel.answers.status import BlocksState, ProcessInfo, Status
+from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
 from appliance.channel.standby_summary import PATIENCE_SECONDS, standby_troubles
 from appliance.channel.status_summary import no_relay, probe_failed
 
@@ -35,6 +35,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     if status.standby is not None:
         troubles = standby_troubles(status.standby, PATIENCE_SECONDS)
         found += [(one.severity, one.kind, "system", one.text) for one in troubles]
+    found += _bundles(status.bundles)
     alarms = (
         Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
     )
@@ -138,6 +139,23 @@ def _blocks(blocks: BlocksState) -> Iterator[_Condition]:
         which = "the first block ends" if blocks.hosts > 1 else "the block ends"
         end = "without an end" if blocks.first_end is None else f"{which} at {_moment(blocks.first_end)}"
         yield "warning", "hosts-blocked", "hosts", f"{count}, {end}: rosrv host blocks"
+
+
+def _bundles(bundles: BundlesState | None) -> Iterator[_Condition]:
+    if bundles is None:
+        return
+    if bundles.refused:
+        stays = f"{bundles.in_force} stays" if bundles.in_force else "no bundle is"
+        text = f"{bundles.refused} is refused, {stays} in force: {bundles.reason.splitlines()[0]}"
+        yield "warning", "bundle-refused", "system", text
+    if bundles.rejected:
+        text = f"the collector {bundles.collector} serves bundles that are not accepted: {bundles.trouble}"
+        yield "alarm", "bundles-rejected", "system", text
+    elif bundles.trouble:
+        yield "warning", "bundles-not-polled", "system", f"no new bundles: {bundles.trouble}"
+    if bundles.changed:
+        text = f"{bundles.in_force} is in force, but was changed on this robot since"
+        yield "notice", "bundle-changed", "system", text
 
 
 def _failing(process: ProcessInfo) -> str:

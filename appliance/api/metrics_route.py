@@ -23,7 +23,7 @@ from appliance.channel.admin import MetricsWanted, StandbyWanted
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.standby_answers import StandbyState
-from appliance.channel.answers.status import ForwardingState, ProcessInfo
+from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo
 from appliance.channel.standby_summary import both_active
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
 from appliance.telemetry.metrics import METRICS, Metric
@@ -162,6 +162,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_audit_degraded": [((), audit.degraded is not None)],
         **_forwarding("syslog", audit.forwarding),
         **_forwarding("collector", audit.collector),
+        **_bundles(status.bundles),
         "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
         "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
         "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
@@ -205,6 +206,21 @@ def _standby(state: StandbyState | None) -> dict[str, _Samples]:
         "rosrv_standby_both_active": [((), both_active(state))] if active else [],
         # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
         "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],
+    }
+
+
+def _bundles(bundles: BundlesState | None) -> dict[str, _Samples]:
+    if bundles is None:
+        names = ("version", "refused", "changed", "checked_seconds", "rejected")
+        return {f"rosrv_bundle_{name}": [] for name in names}
+    number = bundles.in_force.rpartition("/")[2].removesuffix(".tar")
+    checked = -1.0 if bundles.checked is None else time.time() - bundles.checked
+    return {
+        "rosrv_bundle_version": [((), int(number or 0))],
+        "rosrv_bundle_refused": [((), bool(bundles.refused))],
+        "rosrv_bundle_changed": [((), bundles.changed)],
+        "rosrv_bundle_checked_seconds": [((), checked)],
+        "rosrv_bundle_rejected": [((), bundles.rejected)],
     }
 
 

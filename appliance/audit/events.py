@@ -126,6 +126,11 @@ EVENTS: dict[str, str] = {
     "records lost": "The queue was full while the log could not be written; `detail` has the number of lost records.",
     "checkpoint": "The state of the chain up to the preceding record was sealed for signing.",
     "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
+    "bundle in force": "A bundle of the fleet passed its trial and is in force; `detail.bundle` names it.",
+    "bundle refused": "A bundle of the fleet was refused, or rolled back after its trial; `detail.findings` has the"
+    " reasons. The last good one stays in force.",
+    "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
+    " older than known, or for other robots.",
     "forwarding failed": "The receiver of the forwarded log was unreachable for ten seconds; records wait in the"
     " appliance.",
     "forwarding resumed": "The receiver of the forwarded log is reachable again.",
@@ -147,7 +152,7 @@ SEVERITIES: dict[str, Severity] = {
     for severity, names in {
         Severity.NOTICE: (
             "host block ended", "host unblocked",
-            "appliance started", "appliance stopped", "clock not synchronised", "clock synchronised",
+            "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
             "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
@@ -155,6 +160,7 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",
         ),
         Severity.WARNING: (
+            "bundle metadata rejected", "bundle refused",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "forwarding failed", "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
             "policy refused", "recording missed", "renewal refused", "specifications refused", "switchover failed",

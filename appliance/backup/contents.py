@@ -16,7 +16,8 @@ _DATABASES = "control/"  # the only part with databases
 # Files that exist only while the appliance runs, or that the next start makes again. `.ahead` files are also left out:
 # the copied database does not have their changes yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
-_LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, recorded messages
+# Logs of ROS, recorded messages, and what the robot knows of the fleet's signatures: older knowledge would weaken it.
+_LEFT_OUT = {"rosmaster", "rosout", "recordings", "bundles"}
 KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
 """The folders of a state directory that are backed up."""
 

@@ -19,6 +19,7 @@ from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
+    BundlesState,
     ClockState,
     FirewallState,
     IpsecState,
@@ -189,6 +190,8 @@ def _grid(body: Status) -> Table:
     if audit.collector is not None:
         forwarded += f", {audit.collector.behind} to be collected by {audit.collector.to}"
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
+    if body.bundles is not None:
+        grid.add_row("bundle", _bundle(body.bundles))
     if body.recorder is not None:
         kept = body.recorder
         grid.add_row("recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB")
@@ -199,6 +202,19 @@ def _standby(state: StandbyState) -> Text:
     other, witness = lag_in_words(state.other), answer_in_words(state.witness)
     line = f"{state.name} is {state.role}; {state.other.name}: {other}; witness: {witness}"
     return Text(line, style=_YELLOW if any(standby_troubles(state)) else "")
+
+
+def _bundle(bundles: BundlesState) -> Text:
+    line = Text(f"{bundles.in_force or 'none'}{' in force' if bundles.in_force else ''}")
+    if bundles.changed:
+        line.append("; changed on this robot since", style=_YELLOW)
+    if bundles.trying:
+        line.append(f"; {bundles.trying} waits for its confirmation")
+    if bundles.refused:
+        line.append(f"; {bundles.refused} REFUSED", style=_YELLOW)
+    checked = "not verified yet" if bundles.checked is None else f"verified {age(bundles.checked)} ago"
+    line.append(f"; the collector's metadata {'were ' if bundles.checked else ''}{checked}")
+    return line
 
 
 def _policy(policy: PolicyState) -> Text:

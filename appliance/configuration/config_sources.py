@@ -41,6 +41,7 @@ _PATH_KEYS = (
     ("ipsec", "ca_passphrase_file"),
     ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
     ("fleet", "ca"), ("fleet", "certificate"), ("fleet", "key"), ("fleet", "receipt_key"),
+    ("fleet", "bundles", "root"),
 )  # fmt: skip
 KeyPath = tuple[str | int, ...]
 _SHORT_NAMES: dict[str, KeyPath] = {

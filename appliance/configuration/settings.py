@@ -26,6 +26,7 @@ from pydantic import (
 from appliance.signing.site_keys import checked_key
 
 _NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}){1,5}")
+_FLEET_WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 
 T = TypeVar("T")
@@ -266,47 +267,6 @@ class Syslog:
 
 
 @_section
-class FleetSection:
-    """The collector of many appliances, to which sealed segments of the audit log are pushed; off by default."""
-
-    collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
-        default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
-    )
-    ca: Path | None = key(default=None, description="authority of the collector's certificate (PEM)")
-    certificate: Path | None = key(
-        default=None, description="client certificate, enrolled at the collector (PEM)"
-    )
-    receipt_key: Path | None = key(
-        default=None,
-        description="public key of the collector's receipts (PEM); `rosrv-fleet init` prints its file",
-    )
-    retention_waits: bool = key(
-        default=False,
-        description="records that are older than `audit.retention_days` stay until the collector has them;"
-        " `audit.retention_bytes` and a full disk remove them nevertheless",
-    )
-    key: Path | None = key(default=None, description="key of `certificate`; readable by user rosrv-fleet")
-
-    def __post_init__(self) -> None:
-        files = {
-            "ca": self.ca,
-            "certificate": self.certificate,
-            "key": self.key,
-            "receipt_key": self.receipt_key,
-        }
-        missing = [name for name, value in files.items() if value is None]
-        if self.collector is not None and missing:
-            raise ValueError(f"{', '.join(missing)} must be given with collector")
-        if self.collector is None and (len(missing) < len(files) or self.retention_waits):
-            raise ValueError("the section has no effect without collector")
-
-    @property
-    def destination(self) -> tuple[str, int]:
-        """`collector` as address and port; only where it is given."""
-        return split_collector(self.collector or "")
-
-
-@_section
 class Audit:
     """The audit log."""
 
@@ -463,6 +423,97 @@ class Ipsec:
     )
 
 
+def _checked_fleet_word(text: str) -> str:
+    if text and not _FLEET_WORD.fullmatch(text):
+        raise ValueError(
+            f"{text!r} is not a name of lower-case letters, digits and -, for example arm-robots"
+        )
+    return text
+
+
+@_section
+class Bundles:
+    """Policy, specifications and hosts from the fleet's signed bundles; off unless `root` is given."""
+
+    root: Path | None = key(
+        default=None, description="the trusted root metadata (root.json) that the fleet's operator gives out"
+    )
+    site: Annotated[str, AfterValidator(_checked_fleet_word)] = key(
+        default="", description="the site that this robot belongs to"
+    )
+    group: Annotated[str, AfterValidator(_checked_fleet_word)] = key(
+        default="", description="the robot group: the robots that get the same bundles"
+    )
+    interval: Annotated[float, Field(ge=1, le=86_400, allow_inf_nan=False)] = key(
+        default=300.0,
+        description="seconds between two polls; an event of the collector makes the next one earlier",
+    )
+    confirm_seconds: Annotated[float, Field(ge=1, le=3600, allow_inf_nan=False)] = key(
+        default=30.0,
+        description="for which a new bundle must stay healthy; otherwise it is rolled back automatically",
+    )
+
+    def __post_init__(self) -> None:
+        if self.root is not None and not (self.site and self.group):
+            raise ValueError("root needs site and group: the bundles are signed for one group of one site")
+
+
+@_section
+class Fleet:
+    """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default."""
+
+    collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
+        default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
+    )
+    name: str | None = key(
+        default=None, description="name in the collector's certificate; default: its address"
+    )
+    ca: Path | None = key(default=None, description="authority of the collector's certificate (PEM)")
+    certificate: Path | None = key(
+        default=None, description="client certificate, enrolled at the collector (PEM)"
+    )
+    receipt_key: Path | None = key(
+        default=None,
+        description="public key of the collector's receipts (PEM); `rosrv-fleet init` prints its file."
+        " With it, sealed segments are pushed",
+    )
+    retention_waits: bool = key(
+        default=False,
+        description="records that are older than `audit.retention_days` stay until the collector has them;"
+        " `audit.retention_bytes` and a full disk remove them nevertheless",
+    )
+    robot: str = key(
+        default="",
+        pattern=r"^([a-z0-9][a-z0-9._-]{0,62})?$",
+        description="this robot's name at the collector (`rosrv-fleet robot add`); bundles need it",
+    )
+    key: Path | None = key(
+        default=None, description="key of `certificate`; readable by users rosrv-fleet and rosrv-bundles"
+    )
+    bundles: Bundles = Bundles()
+
+    def __post_init__(self) -> None:
+        if self.collector is None:
+            if any(getattr(self, field.name) != field.default for field in dataclasses.fields(self)):
+                raise ValueError("the section has no effect without collector")
+            return
+        needed: dict[str, Path | str | None] = {"ca": self.ca, "certificate": self.certificate, "key": self.key}
+        if self.bundles.root is not None:
+            needed |= {"robot": self.robot}
+        missing = [name for name, value in needed.items() if not value]
+        if missing:
+            raise ValueError(f"{', '.join(missing)} must be given with collector")
+        if self.receipt_key is None and self.bundles.root is None:
+            raise ValueError("collector needs receipt_key, to push segments, or bundles.root, to take bundles")
+        if self.receipt_key is None and self.retention_waits:
+            raise ValueError("retention_waits has no effect without receipt_key")
+
+    @property
+    def destination(self) -> tuple[str, int]:
+        """`collector` as address and port; only where it is given."""
+        return split_collector(self.collector or "")
+
+
 @_section
 class Availability:
     """Two appliances, of which one takes over from the other; `rosrv standby join` makes them a pair."""
@@ -616,7 +667,6 @@ class Settings:
     advertise: list[Advertisement] = key(default=[])
     limits: LimitsSection = LimitsSection()
     audit: Audit = Audit()
-    fleet: FleetSection = FleetSection()
     liveness: LivenessSection = LivenessSection()
     relay: Relay = Relay()
     recorder: RecorderRules = RecorderRules()
@@ -624,6 +674,7 @@ class Settings:
     ipsec: Ipsec = Ipsec()
     availability: Availability = Availability()
     api_limits: ApiLimits = ApiLimits()
+    fleet: Fleet = Fleet()
 
     def __post_init__(self) -> None:
         to, collector = self.audit.syslog.to, self.fleet.collector

@@ -23,7 +23,7 @@ from appliance.control.robot import robot_addresses
 from appliance.control.signer_requests import SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.hosts.host_table import HostTable
-from appliance.hosts.hosts_file import DeclaredHosts
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enforcement
@@ -131,7 +131,8 @@ async def make_foundation(
     blocks = BlockTable.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
-    table = HostTable(store, settings.ipsec.pool, DeclaredHosts(settings.hosts))
+    declared = DeclaredHosts(settings.hosts, store.settings().get(BUNDLED_HOSTS, ""))
+    table = HostTable(store, settings.ipsec.pool, declared)
     host_authority = make_host_authority(
         settings, signing.link, store, table, pair=pair, replication=replication
     )

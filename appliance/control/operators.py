@@ -7,6 +7,8 @@ from appliance.channel.answers.status import AuditState
 from appliance.control.administration import Administration
 from appliance.control.assembly import Parts
 from appliance.control.block_orders import BlockOrders
+from appliance.control.bundle_gate import BundleGate
+from appliance.control.bundle_health import RobotHealth
 from appliance.control.clock_check import ClockCheck
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder_link import ForwarderLink
@@ -36,6 +38,7 @@ class Operators:
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
     standby: StandbyOrders
+    bundles: BundleGate
     administration: Administration
     rest: RestLink
 
@@ -66,7 +69,8 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     syslog = settings.audit.syslog
     forwarded = ForwarderLink(syslog.to, syslog.send, trail)
-    collected = ForwarderLink(settings.fleet.collector, "all", trail, base.receipts.received)
+    pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
+    collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
         parts.monitors, base.policies, base.store, trail, settings.forgotten_after
     )
@@ -82,6 +86,15 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
         carried_out=ends.relay.carried_out,
     )
+    bundles = BundleGate(
+        settings.fleet,
+        policies=base.policies,
+        monitors=parts.monitors,
+        hosts=hosts,
+        store=base.store,
+        trail=trail,
+        health=lambda: RobotHealth.of(trail.meter, parts.monitors, base.lifeline.surroundings.processes),
+    )
     looks = Queries(
         parts,
         trail,
@@ -96,6 +109,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         switched_off=switched_off.rows,
         blocks=blocks.status,
         standby=standby.state,
+        bundles=bundles.status,
     )
     orders = StandbyOrders(standby, trail)
     administration = Administration(
@@ -134,6 +148,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         switched_off=switched_off,
         blocks=blocks,
         standby=orders,
+        bundles=bundles,
         administration=administration,
         rest=rest(),
     )

@@ -13,6 +13,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import structlog
@@ -56,6 +57,13 @@ def _error_text(error: OSError | UnicodeDecodeError) -> str:
         if isinstance(error, OSError)
         else f"it is not UTF-8 text: {error.reason}"
     )
+
+
+class PolicyCases(NamedTuple):
+    """Test cases that come with a policy: the name of their file, and their text (None: no cases)."""
+
+    file: str
+    text: str | None
 
 
 class RevisionChangedError(Exception):
@@ -160,18 +168,24 @@ class Policies(Revisions[RevisionRow]):
             policy, signature = await self._prepared(self._read, str(self.file), who)
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
-    async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
+    async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
+        """Compile and test a text without loading it. Raises `PolicyRefusedError`."""
+        await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
+
+    async def load(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None = None) -> Loaded:
         """Bring a given text into force, as `reload` does with the file.
 
-        Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
-        lines of the file may differ. Raises `PolicyRefusedError` and `RevisionChangedError`.
+        `cases` replace the test cases beside the file. Loading the same text again makes no new revision. Messages cite
+        its rules as `revision N:line`, because the lines of the file may differ. Raises `PolicyRefusedError` and
+        `RevisionChangedError`.
         """
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
             now = self.in_force
             if now.who != DISK and (now.text, now.signature) == given:
                 return self._loaded(self.revision, 0)
-            policy, signature = await self._prepared(lambda: given, f"revision {self.revision + 1}", who)
+            name = f"revision {self.revision + 1}"
+            policy, signature = await self._prepared(lambda: given, name, who, cases)
             return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
@@ -262,13 +276,15 @@ class Policies(Revisions[RevisionRow]):
 
     # --- inside ---
 
-    async def _prepared(self, read: Callable[[], tuple[str, str]], file: str, who: str) -> tuple[Policy, str]:
+    async def _prepared(
+        self, read: Callable[[], tuple[str, str]], file: str, who: str, cases: PolicyCases | None = None
+    ) -> tuple[Policy, str]:
         """Read, compile and test a policy in a thread, without delay for nodes. Return it with its signature."""
         before = self.revision
         try:
             while True:
                 known = self.known
-                policy, signature = await asyncio.to_thread(self._tested, read, file, known)
+                policy, signature = await asyncio.to_thread(self._tested, read, file, known, cases)
                 if self._hosts() == known.hosts:
                     break
         except PolicyRefusedError as error:
@@ -296,10 +312,19 @@ class Policies(Revisions[RevisionRow]):
             ) from error
 
     def _tested(
-        self, read: Callable[[], tuple[str, str]], file: str, known: PolicyContext
+        self,
+        read: Callable[[], tuple[str, str]],
+        file: str,
+        known: PolicyContext,
+        cases: PolicyCases | None = None,
     ) -> tuple[Policy, str]:
         text, signature = read()
-        return self._judged(text, signature, file, self.with_cases(known)), signature
+        tested = (
+            self.with_cases(known)
+            if cases is None
+            else replace(known, cases_file=cases.file, cases=cases.text)
+        )
+        return self._judged(text, signature, file, tested), signature
 
     def _judged(self, text: str, signature: str, file: str, known: PolicyContext) -> Policy:
         try:

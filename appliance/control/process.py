@@ -161,6 +161,7 @@ class _Control:
             operators.clock.watch(),
             operators.switched_off.watch(),
             operators.blocks.watch(),
+            operators.bundles.run(),
             self._save_parameters(),
             base.tunnels.run(operators.certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),

@@ -23,6 +23,7 @@ from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     AuditState,
     BlocksState,
+    BundlesState,
     ClockState,
     MinuteState,
     PolicyState,
@@ -59,7 +60,8 @@ class Queries:
 
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
     recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
-    that is switched off. `blocks()` returns the state of the blocks of hosts. `standby()` returns the state of the two
+    that is switched off. `blocks()` and `bundles()` return the states of the blocks and the
+    bundles. `standby()` returns the state of the two
     appliances, or None if this one is not one of two.
     """
 
@@ -76,6 +78,7 @@ class Queries:
     switched_off: Callable[[], list[SwitchedOff]]
     blocks: Callable[[], BlocksState]
     standby: Callable[[], StandbyState | None]
+    bundles: Callable[[], BundlesState | None]
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
@@ -202,6 +205,7 @@ class Queries:
             blocks=self.blocks(),
             last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
             standby=self.standby(),
+            bundles=self.bundles(),
         )
 
     def _policy(self) -> PolicyState:

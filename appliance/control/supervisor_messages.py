@@ -87,6 +87,8 @@ class SupervisorMessages:
                 self._operators.forwarded.link.attach(Channel(sock, messages.ForwardingLink))
             case "fleet":
                 self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
+            case "bundles":
+                self._operators.bundles.link.attach(Channel(sock, messages.BundleLink, longest=16 << 20))
             case "recorder":
                 self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:

@@ -13,6 +13,7 @@ import hashlib
 import ipaddress
 import ssl
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
@@ -25,7 +26,7 @@ from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment_tokens import LONGEST_SECONDS, MOST
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
-from appliance.hosts.hosts_file import DeclaredHostsError
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DeclaredHostsError
 from appliance.hosts.rest_address import NO_TUNNELS
 from appliance.hosts.self_service import HostSelfService
 from appliance.hosts.view import HostView
@@ -223,11 +224,25 @@ class HostEnrolment:
     async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
         """Read hosts.yaml again and open or close tunnels. Raises as `add`; an invalid file changes nothing."""
         self._table.require(request.expected)
+        return await self._declare(self._table.declared.reload, who)
+
+    async def take_bundle(self, text: str, who: str) -> answers.Reloaded:
+        """Use a bundle's text instead of hosts.yaml (empty: the file again). Raises as `reload`."""
+        declared = self._table.declared
+        return await self._declare(partial(declared.take, text) if text else declared.reload, who)
+
+    @property
+    def bundled(self) -> str:
+        """Return the bundle's text that is in use instead of hosts.yaml; empty if there is none."""
+        return self._table.declared.bundled
+
+    async def _declare(self, read: Callable[[], None], who: str) -> answers.Reloaded:
         before = {row.name for row in self._table.admitted()}
         try:
-            self._table.declared.reload()
+            read()
         except DeclaredHostsError as error:
             raise HostRefusedError(f"{error}; the previous declaration stays in force") from error
+        self._store.save_setting(BUNDLED_HOSTS, self._table.declared.bundled)
         after = {row.name for row in self._table.admitted()}
         self._table.changed()
         taken = 0
@@ -244,7 +259,7 @@ class HostEnrolment:
         divergence = [f"{row.name}: {row.divergence}" for row in self._view.rows() if row.divergence]
         self._trail.happened(
             "hosts reloaded",
-            f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
+            f"{self._table.declared.source}: {len(self._table.declared.hosts)} hosts are declared",
             opened=sorted(after - before),
             closed=sorted(before - after),
             taken_back=taken,

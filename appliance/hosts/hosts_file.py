@@ -1,5 +1,7 @@
 """Read `ipsec/hosts.yaml`, which declares the hosts to enrol, at start and on reload. The file is never written.
 
+A bundle of the fleet has a text of its own, which replaces the file until the next reload.
+
 hosts:
   - name: ocu-1
     address: 10.113.11.20   # optional: reserved for it
@@ -21,6 +23,10 @@ import yaml
 from appliance.base.input_files import read_given_text
 from appliance.base.validation_messages import meant, not_yaml
 from appliance.policy.policy_findings import quoted
+
+IN_BUNDLE = "hosts.yaml of the bundle"
+BUNDLED_HOSTS = "bundled hosts"
+"""The setting of the store that keeps the text of a bundle."""
 
 _LARGEST = 1 << 20
 _MOST_GROUPS = 32
@@ -44,14 +50,18 @@ class DeclaredHost:
 
 
 class DeclaredHosts:
-    """The file's last valid content; `error` is the reason if the file is invalid now."""
+    """The file's last valid content, or that of a bundle; `error` is the reason if the text is invalid now.
 
-    def __init__(self, path: Path) -> None:
+    `bundled` is the text of a bundle; empty: the file is in use.
+    """
+
+    def __init__(self, path: Path, bundled: str = "") -> None:
         self.path = path
+        self.bundled = bundled
         self.hosts: dict[str, DeclaredHost] = {}
         self.error = ""
         try:
-            self.hosts = read_declared(path)
+            self.hosts = parse_declared(bundled, IN_BUNDLE) if bundled else read_declared(path)
         except DeclaredHostsError as error:
             self.error = str(error)
 
@@ -67,7 +77,17 @@ class DeclaredHosts:
         except DeclaredHostsError as error:
             self.error = str(error)
             raise
-        self.error = ""
+        self.error = self.bundled = ""
+
+    def take(self, text: str) -> None:
+        """Use the text of a bundle instead of the file. Raises `DeclaredHostsError`; then nothing changes."""
+        self.hosts = parse_declared(text, IN_BUNDLE)
+        self.error, self.bundled = "", text or "\n"
+
+    @property
+    def source(self) -> str:
+        """Return the name of the text in use, for messages."""
+        return IN_BUNDLE if self.bundled else str(self.path)
 
     def wants(self, name: str) -> bool:
         """Whether a host's tunnel may be open."""
@@ -84,6 +104,11 @@ def read_declared(path: Path) -> dict[str, DeclaredHost]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise DeclaredHostsError(f"{path}: cannot be read: {reason}") from error
+    return parse_declared(text, str(path))
+
+
+def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:
+    """Return the hosts that a text declares, by name; `path` is its name in errors. Raises `DeclaredHostsError`."""
     if len(text) > _LARGEST:
         raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
     reading = _Reading()

@@ -299,6 +299,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
             )
 
+    async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
+        """Bring exactly these sources into force. Raises `SpecificationsRefusedError`; then nothing has changed."""
+        async with self._changing(None):
+            if self.in_force.who != DISK and sources == self.sources:
+                return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
+            return await self._change(sources, who, who, note)
+
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, given by their names or the names of their monitors.
 

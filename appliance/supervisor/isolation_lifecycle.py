@@ -331,7 +331,10 @@ class ContainerIsolation(NoIsolation):
         """Return the users that may reach the fleet's collector, and nothing else."""
         if self._ports.collector is None:
             return ()
-        return (ForwarderAccess(account_of("rosrv-fleet").uid, *self._ports.collector, name="segments"),)
+        return tuple(
+            ForwarderAccess(account_of(user).uid, *self._ports.collector, name=name)
+            for user, name in (("rosrv-fleet", "segments"), ("rosrv-bundles", "bundles"))
+        )
 
     def _forwarder(self) -> ForwarderAccess | None:
         if self._ports.syslog is None:

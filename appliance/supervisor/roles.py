@@ -161,7 +161,9 @@ ROLES = (
     _ours(
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
-        links=("relay", "signer", "compiler", "api", "charon", "syslog", "fleet", "recorder", "lease"),
+        links=(
+            "relay", "signer", "compiler", "api", "charon", "syslog", "fleet", "recorder", "lease", "bundles",
+        ),
         readable_by="rosrv-api",
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, families=ROUTES, reads=(*folders_of(*facts.control_reads), str(DPKG)), binds=None,
@@ -225,6 +227,16 @@ ROLES = (
         ),
     ),
     _ours(
+        "bundles", "rosrv-bundles", "bundles", "appliance.bundles.process:main",
+        ended_early=600, after="control", dispensable=True,
+        sandbox=lambda facts: SandboxPlan(
+            allowlist=True,
+            families=ROUTES,
+            reads=folders_of(*facts.fleet_reads),
+            connects=None if facts.collector_port is None else (facts.collector_port,),
+        ),
+    ),
+    _ours(
         "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
         ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
         network=False,
@@ -241,10 +253,13 @@ def roles_of(
     fleet: bool = False,
     recorder: bool = False,
     lease: bool = False,
+    bundles: bool = False,
 ) -> tuple[Role, ...]:
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
-    wanted = {"api": api, "syslog": syslog, "fleet": fleet, "recorder": recorder, "lease": lease}
+    wanted = {
+        "api": api, "syslog": syslog, "fleet": fleet, "recorder": recorder, "lease": lease, "bundles": bundles,
+    }  # fmt: skip
     return tuple(role for role in ROLES if wanted.get(role.name, True))
 
 

@@ -154,7 +154,8 @@ def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
 
 def _files_of_fleet(settings: Settings) -> tuple[Path, ...]:
     fleet = settings.fleet
-    return tuple(filter(None, (fleet.ca, fleet.certificate, fleet.key, fleet.receipt_key)))
+    files = (fleet.ca, fleet.certificate, fleet.key, fleet.receipt_key, fleet.bundles.root)
+    return tuple(filter(None, files))
 
 
 def _port_of_syslog(settings: Settings) -> int | None:

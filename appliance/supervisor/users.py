@@ -21,6 +21,7 @@ NUMERIC_IDS = {
     "rosrv-recorder": 61019,
     "rosrv-compiler": 61020,
     "rosrv-lease": 61021,
+    "rosrv-bundles": 61022,
     "rosrv-fleet": 61023,
 }
 

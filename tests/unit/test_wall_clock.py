@@ -8,6 +8,7 @@ from tests.support.sources import ROOT, product_files
 READERS = {
     "a moment that people are shown, or that stands in a file": [
         "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
+        "bundles/poller.py", "control/bundle_gate.py",
         "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
         "control/policies.py", "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
@@ -19,6 +20,7 @@ READERS = {
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "bundles/verified_bundles.py",
         "control/passive_rest.py", "control/token_orders.py", "hosts/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",

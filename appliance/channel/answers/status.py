@@ -184,6 +184,24 @@ class BlocksState(msgspec.Struct, frozen=True):
     first_end: Annotated[Moment | None, doc("when the first block ends; null: none ends without an order")]
 
 
+class BundlesState(msgspec.Struct, frozen=True):
+    """The bundle of the fleet in force (SITE/GROUP/VERSION.tar; empty: none), and what became of later ones."""
+
+    collector: Annotated[str, doc("URL of the collector")]
+    in_force: Annotated[str, doc("the bundle in force; empty: none")]
+    sha256: Annotated[str, doc("SHA-256 of its archive")]
+    since: Annotated[Moment | None, doc("when its trial ended; null: none is in force")]
+    trying: Annotated[str, doc("the bundle in its commit-confirm period; empty: none")]
+    refused: Annotated[
+        str, doc("the last bundle that this robot refused; empty: none since the one in force")
+    ]
+    reason: Annotated[str, doc("why it was refused")]
+    changed: Annotated[bool, doc("an operator has changed a part of the bundle on this robot")]
+    checked: Annotated[Moment | None, doc("when the collector's metadata were last verified; null: not yet")]
+    trouble: Annotated[str, doc("why no bundles are taken now; empty: they are")]
+    rejected: Annotated[bool, doc("the collector serves metadata that are not accepted")]
+
+
 class MinuteState(msgspec.Struct, frozen=True):
     """The last minute's denials and drops. From `attention_at` denials on, an operator should look at them."""
 
@@ -223,3 +241,4 @@ class Status(msgspec.Struct, frozen=True):
     blocks: BlocksState = BlocksState(0, None)
     last_minute: MinuteState = MinuteState(0, {})
     standby: Annotated[StandbyState | None, doc("null: this appliance is not one of two")] = None
+    bundles: Annotated[BundlesState | None, doc("null: no bundles of a fleet are configured")] = None

@@ -1,0 +1,132 @@
+"""Pack and unpack bundles: a policy with its test cases, specifications and `hosts.yaml` in one archive. No I/O.
+
+An archive is an uncompressed tar file (ustar) with these files, sorted by name:
+
+policy.ini                          the access policy
+policy.ini.sig                      optional: the site's signature
+policy.ini.tests.yaml               optional: the policy's test cases
+hosts.yaml                          the hosts to enrol
+monitors/NAME.rv                    any number of specifications
+monitors/msg/PACKAGE/NAME.msg|.srv  any number of message definitions
+monitors/….sig                      optional: the site's signature of each
+
+Invariants:
+1. Equal contents have equal archives: owners, times and modes are constant. An archive is accepted only if packing its
+   contents gives the same bytes, so links, devices, trailing data and unusual headers are rejected.
+2. An archive has at most `LONGEST` bytes and `_MOST_FILES` files. Nothing is expanded.
+"""
+
+import io
+import re
+import tarfile
+from collections.abc import Mapping
+
+from appliance.channel.messages import BundleContents
+
+LONGEST = 6 << 20
+"""The most bytes of an archive."""
+
+_MOST_FILES = 2500
+_LONGEST_HOSTS = 1 << 20
+POLICY, CASES, HOSTS = "policy.ini", "policy.ini.tests.yaml", "hosts.yaml"
+_WORD = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
+_SPECIFICATION = re.compile(rf"monitors/({_WORD}\.rv)")
+_DEFINITION = re.compile(rf"monitors/msg/({_WORD}/{_WORD}\.(?:msg|srv))")
+_SIGNATURE = ".sig"
+
+
+class BundleArchiveError(Exception):
+    """An archive or its contents are invalid; the text has the reason and what to do."""
+
+
+def is_bundle_file(name: str) -> bool:
+    """Whether a file of this name, relative to the bundle's folder, belongs to a bundle."""
+    whole = name.removesuffix(_SIGNATURE)
+    if whole in (POLICY, CASES, HOSTS):
+        return whole in (name, POLICY)
+    return bool(_SPECIFICATION.fullmatch(whole) or _DEFINITION.fullmatch(whole))
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """Return the archive of these files by name. Raises `BundleArchiveError` if they are not a valid bundle."""
+    contents_of(files)
+    return _packed(files)
+
+
+def unpack(archive: bytes) -> BundleContents:
+    """Return the contents of an archive. Raises `BundleArchiveError`."""
+    if len(archive) > LONGEST:
+        raise BundleArchiveError(f"the archive has {len(archive)} bytes; the limit is {LONGEST}")
+    files: dict[str, bytes] = {}
+    try:
+        with tarfile.open(fileobj=io.BytesIO(archive), mode="r:", errorlevel=2) as tar:
+            for member in tar:
+                if not member.isreg() or not is_bundle_file(member.name) or member.name in files:
+                    raise BundleArchiveError(f"{member.name[:200]!r} is not a file of a bundle")
+                if len(files) >= _MOST_FILES:
+                    raise BundleArchiveError(f"the archive has more than {_MOST_FILES} files")
+                opened = tar.extractfile(member)
+                files[member.name] = opened.read() if opened is not None else b""
+    except (tarfile.TarError, OSError, ValueError, OverflowError) as error:
+        raise BundleArchiveError(f"the archive is not a valid tar file: {error}") from error
+    contents = contents_of(files)
+    if _packed(files) != archive:
+        raise BundleArchiveError("the archive was not made by rosrv-fleet bundle add: make it again")
+    return contents
+
+
+def contents_of(files: Mapping[str, bytes]) -> BundleContents:
+    """Return the contents in these files by name. Raises `BundleArchiveError`."""
+    unknown = [name for name in files if not is_bundle_file(name)]
+    if unknown:
+        raise BundleArchiveError(f"{unknown[0][:200]!r} is not a file of a bundle: remove it")
+    if len(files) > _MOST_FILES:
+        raise BundleArchiveError(f"a bundle has at most {_MOST_FILES} files, not {len(files)}")
+    for name in (POLICY, HOSTS):
+        if name not in files:
+            raise BundleArchiveError(f"{name} is missing: a bundle states the policy and the hosts")
+    alone = [
+        name for name in files if name.endswith(_SIGNATURE) and name.removesuffix(_SIGNATURE) not in files
+    ]
+    if alone:
+        raise BundleArchiveError(f"{alone[0]} is the signature of a file that the bundle does not have")
+    texts = {name: _text(name, data) for name, data in files.items()}
+    if len(texts[HOSTS]) > _LONGEST_HOSTS:
+        raise BundleArchiveError(f"{HOSTS} is longer than {_LONGEST_HOSTS} characters")
+    named = {name: found[1] for name in texts if (found := _SPECIFICATION.fullmatch(name))}
+    defined = {name: found[1] for name in texts if (found := _DEFINITION.fullmatch(name))}
+    return BundleContents(
+        policy=texts[POLICY],
+        hosts=texts[HOSTS],
+        policy_signature=texts.get(POLICY + _SIGNATURE, ""),
+        cases=texts.get(CASES),
+        files={short: texts[name] for name, short in named.items()},
+        definitions={short: texts[name] for name, short in defined.items()},
+        signatures={
+            short: texts[name + _SIGNATURE]
+            for name, short in (named | defined).items()
+            if name + _SIGNATURE in texts
+        },
+    )
+
+
+def _text(name: str, data: bytes) -> str:
+    """Return a file's text as a local load reads it: UTF-8, LF line ends, without a BOM in specifications."""
+    try:
+        text = data.decode("utf-8-sig" if name.startswith("monitors/") else "utf-8")
+    except UnicodeDecodeError as error:
+        raise BundleArchiveError(f"{name} is not UTF-8 text: {error.reason}") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _packed(files: Mapping[str, bytes]) -> bytes:
+    output = io.BytesIO()
+    with tarfile.open(fileobj=output, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for name in sorted(files):
+            member = tarfile.TarInfo(name)
+            member.size = len(files[name])
+            tar.addfile(member, io.BytesIO(files[name]))
+    packed = output.getvalue()
+    if len(packed) > LONGEST:
+        raise BundleArchiveError(f"the archive has {len(packed)} bytes; the limit is {LONGEST}")
+    return packed

@@ -1,0 +1,160 @@
+"""Poll the collector: verify its metadata, offer the selected bundle to control, and report the robot's state.
+
+Invariants:
+1. A bundle is offered to control only after `VerifiedBundles` has accepted it. Control decides whether it comes into
+   force.
+2. A refused bundle is not offered again until the collector selects another one.
+3. If a step fails, the next one begins after a pause; nothing else changes on the robot.
+"""
+
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+import structlog
+
+from appliance.bundles.collector_connection import CollectorConnection, CollectorError
+from appliance.bundles.verified_bundles import (
+    BundleFolderError,
+    BundleRejectedError,
+    BundleTooEarlyError,
+    SelectedBundle,
+    VerifiedBundle,
+    VerifiedBundles,
+)
+from appliance.channel.messages import BundleOffered, BundlePollReported, BundleStated
+
+REPORT = "v1/bundles/report"
+"""The path of the collector for reports."""
+
+_log = structlog.get_logger()
+_BACK_OFF = (1.0, 2.0, 5.0, 15.0, 30.0, 60.0)
+_JITTER = 0.2  # of the pause, in both directions
+_REPORT_SECONDS = 30.0
+_REPORT_AGAIN_SECONDS = 5.0
+
+
+class RobotReport(msgspec.Struct, frozen=True):
+    """The report of a robot to the collector: bundles by path (empty: none), its health, and polling problems."""
+
+    site: str
+    group: str
+    in_force: str
+    trying: str
+    refused: str
+    reason: str
+    changed: bool
+    denials: int
+    failing: int
+    trouble: str
+
+
+@dataclass(slots=True)
+class Poller:
+    """A poller. `stated()` returns control's last statement (None: no link yet); `offer` sends a bundle to control."""
+
+    bundles: VerifiedBundles
+    connection: CollectorConnection
+    place: tuple[str, str]  # site and group
+    interval: float
+    stated: Callable[[], BundleStated | None]
+    offer: Callable[[BundleOffered], object]
+    clock: Callable[[], float] = time.time
+    progress: BundlePollReported = field(default_factory=BundlePollReported)
+    _failures: int = 0
+    _reported: RobotReport | None = None
+    _due: float = 0.0
+    _retry_at: float = 0.0
+
+    def step(self) -> float:
+        """Check for a bundle and report; return the seconds until the next step."""
+        stated = self.stated()
+        if stated is None:
+            return _jittered(_BACK_OFF[0])
+        pause = self._checked(stated)
+        self._report(self.stated() or stated)
+        return pause
+
+    def report(self) -> None:
+        """Report the robot's state if it has changed or was not reported for some time."""
+        stated = self.stated()
+        if stated is not None:
+            self._report(stated)
+
+    def _checked(self, stated: BundleStated) -> float:
+        try:
+            self.bundles.refresh()
+            selected = self.bundles.selected()
+            if selected is not None and _is_news(selected, stated):
+                self.offer(_offered(self.bundles.get(selected)))
+        except BundleTooEarlyError as error:
+            self.progress = BundlePollReported(self.clock())
+            return _jittered(min(self.interval, max(1.0, error.at - self.clock())))
+        except (BundleRejectedError, BundleFolderError, CollectorError) as error:
+            return self._failed(error)
+        if self._failures:
+            _log.warning("the collector's bundles are verified again")
+        self._failures = 0
+        self.progress = BundlePollReported(self.clock())
+        return _jittered(self.interval)
+
+    def _failed(self, error: Exception) -> float:
+        if not self._failures:
+            _log.error("the collector's bundles cannot be verified; trying again", reason=str(error))
+        pause = _BACK_OFF[min(self._failures, len(_BACK_OFF) - 1)]
+        self._failures += 1
+        self.progress = BundlePollReported(
+            self.progress.checked, str(error)[:1000], isinstance(error, BundleRejectedError)
+        )
+        return _jittered(min(pause, self.interval))
+
+    def _report(self, stated: BundleStated) -> None:
+        refused = stated.refused
+        report = RobotReport(
+            *self.place,
+            stated.in_force,
+            stated.trying,
+            "" if refused is None else refused.path,
+            "" if refused is None else refused.reason[:1000],
+            stated.changed,
+            stated.health.denials,
+            stated.health.failing,
+            self.progress.trouble,
+        )
+        now = time.monotonic()
+        pressing = self._reported is None or _fate_of(report) != _fate_of(self._reported)
+        if now < (self._retry_at if pressing else self._due):
+            return
+        try:
+            self.connection.put(REPORT, msgspec.json.encode(report))
+        except CollectorError as error:
+            self._retry_at = self._due = now + _jittered(_REPORT_AGAIN_SECONDS)
+            if not self.progress.trouble:
+                self.progress = BundlePollReported(self.progress.checked, str(error)[:1000])
+            return
+        self._reported, self._due = report, now + _jittered(_REPORT_SECONDS)
+
+
+def _fate_of(report: RobotReport) -> RobotReport:
+    """Return a report without the counters that change all the time."""
+    return msgspec.structs.replace(report, denials=0, failing=0)
+
+
+def _is_news(selected: SelectedBundle, stated: BundleStated) -> bool:
+    """Whether control does not know the bundle yet."""
+    path, sha256 = str(selected.path), selected.sha256
+    if path in (stated.in_force, stated.trying):
+        return False
+    refused = stated.refused
+    return refused is None or (refused.path, refused.sha256) != (path, sha256)
+
+
+def _offered(bundle: VerifiedBundle) -> BundleOffered:
+    return BundleOffered(str(bundle.path), bundle.sha256, bundle.contents)
+
+
+def _jittered(seconds: float) -> float:
+    """Return a pause that differs among robots, so that they do not ask at the same time."""
+    return seconds * random.uniform(1 - _JITTER, 1 + _JITTER)  # noqa: S311  spreads load, protects nothing

@@ -1,0 +1,211 @@
+"""Run the client of bundles as a process of the appliance: lifeline, link to control, and two threads.
+
+One thread polls the collector, the other listens to its events, which only make the next poll earlier. The process
+reads no state of the appliance. It runs as a separate user, and the firewall lets it reach only the collector.
+"""
+
+import asyncio
+import contextvars
+import logging
+import random
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import structlog
+
+from appliance.base.input_files import read_given
+from appliance.bundles.collector_connection import CollectorConnection, CollectorError, robot_context
+from appliance.bundles.poller import Poller
+from appliance.bundles.verified_bundles import VerifiedBundles
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.configuration.settings import Fleet, load_resolved
+
+EVENTS = "v1/bundles/events"
+"""The path of the collector's event stream."""
+
+_log = structlog.get_logger()
+_TICK_SECONDS = 1.0
+_LAST_SECONDS = 1.0
+_AGAIN_SECONDS = (1.0, 2.0, 5.0, 15.0, 30.0)
+_EVENT = b"event: selection"
+_LEAST_SECONDS = 1.0  # between two polls that events cause
+_SPREAD = 0.05  # of the interval
+_LONGEST_SPREAD = 10.0
+_LONGEST_ROOT = 1 << 18
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    """Poll for bundles until the supervisor ends the process."""
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # it would log every request
+    asyncio.run(_Process(load_resolved(config).fleet, lifeline_fd).run())
+
+
+class PollLoop:
+    """The two threads of a client: one polls, the other listens to `events` at `path`.
+
+    An event makes the next poll earlier. The first poll, and those after events, are spread over some seconds, because
+    all robots start or are woken at the same time.
+    """
+
+    def __init__(self, poller: Poller, events: CollectorConnection, path: str) -> None:
+        self._poller = poller
+        self._events = events
+        self._path = path
+        self._ending, self._wake = threading.Event(), threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    @property
+    def alive(self) -> bool:
+        """Whether both threads run. An exception that ends one is a logged defect."""
+        return all(thread.is_alive() for thread in self._threads)
+
+    def start(self) -> None:
+        """Start the threads. They are daemons: the end of the process does not wait for a collector that hangs."""
+        for work in (self._poll, self._listen):
+            context = contextvars.copy_context()  # keeps the process name in the thread's log lines
+            thread = threading.Thread(target=context.run, args=(work,), name=work.__name__, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def stop(self, seconds: float) -> None:
+        """End the polling thread; wait at most `seconds`."""
+        self._ending.set()
+        self._wake.set()
+        self._threads[0].join(seconds)
+
+    def _poll(self) -> None:
+        spread = min(_LONGEST_SPREAD, _SPREAD * self._poller.interval)
+        due = time.monotonic() + _some_of(spread)
+        while not self._ending.is_set():
+            began = time.monotonic()
+            if began >= due:
+                due = time.monotonic() + self._poller.step()
+            else:
+                self._poller.report()
+            if self._wake.wait(max(0.0, min(_TICK_SECONDS, due - time.monotonic()))):
+                self._wake.clear()
+                due = min(due, began + _LEAST_SECONDS + _some_of(spread))
+
+    def _listen(self) -> None:
+        listen(self._events, self._path, self._ending, self._wake.set)
+
+
+class _Process:
+    """The process: it connects the lifeline, the link to control and the threads."""
+
+    def __init__(self, fleet: Fleet, lifeline_fd: int) -> None:
+        lifeline = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self._child = Child(
+            lifeline,
+            messages.BundleLink,
+            said=self._said,
+            linked=self._linked,
+            lost=lambda _why: self._lost(),
+        )
+        self._stated: messages.BundleStated | None = None
+        self._told: messages.BundlePollReported | None = None
+        self._event_loop: asyncio.AbstractEventLoop | None = None
+        context = context_of(fleet)
+        self._poller = make_poller(
+            fleet, Path.cwd(), connection_of(fleet, context), lambda: self._stated, self._offer
+        )
+        place = f"{fleet.bundles.site}/{fleet.bundles.group}"
+        self._loop = PollLoop(self._poller, connection_of(fleet, context), f"{EVENTS}/{place}")
+
+    async def run(self) -> None:
+        """Poll until the supervisor stops the process."""
+        self._event_loop = asyncio.get_running_loop()
+        self._loop.start()
+        self._child.attach(messages.Ready())
+        while not self._child.ended.is_set():
+            self._tell()
+            try:
+                await asyncio.wait_for(self._child.ended.wait(), _TICK_SECONDS)
+            except TimeoutError:
+                if not self._loop.alive:
+                    break  # the supervisor restarts the process
+        await asyncio.to_thread(self._loop.stop, _LAST_SECONDS)
+
+    def _said(self, message: messages.BundleStated) -> None:
+        self._stated = message
+
+    def _linked(self) -> None:
+        self._told = None
+        self._tell()
+
+    def _lost(self) -> None:
+        self._stated = None  # control states its bundle again when it is back
+
+    def _tell(self) -> None:
+        progress = self._poller.progress
+        if progress != self._told and self._child.tell(progress):
+            self._told = progress
+
+    def _offer(self, offered: messages.BundleOffered) -> None:
+        """Send a bundle to control; the polling thread calls this."""
+        if self._event_loop is not None:
+            self._event_loop.call_soon_threadsafe(self._child.tell, offered)
+
+
+def _some_of(seconds: float) -> float:
+    return random.uniform(0.0, seconds)  # noqa: S311  spreads load, protects nothing
+
+
+def listen(
+    connection: CollectorConnection, path: str, ending: threading.Event, wake: Callable[[], None]
+) -> None:
+    """Call `wake` at each event of the collector's stream at `path` until `ending` is set."""
+    failures = 0
+    while not ending.is_set():
+        try:
+            seen = b""
+            for part in connection.events(path):
+                failures = 0
+                seen = seen[-len(_EVENT) :] + part
+                if _EVENT in seen:
+                    wake()
+                    seen = b""
+                if ending.is_set():
+                    return
+        except CollectorError as error:
+            _log.debug("no events of the collector", reason=str(error))
+        ending.wait(_AGAIN_SECONDS[min(failures, len(_AGAIN_SECONDS) - 1)])
+        failures += 1
+
+
+def context_of(fleet: Fleet) -> ssl.SSLContext:
+    """Return the TLS context of these settings. Raises `OSError`."""
+    assert fleet.ca and fleet.certificate and fleet.key  # noqa: S101  the settings require them
+    return robot_context(fleet.ca, fleet.certificate, fleet.key)
+
+
+def connection_of(fleet: Fleet, context: ssl.SSLContext) -> CollectorConnection:
+    """Return a connection to the configured collector."""
+    return CollectorConnection(fleet.collector or "", context, fleet.name)
+
+
+def make_poller(
+    fleet: Fleet,
+    folder: Path,
+    connection: CollectorConnection,
+    stated: Callable[[], messages.BundleStated | None],
+    offer: Callable[[messages.BundleOffered], object],
+) -> Poller:
+    """Return the poller for these settings; they must configure bundles. Raises `OSError`."""
+    wanted = fleet.bundles
+    assert wanted.root is not None  # noqa: S101  the role runs only with it
+    bundles = VerifiedBundles(
+        folder,
+        read_given(wanted.root, _LONGEST_ROOT),
+        connection,
+        site=wanted.site,
+        group=wanted.group,
+        robot=fleet.robot,
+    )
+    return Poller(bundles, connection, (wanted.site, wanted.group), wanted.interval, stated, offer)

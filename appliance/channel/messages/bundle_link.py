@@ -1,0 +1,73 @@
+"""The link control <-> bundles: verified bundles and the state of polling in one direction, their fate in the other."""
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+
+
+class BundleContents(msgspec.Struct, frozen=True):
+    """The texts of a bundle. `cases` is None without test cases; missing signatures are empty.
+
+    `files` are the specifications by name, `definitions` the message definitions by `package/Type.msg` (or `.srv`), and
+    `signatures` the signatures of both by the same names.
+    """
+
+    policy: str
+    hosts: str
+    policy_signature: str = ""
+    cases: str | None = None
+    files: dict[str, str] = {}
+    definitions: dict[str, str] = {}
+    signatures: dict[str, str] = {}
+
+
+class BundleOffered(Message):
+    """A verified bundle for this robot. `path` is SITE/GROUP/VERSION.tar; `sha256` identifies its archive."""
+
+    path: str
+    sha256: str
+    contents: BundleContents
+
+
+class BundlePollReported(Message):
+    """The state of polling, after each change and each check.
+
+    `checked` is when the collector's metadata were last verified (seconds since the epoch; 0: not yet). `trouble` is
+    the reason if the last check failed; `rejected`: what the collector serves was not accepted.
+    """
+
+    checked: float = 0.0
+    trouble: str = ""
+    rejected: bool = False
+
+
+class RefusedBundle(msgspec.Struct, frozen=True):
+    """A bundle that this robot does not take, and why."""
+
+    path: str
+    sha256: str
+    reason: str
+
+
+class BundleHealth(msgspec.Struct, frozen=True):
+    """The robot's health in reports: denials of the last minute, and monitors that fail or hold topics."""
+
+    denials: int = 0
+    failing: int = 0
+
+
+class BundleStated(Message):
+    """Control states the bundle in force, the one under commit-confirm, and the last refused one; empty: none.
+
+    `changed`: an operator has since changed the policy, the specifications or the hosts on the robot.
+    """
+
+    in_force: str = ""
+    sha256: str = ""
+    trying: str = ""
+    refused: RefusedBundle | None = None
+    changed: bool = False
+    health: BundleHealth = BundleHealth()
+
+
+BundleLink = BundleOffered | BundlePollReported | BundleStated

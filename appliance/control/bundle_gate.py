@@ -1,0 +1,318 @@
+"""Bring bundles of the fleet into force through the same gate as local loads, all parts or none.
+
+The process `bundles` offers bundles that TUF has verified. The gate decides: hosts.yaml is parsed, the policy is
+compiled and passes the bundle's own test cases, the specifications compile and every relay takes them; with
+`site_keys`, all texts are signed. Then commit-confirm begins, a trial of `confirm_seconds`. The bundle stays only if
+the robot stays healthy.
+
+Invariants:
+1. Before the first change, a journal (`BundleRecord.trial`) with the way back is on the disk. If control or the
+   appliance ends during a trial, the next start goes back.
+2. The bundle in force changes in one write, at the end of a healthy trial.
+3. Going back never undoes a change that an operator made during the trial.
+4. A refused bundle changes nothing; the last good one stays in force.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import msgspec
+import structlog
+
+from appliance.base.actors import UNCONFIRMED
+from appliance.channel import admin, messages
+from appliance.channel.answers.status import BundlesState
+from appliance.channel.link import Link
+from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
+from appliance.configuration.settings import Fleet
+from appliance.control.bundle_health import RobotHealth
+from appliance.control.policies import Policies, PolicyCases, PolicyRefusedError, RevisionChangedError
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.hosts.host_table import HostRefusedError
+from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
+from appliance.signing.fingerprints import fingerprint
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
+from appliance.specifications.specification_manager import SpecificationManager
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
+
+_log = structlog.get_logger()
+_SETTING = "fleet bundle"
+_TICK_SECONDS = 1.0
+_AGAIN_SECONDS = 5.0
+_INTERRUPTIONS = 3  # trials of one bundle that may end with the process before the bundle is refused
+_REFUSALS = (
+    DeclaredHostsError,
+    HostRefusedError,
+    PolicyRefusedError,
+    RevisionChangedError,
+    SpecificationsRefusedError,
+)
+_UNCONFIRMED_CHANGE = "a local change waits for its confirmation; the bundle waits for it"
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """The journal of a trial: the bundle, and what was in force before (`hosts_back` empty: the file hosts.yaml)."""
+
+    path: str
+    sha256: str
+    policy_back: int
+    monitors_back: int
+    hosts_back: str
+    hosts_sha256: str
+
+    @property
+    def who(self) -> str:
+        """Return the author of the bundle's revisions."""
+        return f"bundle {self.path}"
+
+
+class BundleRecord(msgspec.Struct, frozen=True):
+    """The stored record: the bundle in force since `since` with its revisions, the refused one, and a trial.
+
+    `interrupted` is the SHA-256 of the bundle whose last `interruptions` trials ended with the process.
+    """
+
+    in_force: str = ""
+    sha256: str = ""
+    since: float = 0.0
+    policy: int = 0
+    monitors: int = 0
+    refused: RefusedBundle | None = None
+    trial: Trial | None = None
+    interrupted: str = ""
+    interruptions: int = 0
+
+
+class BundleGate:
+    """The gate, and control's end of the link to the process `bundles`. `health()` returns the present health."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        *,
+        policies: Policies,
+        monitors: SpecificationManager,
+        hosts: HostEnrolment,
+        store: StateStore,
+        trail: AuditTrail,
+        health: Callable[[], RobotHealth],
+    ) -> None:
+        self._fleet = fleet
+        self._policies, self._monitors, self._hosts = policies, monitors, hosts
+        self._store, self._trail, self._health = store, trail, health
+        self.link = Link(self._heard)
+        self._record = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=BundleRecord)
+        self._poll = messages.BundlePollReported()
+        self._stated: BundleStated | None = None
+        self._stated_to: object = None
+        self._offered: BundleOffered | None = None
+        self._there = asyncio.Event()
+        self._waits = ""
+
+    def status(self) -> BundlesState | None:
+        """Return the state for `rosrv status` and the metrics, or None if no bundles are configured or in force."""
+        record, fleet = self._record, self._fleet
+        if fleet.bundles.root is None and not record.in_force:
+            return None
+        trouble = self._poll.trouble or self._waits
+        if fleet.bundles.root is not None and self.link.channel is None:
+            trouble = trouble or "the process that polls for bundles is not running yet"
+        return BundlesState(
+            collector=fleet.collector or "",
+            in_force=record.in_force,
+            sha256=record.sha256,
+            since=record.since or None,
+            trying="" if record.trial is None else record.trial.path,
+            refused="" if record.refused is None else record.refused.path,
+            reason="" if record.refused is None else record.refused.reason,
+            changed=self._changed,
+            checked=self._poll.checked or None,
+            trouble=trouble,
+            rejected=self._poll.rejected,
+        )
+
+    async def run(self) -> None:
+        """Undo an interrupted trial, then take bundles as they are offered."""
+        if self._record.trial is not None:
+            await self._undo_interrupted(self._record, self._record.trial)
+        while self._fleet.bundles.root is not None:
+            self._state()
+            try:
+                async with asyncio.timeout(_TICK_SECONDS):
+                    await self._there.wait()
+            except TimeoutError:
+                continue
+            self._there.clear()
+            offered, self._offered = self._offered, None
+            if offered is not None:
+                await self._take(offered)
+
+    # --- the link ---
+
+    def _heard(self, message: messages.BundleOffered | messages.BundlePollReported) -> None:
+        if isinstance(message, BundleOffered):
+            self._offered = message
+            self._there.set()
+            return
+        if message.rejected and message.trouble != self._poll.trouble:
+            self._trail.happened("bundle metadata rejected", message.trouble, collector=self._fleet.collector)
+        self._poll = message
+
+    def _state(self) -> None:
+        """State the bundle in force to the process, if something has changed."""
+        record, health = self._record, self._health()
+        stated = BundleStated(
+            record.in_force,
+            record.sha256,
+            "" if record.trial is None else record.trial.path,
+            record.refused,
+            self._changed,
+            BundleHealth(health.denials, len(health.failing)),
+        )
+        if (stated, self.link.channel) != (self._stated, self._stated_to):
+            self._stated, self._stated_to = stated, self.link.channel
+            self.link.send(stated)
+
+    @property
+    def _changed(self) -> bool:
+        """Whether an operator has changed a part of the bundle in force on this robot."""
+        record = self._record
+        if not record.in_force or record.trial is not None:
+            return False
+        there = (self._policies.revision, self._monitors.revision)
+        return there != (record.policy, record.monitors) or not self._hosts.bundled
+
+    # --- the gate ---
+
+    async def _take(self, offered: BundleOffered) -> None:
+        record, contents = self._record, offered.contents
+        if (offered.path, offered.sha256) == (record.in_force, record.sha256):
+            return
+        self._waits = ""
+        if self._policies.confirm_by is not None or self._monitors.confirm_by is not None:
+            self._waits = _UNCONFIRMED_CHANGE
+            return
+        try:
+            parse_declared(contents.hosts, IN_BUNDLE)
+            await self._policies.attempt(contents.policy, contents.policy_signature, _cases(contents))
+        except _REFUSALS as error:
+            self._refuse(offered.path, offered.sha256, str(error))
+            return
+        trial = Trial(
+            offered.path,
+            offered.sha256,
+            self._policies.revision,
+            self._monitors.revision,
+            self._hosts.bundled,
+            fingerprint(contents.hosts or "\n"),
+        )
+        try:
+            await self._keep(msgspec.structs.replace(record, trial=trial))
+            await self._try(trial, contents)
+        except StoreError as error:  # says nothing about the bundle: it is offered again
+            self._waits = str(error)
+            await self._undo(trial)
+            self._save(msgspec.structs.replace(self._record, trial=None))
+
+    async def _try(self, trial: Trial, contents: messages.BundleContents) -> None:
+        """Put a bundle into force for the trial; keep it if the robot stays healthy, otherwise go back."""
+        before = self._health()
+        try:
+            await self._put_in_force(trial, contents)
+            reason = await self._watched(before)
+        except _REFUSALS as error:
+            reason = str(error)
+        if reason:
+            await self._undo(trial)
+            self._refuse(trial.path, trial.sha256, reason)
+            return
+        policy, monitors = self._policies.revision, self._monitors.revision
+        await self._keep(BundleRecord(trial.path, trial.sha256, time.time(), policy, monitors))
+        self._trail.happened(
+            "bundle in force",
+            f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s",
+            bundle=trial.path,
+            sha256=trial.sha256,
+            revision_of_specifications=monitors,
+        )
+
+    async def _put_in_force(self, trial: Trial, contents: messages.BundleContents) -> None:
+        """Bring all parts into force. Raises one of `_REFUSALS`; then some parts may be in force."""
+        sources = Sources(contents.files, contents.definitions, contents.signatures)
+        await self._monitors.take_bundle(sources, trial.who, "of the bundle")
+        load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
+        await self._policies.load(load, trial.who, _cases(contents))
+        await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
+
+    async def _watched(self, before: RobotHealth) -> str:
+        """Watch the robot for the time of the trial; return why it is not healthy, or an empty text."""
+        deadline = time.monotonic() + self._fleet.bundles.confirm_seconds
+        there = (self._policies.revision, self._monitors.revision)
+        while True:
+            if there != (self._policies.revision, self._monitors.revision):
+                return "an operator changed the policy or the specifications during the trial"
+            reason = self._health().worse_than(before)
+            if reason or time.monotonic() >= deadline:
+                return reason
+            self._state()
+            await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - time.monotonic())))
+
+    def _refuse(self, path: str, sha256: str, reason: str) -> None:
+        """Record why a bundle is refused, and end its trial."""
+        refused = RefusedBundle(path, sha256, reason[:4000])
+        self._save(msgspec.structs.replace(self._record, refused=refused, trial=None))
+        stays = self._record.in_force or "no bundle"
+        self._trail.happened(
+            "bundle refused",
+            f"{path} is refused, {stays} stays in force: {reason.splitlines()[0] if reason else ''}",
+            bundle=path,
+            sha256=sha256,
+            findings=reason.splitlines()[:100],
+        )
+
+    # --- going back ---
+
+    async def _undo_interrupted(self, record: BundleRecord, trial: Trial) -> None:
+        """Go back after control or the appliance ended during a trial; the bundle may be tried again."""
+        await self._undo(trial)
+        interruptions = 1 + (record.interruptions if record.interrupted == trial.sha256 else 0)
+        self._save(
+            msgspec.structs.replace(record, trial=None, interrupted=trial.sha256, interruptions=interruptions)
+        )
+        if interruptions >= _INTERRUPTIONS:
+            reason = f"the appliance ended during each of {interruptions} trials"
+            self._refuse(trial.path, trial.sha256, reason)
+
+    async def _undo(self, trial: Trial) -> None:
+        """Bring what was in force before a trial into force again, except parts that an operator has changed."""
+        while True:
+            try:
+                if self._policies.in_force.who == trial.who and self._policies.revision > trial.policy_back:
+                    await self._policies.roll_back(admin.PolicyRollback(trial.policy_back), UNCONFIRMED)
+                if self._monitors.in_force.who == trial.who and self._monitors.revision > trial.monitors_back:
+                    await self._monitors.roll_back(admin.MonitorRollback(trial.monitors_back), UNCONFIRMED)
+                if fingerprint(self._hosts.bundled) == trial.hosts_sha256 and (
+                    self._hosts.bundled != trial.hosts_back
+                ):
+                    await self._hosts.take_bundle(trial.hosts_back, UNCONFIRMED)
+            except (*_REFUSALS, StoreError) as error:
+                _log.error("a bundle cannot be rolled back yet", bundle=trial.path, error=str(error))
+                await asyncio.sleep(_AGAIN_SECONDS)
+            else:
+                return
+
+    async def _keep(self, record: BundleRecord) -> None:
+        """Store a record, and wait until it is on the disk. Raises `StoreError`."""
+        self._save(record)
+        await self._store.settled()
+
+    def _save(self, record: BundleRecord) -> None:
+        self._record = record
+        self._store.save_setting(_SETTING, msgspec.json.encode(record).decode())
+
+
+def _cases(contents: messages.BundleContents) -> PolicyCases:
+    return PolicyCases("policy.ini.tests.yaml", contents.cases)

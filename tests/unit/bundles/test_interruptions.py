@@ -1,0 +1,103 @@
+"""A robot's client of bundles that is killed, or whose disk is full, loses nothing that it knew, and goes on."""
+
+import os
+import resource
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.bundles.verified_bundles import BundleFolderError, BundleRejectedError, VerifiedBundles
+from tests.support.bundle_site import BundleSite
+
+_KILLED, _DONE, _FULL = 9, 0, 7
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[tuple[BundleSite, str]]:
+    """Serve a site with two bundles; the robot knows the first one."""
+    site = BundleSite(tmp_path / "site")
+    site.add()
+    with site.served() as url:
+        poll(site.robot(url, tmp_path / "robot"))
+        yield site, url
+
+
+def poll(robot: VerifiedBundles) -> str:
+    """Do what a robot does at each poll; return the bundle that it would take."""
+    robot.refresh()
+    selected = robot.selected()
+    assert selected is not None
+    return str(robot.get(selected).path)
+
+
+def in_child(work: Callable[[], None]) -> int:
+    """Run work in a child process; return its exit status."""
+    child = os.fork()
+    if not child:
+        try:
+            work()
+            os._exit(_DONE)
+        except BundleFolderError:
+            os._exit(_FULL)
+        except BaseException:  # noqa: BLE001  the child may not return into pytest
+            os._exit(1)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def killed_at(step: int, folder: Path) -> None:
+    """End this process without any cleanup at the given access to a file of a folder."""
+    left = [step]
+
+    def hook(event: str, arguments: tuple[object, ...]) -> None:
+        if event in ("open", "os.rename", "os.remove", "os.mkdir", "os.symlink") and str(folder) in str(
+            arguments[0]
+        ):
+            left[0] -= 1
+            if left[0] < 0:
+                os._exit(_KILLED)
+
+    sys.addaudithook(hook)
+
+
+def test_a_kill_at_any_step_loses_nothing(site: tuple[BundleSite, str], tmp_path: Path) -> None:
+    """Killed at every access to its files in turn, the client finds the new bundle, and still refuses the old time."""
+    served, url = site
+    old = served.timestamp
+    step = 0
+    while True:
+        path = served.add()
+        new = served.timestamp
+        robot = served.robot(url, tmp_path / "robot")
+
+        def work(robot: VerifiedBundles = robot, step: int = step) -> None:
+            killed_at(step, tmp_path / "robot")
+            poll(robot)
+
+        status = in_child(work)
+        assert status in (_KILLED, _DONE)
+        assert poll(served.robot(url, tmp_path / "robot")) == str(path)
+        served.timestamp = old
+        with pytest.raises(BundleRejectedError, match="version"):
+            poll(served.robot(url, tmp_path / "robot"))
+        served.timestamp = old = new
+        if status == _DONE:
+            break
+        step += 3
+    assert step > 15
+
+
+def test_a_full_disk_is_reported_and_passes(site: tuple[BundleSite, str], tmp_path: Path) -> None:
+    """While files cannot be written, the client reports that; afterwards it takes the bundle."""
+    served, url = site
+    path = served.add()
+    robot = served.robot(url, tmp_path / "robot")
+
+    def work() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))
+        poll(robot)
+
+    assert in_child(work) == _FULL
+    assert poll(served.robot(url, tmp_path / "robot")) == str(path)
+    assert not list((tmp_path / "robot").rglob("tmp*"))

@@ -1,0 +1,353 @@
+"""Every attack of TUF's list is refused by the real client, over a real TLS connection to a collector that lies."""
+
+import datetime
+import http.server
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rosrv_fleet.bundles.keys import load_online_key
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
+from securesystemslib.signer import CryptoSigner
+from tuf.api.metadata import Metadata, MetaFile, Snapshot, TargetFile, Targets, Timestamp
+
+from appliance.bundles import collector_connection
+from appliance.bundles.bundle_archive import pack
+from appliance.bundles.collector_connection import CollectorError
+from appliance.bundles.terms import BundlePath, Ring, custom_of
+from appliance.bundles.verified_bundles import (
+    BundleRejectedError,
+    BundleTooEarlyError,
+    VerifiedBundle,
+    VerifiedBundles,
+)
+from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files, everywhere, give
+
+METADATA = "/v1/bundles/metadata"
+
+
+class Field:
+    """A site with one served bundle, and one robot that has taken it."""
+
+    def __init__(self, folder: Path, url: str, site: BundleSite) -> None:
+        self.site, self.url, self.folder = site, url, folder
+        self.robot = site.robot(url, folder / "robot")
+
+    def poll(self, robot: VerifiedBundles | None = None) -> VerifiedBundle | None:
+        """Do what a robot does at each poll; return the bundle that it would take."""
+        asker = robot or self.robot
+        asker.refresh()
+        selected = asker.selected()
+        return None if selected is None else asker.get(selected)
+
+    def give(self, path: str, body: bytes | None) -> None:
+        """Make the collector answer a path with other bytes."""
+        self.site.lies[path] = lambda handler: give(handler, body)
+
+    def timestamp(self, snapshot: int, version: int | None = None, days: float = 1.0) -> bytes:
+        """Return a timestamp that the stolen online key has signed."""
+        signed = Timestamp(
+            version=version or int(time.time()) + 1000,
+            expires=(datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(
+                microsecond=0
+            ),
+            snapshot_meta=MetaFile(snapshot),
+        )
+        document = Metadata(signed)
+        document.sign(load_online_key(self.site.repository.folder / TIMESTAMP_KEY))
+        return document.to_bytes()
+
+
+@pytest.fixture
+def field(tmp_path: Path) -> Iterator[Field]:
+    """Return a site with a first bundle, which the robot has verified."""
+    site = BundleSite(tmp_path / "site")
+    site.add()
+    with site.served() as url:
+        made = Field(tmp_path, url, site)
+        assert made.poll() is not None
+        yield made
+
+
+def refused(field: Field, word: str, robot: VerifiedBundles | None = None) -> None:
+    """Require that a poll is rejected with a reason that has this word, and gives no bundle."""
+    with pytest.raises(BundleRejectedError, match=word):
+        field.poll(robot)
+
+
+def test_an_honest_collector_serves_each_new_bundle(field: Field) -> None:
+    """A robot gets the selected bundle with all texts, and the next one after it."""
+    files = bundle_files(monitors__a_dot_rv="monitor", policy_dot_ini_dot_tests_dot_yaml="cases: []")
+    path = field.site.add(files)
+    taken = field.poll()
+    assert taken is not None
+    assert taken.path == path
+    assert taken.contents.files == {"a.rv": "monitor"}
+    assert taken.contents.cases == "cases: []"
+
+
+def test_without_a_selection_nothing_is_taken(field: Field) -> None:
+    """Without a selection the robot takes nothing, without an error."""
+    field.site.selection = ""
+    assert field.poll() is None
+
+
+def test_rollback_of_the_timestamp_is_rejected(field: Field) -> None:
+    """An older timestamp, validly signed, is rejected once the robot has seen a newer one, also after a restart."""
+    old = field.site.timestamp
+    field.site.add()
+    assert field.poll() is not None
+    field.give(f"{METADATA}/timestamp.json", old)
+    refused(field, "version")
+    refused(field, "version", field.site.robot(field.url, field.folder / "robot"))
+
+
+def test_rollback_by_a_stolen_timestamp_key_is_rejected(field: Field) -> None:
+    """A new timestamp that names an older snapshot is rejected."""
+    field.site.add()
+    assert field.poll() is not None
+    field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=2))
+    refused(field, "version")
+
+
+def test_a_withdrawn_bundle_is_rejected(field: Field) -> None:
+    """The collector cannot select a bundle that the group's key has withdrawn since."""
+    first = field.site.selection
+    field.site.add(keep=1)
+    field.site.selection = first
+    refused(field, "withdrawn")
+
+
+def test_the_former_bundle_may_be_selected_while_it_is_signed(field: Field) -> None:
+    """Going back to a bundle that is still signed is the collector's choice: it is a delay, not a rollback."""
+    first = field.site.selection
+    field.site.add(keep=2)
+    assert field.poll() is not None
+    field.site.selection = first
+    taken = field.poll()
+    assert taken is not None
+    assert str(taken.path) == first
+
+
+def test_freeze_ends_with_the_timestamp(field: Field) -> None:
+    """A collector that serves the same metadata forever is noticed when the timestamp expires."""
+    field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=3, days=-0.01))
+    refused(field, "expired")
+
+
+def test_freeze_by_a_stolen_timestamp_key_ends_with_the_snapshot(tmp_path: Path) -> None:
+    """Fresh timestamps of an expired snapshot are rejected: the snapshot's key is offline."""
+    months_ago = datetime.datetime.now(datetime.UTC).replace(microsecond=0) - datetime.timedelta(days=70)
+    site = BundleSite(tmp_path / "site", now=lambda: months_ago)
+    site.repository.add(SITE, GROUP, bundle_files(), everywhere())
+    with site.served() as url:
+        field = Field(tmp_path, url, site)
+        site.timestamp = field.timestamp(snapshot=3)
+        refused(field, "expired")
+
+
+def test_fast_forward_is_undone_by_new_keys(field: Field) -> None:
+    """A thief may set the timestamp's version to the highest number; after a rotation of the keys, robots go on."""
+    field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=3, version=2**31))
+    assert field.poll() is not None
+    field.site.lies.clear()
+    field.site.add()
+    refused(field, "version")
+    field.site.repository.rotate("timestamp")
+    field.site.timestamp = None
+    field.site.publish()
+    taken = field.poll()
+    assert taken is not None
+    assert taken.path.version == 2
+
+
+def test_mix_and_match_is_rejected(field: Field) -> None:
+    """Targets of one time with a snapshot of another time are rejected."""
+    site = field.site
+    old = (site.repository.metadata / f"2.{SITE}.{GROUP}.json").read_bytes()
+    site.add()
+    field.give(f"{METADATA}/3.{SITE}.{GROUP}.json", old)
+    refused(field, "v3, got v2")
+
+
+def test_endless_data_is_cut(field: Field) -> None:
+    """Metadata or a bundle without an end is cut at its limit; the process does not grow."""
+
+    def endless(handler: http.server.BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.end_headers()
+        handler.close_connection = True
+        for _ in range(2000):
+            handler.wfile.write(bytes(1 << 16))
+
+    field.site.lies[f"{METADATA}/timestamp.json"] = endless
+    with pytest.raises(CollectorError, match="more than"):
+        field.poll()
+    field.site.lies.clear()
+    path = field.site.add(bundle_files(monitors__long_dot_rv="x" * 10_000))
+    (target,) = [one for at, one in field.site.repository.bundles() if at == path]
+    field.site.lies[f"/v1/bundles/targets/{target.get_prefixed_paths()[0]}"] = endless
+    refused(field, "exceeding")
+
+
+def test_slow_retrieval_is_cut(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A collector that sends a byte now and then is given up at the deadline of the exchange."""
+    monkeypatch.setattr(collector_connection, "_EXCHANGE_SECONDS", 0.3)
+
+    def slow(handler: http.server.BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Length", "500")
+        handler.end_headers()
+        for _ in range(100):
+            handler.wfile.write(b"x")
+            threading.Event().wait(0.05)  # the pause of a slow collector
+
+    field.site.lies[f"{METADATA}/timestamp.json"] = slow
+    began = time.monotonic()
+    with pytest.raises(CollectorError, match="takes more than"):
+        field.poll()
+    assert time.monotonic() - began < 4
+
+
+def test_the_wrong_target_is_rejected(field: Field) -> None:
+    """Other bytes in place of the signed bundle, such as an earlier one, are rejected."""
+    path = field.site.add(bundle_files("[Nodes]\n"))
+    found = {at.version: target for at, target in field.site.repository.bundles()}
+    old = (field.site.repository.targets / found[1].get_prefixed_paths()[0]).read_bytes()
+    field.give(f"/v1/bundles/targets/{found[path.version].get_prefixed_paths()[0]}", old)
+    refused(field, "length|hash")
+
+
+def test_arbitrary_software_is_rejected(field: Field) -> None:
+    """Metadata that a foreign key has signed, and unsigned metadata, are rejected."""
+    expires = datetime.datetime.now(datetime.UTC).replace(microsecond=0) + datetime.timedelta(days=1)
+    forged = Metadata(Timestamp(int(time.time()) + 9, expires=expires, snapshot_meta=MetaFile(9)))
+    field.give(f"{METADATA}/timestamp.json", forged.to_bytes())
+    refused(field, "signed")
+    forged.sign(CryptoSigner.generate_ed25519())
+    field.give(f"{METADATA}/timestamp.json", forged.to_bytes())
+    refused(field, "signed")
+    foreign = BundleSite(field.folder / "foreign")
+    foreign.add()
+    field.give(f"{METADATA}/timestamp.json", foreign.timestamp)
+    refused(field, "signed")
+
+
+def test_a_group_key_signs_for_no_other_group(field: Field) -> None:
+    """Extraneous bundles: the key of one group lists a bundle of another; its robots do not find it."""
+    repository = field.site.repository
+    repository.delegate(SITE, "lifts")
+    archive = pack(bundle_files())
+    listed = Metadata[Targets].from_file(str(repository.metadata / f"1.{SITE}.lifts.json"))
+    path = BundlePath(SITE, GROUP, 99)
+    target = TargetFile.from_data(str(path), archive, ["sha256"])
+    target.unrecognized_fields["custom"] = custom_of(everywhere())
+    listed.signed.targets[str(path)] = target
+    listed.signed.version = 2
+    for signer in repository._keys.signers(f"{SITE}.lifts", repository._keyids(f"{SITE}.lifts")):
+        listed.sign(signer)
+    listed.to_file(str(repository.metadata / f"2.{SITE}.lifts.json"))
+    (repository.targets / SITE / GROUP).mkdir(parents=True, exist_ok=True)
+    for name in target.get_prefixed_paths():
+        (repository.targets / name).write_bytes(archive)
+    repository.snapshot()
+    field.site.publish()
+    field.site.selection = str(path)
+    refused(field, "not signed")
+
+
+def test_bundles_of_other_robots_are_rejected(field: Field) -> None:
+    """A bundle of another group or another site, validly signed, is rejected without a download."""
+    repository = field.site.repository
+    for site, group in ((SITE, "lifts"), ("site-b", GROUP)):
+        repository.delegate(site, group)
+        path = repository.add(site, group, bundle_files(), everywhere())
+        field.site.publish()
+        field.site.selection = str(path)
+        refused(field, "other robots")
+    assert not [path for path in field.site.requests if "lifts" in path or "site-b" in path]
+
+
+@pytest.mark.parametrize(
+    "selection", ["../../etc/passwd", "x", "a/b/0.tar", "site-a/arms/1.tar\nsite-a", "\x00" * 900]
+)
+def test_an_invalid_selection_is_rejected(field: Field, selection: str) -> None:
+    """A selection that is not the name of a bundle is rejected."""
+    field.site.selection = selection
+    refused(field, "invalid")
+
+
+def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
+    """The collector cannot give the bundle to a robot before the time that the operator signed for its ring."""
+    rings = (Ring("canary", ["canary-1"]), Ring("rest", [], 100, 3600))
+    path = field.site.add(terms=everywhere(None, *rings))
+    with pytest.raises(BundleTooEarlyError):
+        field.poll()
+    canary = field.site.robot(field.url, field.folder / "canary", "canary-1")
+    taken = field.poll(canary)
+    assert taken is not None
+    assert taken.path == path
+    later = field.site.robot(field.url, field.folder / "later", ROBOT, lambda: time.time() + 3601)
+    assert field.poll(later) is not None
+
+
+def test_a_compromised_root_key_is_replaced(field: Field) -> None:
+    """After a rotation of root, targets, snapshot and group keys, robots follow; the old keys sign nothing any more."""
+    site, repository = field.site, field.site.repository
+    old = {role: repository._keys.signers(role, repository._keyids(role)) for role in ("snapshot", "targets")}
+    for role in ("root", "targets", "snapshot", f"{SITE}.{GROUP}"):
+        repository.rotate(role)
+    path = site.add()
+    taken = field.poll()
+    assert taken is not None
+    assert taken.path == path
+    stolen = Metadata(Snapshot(version=50, meta={"targets.json": MetaFile(50)}))
+    stolen.signed.expires = datetime.datetime.now(datetime.UTC).replace(microsecond=0) + datetime.timedelta(
+        days=1
+    )
+    stolen.sign(old["snapshot"][0])
+    field.give(f"{METADATA}/50.snapshot.json", stolen.to_bytes())
+    field.give(f"{METADATA}/timestamp.json", field.timestamp(snapshot=50))
+    refused(field, "signed")
+
+
+def test_a_root_that_the_old_root_did_not_sign_is_rejected(field: Field) -> None:
+    """A new root needs the signature of the root that robots trust."""
+    foreign = BundleSite(field.folder / "foreign")
+    foreign.repository.rotate("root")
+    field.give(f"{METADATA}/2.root.json", (foreign.repository.metadata / "2.root.json").read_bytes())
+    refused(field, "signed")
+
+
+def test_lost_knowledge_begins_with_the_given_root(field: Field) -> None:
+    """A robot without its folder of metadata begins with the root that it was given, and follows all rotations."""
+    for _ in range(3):
+        field.site.repository.rotate("root")
+    field.site.add()
+    shutil.rmtree(field.folder / "robot")
+    assert field.poll() is not None
+
+
+def test_redirects_and_compression_are_not_followed(field: Field) -> None:
+    """The connection stays with the configured collector, and expands nothing."""
+
+    def elsewhere(handler: http.server.BaseHTTPRequestHandler) -> None:
+        handler.send_response(302)
+        handler.send_header("Location", "https://127.0.0.1:1/")
+        handler.send_header("Content-Length", "0")
+        handler.end_headers()
+
+    def bomb(handler: http.server.BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Encoding", "gzip")
+        handler.send_header("Content-Length", "3")
+        handler.end_headers()
+        handler.wfile.write(b"\x1f\x8b\x08")
+
+    for lie, word in ((elsewhere, "302"), (bomb, "compresses")):
+        field.site.lies[f"{METADATA}/timestamp.json"] = lie
+        with pytest.raises(CollectorError, match=word):
+            field.poll()
