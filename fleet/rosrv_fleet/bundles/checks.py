@@ -1,0 +1,39 @@
+"""Check a bundle's contents on the operator's machine, as robots will, as far as they can be known there."""
+
+import ipaddress
+
+from appliance.channel.messages import BundleContents
+from appliance.hosts.hosts_file import DeclaredHostsError, parse_declared
+from appliance.policy.judgement import PolicyContext, judge
+from appliance.policy.policy_findings import PolicyError
+from appliance.specifications.checking import check
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
+
+
+def findings_of(contents: BundleContents) -> list[str]:
+    """Return all errors: in hosts.yaml, the policy, its test cases and the specifications.
+
+    The policy may name hosts only if hosts.yaml declares their addresses. Signatures of the site are checked on the
+    robots, which have the site's keys.
+    """
+    found: list[str] = []
+    hosts = {}
+    try:
+        declared = parse_declared(contents.hosts, "hosts.yaml")
+        hosts = {
+            name: ipaddress.ip_address(host.address)
+            for name, host in declared.items()
+            if host.address is not None
+        }
+    except DeclaredHostsError as error:
+        found.append(str(error))
+    try:
+        known = PolicyContext(hosts=hosts, cases_file="policy.ini.tests.yaml", cases=contents.cases)
+        judge(contents.policy, "policy.ini", known).accepted()
+    except PolicyError as error:
+        found += [str(finding) for finding in error.findings]
+    try:
+        check(Sources(contents.files, contents.definitions, contents.signatures), [])
+    except SpecificationsRefusedError as error:
+        found += error.findings
+    return found

@@ -1,0 +1,139 @@
+"""Read what the operator published, check that it is complete, and sign the timestamp that names it.
+
+The collector serves the folder's files as they are. It signs only the timestamp: at each new snapshot, and again before
+the last one expires. A snapshot is named only if everything that it lists is there and verifies, so robots never see
+half of a publication.
+"""
+
+import datetime
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from securesystemslib.signer import CryptoSigner
+from tuf.api.exceptions import RepositoryError
+from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, TargetFile, Targets, Timestamp
+from tuf.api.serialization import DeserializationError
+from tuf.api.serialization.json import JSONSerializer
+
+from appliance.bundles.terms import Terms, TermsError, terms_of
+
+S = TypeVar("S", Root, Snapshot, Targets)
+_ROOT = re.compile(r"([1-9][0-9]*)\.root\.json")
+_SNAPSHOT = re.compile(r"([1-9][0-9]*)\.snapshot\.json")
+LIFETIME = datetime.timedelta(hours=24)
+"""The life of a timestamp: robots notice within this time that newer metadata are withheld."""
+
+_RENEW = datetime.timedelta(hours=8)  # the age at which a timestamp is signed again
+
+
+class PublicationError(Exception):
+    """The published files are not complete or not valid; the text has the reason and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """A complete publication: the root, the snapshot's version, and the signed bundles with their terms."""
+
+    root: Root
+    snapshot: int
+    bundles: dict[str, Terms]
+    expires: datetime.datetime
+
+
+def read_publication(folder: Path) -> Publication:
+    """Return the newest publication in a folder, fully verified. Raises `PublicationError`."""
+    metadata = folder / "metadata"
+    try:
+        root = _load(metadata / f"{_newest(metadata, _ROOT)}.root.json", Root)
+        root.signed.verify_delegate("root", root.signed_bytes, root.signatures)
+        version = _newest(metadata, _SNAPSHOT)
+        snapshot = _load(metadata / f"{version}.snapshot.json", Snapshot)
+        root.signed.verify_delegate("snapshot", snapshot.signed_bytes, snapshot.signatures)
+        top = _listed(metadata, "targets", snapshot.signed)
+        root.signed.verify_delegate("targets", top.signed_bytes, top.signatures)
+        bundles: dict[str, Terms] = {}
+        expires = [root.signed.expires, snapshot.signed.expires, top.signed.expires]
+        for role in _delegated(top.signed):
+            listed = _listed(metadata, role, snapshot.signed)
+            top.signed.verify_delegate(role, listed.signed_bytes, listed.signatures)
+            expires.append(listed.signed.expires)
+            for name, target in listed.signed.targets.items():
+                _require_target(folder / "targets", target)
+                bundles[name] = terms_of(target.custom)
+    except (RepositoryError, DeserializationError, OSError, ValueError, TermsError) as error:
+        raise PublicationError(
+            f"{folder} is not a complete publication: {error}; publish it again"
+        ) from error
+    return Publication(root.signed, version, bundles, min(expires))
+
+
+def next_timestamp(
+    publication: Publication, last: bytes | None, key: CryptoSigner, now: datetime.datetime
+) -> bytes | None:
+    """Return a new timestamp, or None if the last one is good. Raises `PublicationError`.
+
+    Versions follow the clock, so a collector that lost its state still signs later versions than before.
+    """
+    keyids = publication.root.roles["timestamp"].keyids
+    if key.public_key.keyid not in keyids:
+        raise PublicationError("the root names another timestamp key: copy timestamp.pem of the repository")
+    before = _signed_before(last, publication.root)
+    if before is not None:
+        if before.snapshot_meta.version > publication.snapshot:
+            there = f"snapshot {publication.snapshot} is older than {before.snapshot_meta.version}"
+            raise PublicationError(f"{there}, which robots know: publish the newest repository")
+        if before.snapshot_meta.version == publication.snapshot and before.expires - now > LIFETIME - _RENEW:
+            return None
+    least = 1 if before is None else before.version + 1
+    signed = Timestamp(
+        version=max(least, int(now.timestamp())),
+        expires=min(now + LIFETIME, publication.expires).replace(microsecond=0),
+        snapshot_meta=MetaFile(publication.snapshot),
+    )
+    document = Metadata(signed)
+    document.sign(key)
+    return document.to_bytes(JSONSerializer(compact=True))
+
+
+def _signed_before(last: bytes | None, root: Root) -> Timestamp | None:
+    """Return the last timestamp; None if the present root does not accept it: robots then discard it also."""
+    if last is None:
+        return None
+    try:
+        document = Metadata[Timestamp].from_bytes(last)
+        root.verify_delegate("timestamp", document.signed_bytes, document.signatures)
+    except (RepositoryError, DeserializationError, ValueError):
+        return None
+    return document.signed
+
+
+def _newest(metadata: Path, names: re.Pattern[str]) -> int:
+    found = [int(name[1]) for path in metadata.iterdir() if (name := names.fullmatch(path.name))]
+    if not found:
+        raise ValueError("there are no signed metadata")
+    return max(found)
+
+
+def _load(path: Path, kind: type[S]) -> Metadata[S]:
+    document = Metadata.from_file(str(path))
+    if not isinstance(document.signed, kind):
+        raise ValueError(f"{path.name} has other metadata than its name says")
+    return document
+
+
+def _listed(metadata: Path, role: str, snapshot: Snapshot) -> Metadata[Targets]:
+    meta = snapshot.meta.get(f"{role}.json")
+    if meta is None:
+        raise ValueError(f"the snapshot does not list {role}")
+    return _load(metadata / f"{meta.version}.{role}.json", Targets)
+
+
+def _delegated(top: Targets) -> list[str]:
+    return [] if top.delegations is None else list(top.delegations.roles or {})
+
+
+def _require_target(targets: Path, target: TargetFile) -> None:
+    for name in target.get_prefixed_paths():
+        target.verify_length_and_hashes((targets / name).read_bytes())

@@ -1,0 +1,282 @@
+"""Edit the operator's repository of bundles: delegate groups, add and withdraw bundles, sign, rotate keys.
+
+The repository is a folder on the operator's machine. `metadata/` and `targets/` are what the collector publishes
+(`publish`). `root.json` is what robots trust first. The keys are encrypted files in `keys/`, or anywhere else; the
+collector never gets them. It gets `timestamp.pem` only.
+
+Roles, by TUF's own guidance: root and targets sign seldom, so their keys are offline. Each group of a site has a
+delegated role with a path pattern of its own, so the holder of its key can sign for no other group. Bundles come from
+operators only, so the snapshot is signed offline together with them, and expires after weeks. Only the timestamp is
+online, because it is signed every few hours: a stolen timestamp key can freeze the fleet until the snapshot expires,
+but it cannot mix versions.
+
+Invariants:
+1. Metadata files are never changed: each new version is a new file. A killed command leaves the former state, and the
+   next one completes it.
+2. A snapshot lists only metadata that are on the disk.
+"""
+
+import datetime
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from tuf.api.metadata import (
+    DelegatedRole,
+    Delegations,
+    Metadata,
+    MetaFile,
+    Root,
+    Snapshot,
+    TargetFile,
+    Targets,
+)
+from tuf.api.serialization.json import JSONSerializer
+
+from appliance.base.atomic_files import write_whole
+from appliance.bundles.bundle_archive import pack
+from appliance.bundles.terms import BundlePath, Terms, custom_of, role_of
+from rosrv_fleet.bundles.keys import KeyFolder, make_online_key
+
+TIMESTAMP_KEY = "timestamp.pem"
+_TOP = ("root", "targets", "snapshot", "timestamp")
+_VERSIONED = re.compile(r"([1-9][0-9]*)\.(.+)\.json")
+S = TypeVar("S", Root, Targets, Snapshot)
+
+
+def _utc_now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+
+
+class RepositoryError(Exception):
+    """The repository cannot be changed like this; the text has the reason and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lifetimes:
+    """The days after which metadata expire."""
+
+    root: int = 365
+    targets: int = 180
+    group: int = 90
+    snapshot: int = 60
+
+
+class BundleRepository:
+    """A repository in a folder, with the keys that sign it. `now()` returns the present time in UTC."""
+
+    def __init__(
+        self,
+        folder: Path,
+        keys: KeyFolder,
+        lifetimes: Lifetimes | None = None,
+        now: Callable[[], datetime.datetime] = _utc_now,
+    ) -> None:
+        self.folder = folder
+        self.metadata = folder / "metadata"
+        self.targets = folder / "targets"
+        self._keys = keys
+        self._lifetimes = lifetimes or Lifetimes()
+        self.now = now
+
+    # --- commands ---
+
+    def init(self) -> None:
+        """Make the keys and the first metadata. Raises `RepositoryError` if there is a repository."""
+        if self.metadata.exists():
+            raise RepositoryError(f"{self.folder} has a repository: use it, or choose another folder")
+        self.metadata.mkdir(parents=True)
+        root = Root(consistent_snapshot=True)
+        for role in ("root", "targets", "snapshot"):
+            root.add_key(self._keys.make(role), role)
+        root.add_key(make_online_key(self.folder / TIMESTAMP_KEY), "timestamp")
+        self._save_root(root, root)
+        targets = Targets()
+        targets.delegations = Delegations({}, {})
+        self._save("targets", targets)
+        self.snapshot()
+
+    def delegate(self, site: str, group: str) -> None:
+        """Make a key and a role for a group of a site. Raises `RepositoryError` and `TermsError`."""
+        role = role_of(site, group)
+        top = self._open("targets", Targets)
+        if role in self._delegated(top):
+            raise RepositoryError(
+                f"{role} is delegated already; rotate its key with `rosrv-fleet bundle rotate`"
+            )
+        delegated = DelegatedRole(role, [], 1, terminating=True, paths=[f"{site}/{group}/*.tar"])
+        assert top.delegations is not None and top.delegations.roles is not None  # noqa: S101  made by `init`
+        top.delegations.roles[role] = delegated
+        top.add_key(self._keys.make(role), role)
+        self._save("targets", top)
+        self._save(role, Targets())
+        self.snapshot()
+
+    def add(
+        self, site: str, group: str, files: Mapping[str, bytes], terms: Terms, *, keep: int = 2
+    ) -> BundlePath:
+        """Sign a bundle of these files as the next version of a group, and withdraw all but the newest `keep`.
+
+        Raises `RepositoryError`, `TermsError` and `BundleArchiveError`.
+        """
+        role = self._require_role(site, group)
+        listed = self._open(role, Targets)
+        path = BundlePath(site, group, 1 + max([*self._versions(listed), self._last_version(site, group)]))
+        archive = pack(files)
+        target = TargetFile.from_data(str(path), archive, ["sha256"])
+        target.unrecognized_fields["custom"] = custom_of(terms)
+        (self.targets / site / group).mkdir(parents=True, exist_ok=True)
+        for name in target.get_prefixed_paths():
+            write_whole(self.targets / name, archive, 0o644)
+        listed.targets[str(path)] = target
+        for version in sorted(self._versions(listed))[: -max(1, keep)]:
+            del listed.targets[str(path._replace(version=version))]
+        self._save(role, listed)
+        self.snapshot()
+        return path
+
+    def withdraw(self, path: BundlePath) -> None:
+        """Sign a group's bundles without this one; no robot takes it any more. Raises `RepositoryError`."""
+        role = self._require_role(path.site, path.group)
+        listed = self._open(role, Targets)
+        if str(path) not in listed.targets:
+            known = ", ".join(listed.targets) or "none"
+            raise RepositoryError(f"{path} is not signed; signed are: {known}")
+        del listed.targets[str(path)]
+        self._save(role, listed)
+        self.snapshot()
+
+    def sign(self) -> None:
+        """Sign everything again with new expiry dates, except the root."""
+        for role in ("targets", *self.roles()):
+            self._save(role, self._open(role, Targets))
+        self.snapshot()
+
+    def rotate(self, role: str) -> None:
+        """Replace the key of a role. Raises `RepositoryError`.
+
+        A new root is signed with the old root key and the new one. If the snapshot or timestamp key is replaced, robots
+        discard what the old key signed, so they recover from versions that a thief set too high.
+        """
+        if role in _TOP:
+            before = self._open("root", Root)
+            root = self._open("root", Root)
+            key = (
+                make_online_key(self.folder / TIMESTAMP_KEY) if role == "timestamp" else self._keys.make(role)
+            )
+            for keyid in list(root.roles[role].keyids):
+                root.revoke_key(keyid, role)
+            root.add_key(key, role)
+            self._save_root(root, before)
+        elif role in self.roles():
+            top = self._open("targets", Targets)
+            for keyid in list(self._delegated(top)[role].keyids):
+                top.revoke_key(keyid, role)
+            top.add_key(self._keys.make(role), role)
+            self._save("targets", top)
+            self._save(role, self._open(role, Targets))
+        else:
+            raise RepositoryError(f"{role} is not a role; there are: {', '.join([*_TOP, *self.roles()])}")
+        if role == "targets":
+            self._save(role, self._open(role, Targets))
+        self.snapshot()
+
+    def renew_root(self) -> None:
+        """Sign the root again with a new expiry date."""
+        root = self._open("root", Root)
+        self._save_root(root, root)
+
+    # --- queries ---
+
+    def roles(self) -> list[str]:
+        """Return the delegated roles."""
+        return sorted(self._delegated(self._open("targets", Targets)))
+
+    def bundles(self) -> Iterator[tuple[BundlePath, TargetFile]]:
+        """Yield the signed bundles."""
+        for role in self.roles():
+            for name, target in self._open(role, Targets).targets.items():
+                yield BundlePath.parse(name), target
+
+    def expiries(self) -> dict[str, datetime.datetime]:
+        """Return when each role's metadata expire."""
+        found = {
+            "root": self._open("root", Root).expires,
+            "snapshot": self._open("snapshot", Snapshot).expires,
+        }
+        return found | {role: self._open(role, Targets).expires for role in ("targets", *self.roles())}
+
+    # --- signing ---
+
+    def snapshot(self) -> None:
+        """Sign a snapshot of the newest metadata."""
+        try:
+            snapshot = self._open("snapshot", Snapshot)
+        except RepositoryError:
+            snapshot = Snapshot()
+        snapshot.meta = {f"{role}.json": MetaFile(self._newest(role)) for role in ("targets", *self.roles())}
+        self._save("snapshot", snapshot)
+
+    def _save_root(self, root: Root, before: Root) -> None:
+        """Sign a root with its own keys and those of the former one; write it also as the robots' trusted root."""
+        keyids = {*before.roles["root"].keyids, *root.roles["root"].keyids}
+        path = self._save("root", root, keyids)
+        write_whole(self.folder / "root.json", path.read_bytes(), 0o644)
+
+    def _save(
+        self, role: str, signed: Root | Targets | Snapshot, keyids: Iterable[str] | None = None
+    ) -> Path:
+        """Sign the next version of a role and write it."""
+        signed.version = 1 + self._newest(role)
+        signed.expires = self.now() + datetime.timedelta(days=self._days(role))
+        document: Metadata[Any] = Metadata(signed)
+        wanted = set(self._keyids(role) if keyids is None else keyids)
+        for signer in self._keys.signers(role, wanted):
+            document.sign(signer, append=True)
+        path = self.metadata / f"{signed.version}.{role}.json"
+        write_whole(path, document.to_bytes(JSONSerializer(compact=False)), 0o644)
+        return path
+
+    def _days(self, role: str) -> int:
+        days = self._lifetimes
+        return {"root": days.root, "targets": days.targets, "snapshot": days.snapshot}.get(role, days.group)
+
+    def _keyids(self, role: str) -> list[str]:
+        if role in _TOP:
+            return list(self._open("root", Root).roles[role].keyids)
+        return list(self._delegated(self._open("targets", Targets))[role].keyids)
+
+    # --- reading ---
+
+    def _open(self, role: str, kind: type[S]) -> S:
+        version = self._newest(role)
+        if not version:
+            raise RepositoryError(f"{self.folder} is not a repository of bundles: rosrv-fleet bundle init")
+        signed = Metadata.from_file(str(self.metadata / f"{version}.{role}.json")).signed
+        if not isinstance(signed, kind):
+            raise RepositoryError(f"{version}.{role}.json has other metadata than its name says")
+        return signed
+
+    def _newest(self, role: str) -> int:
+        """Return the newest version of a role on the disk; 0 for none."""
+        names = (_VERSIONED.fullmatch(path.name) for path in self.metadata.glob("*.json"))
+        return max((int(name[1]) for name in names if name is not None and name[2] == role), default=0)
+
+    def _delegated(self, top: Targets) -> Mapping[str, DelegatedRole]:
+        return {} if top.delegations is None or top.delegations.roles is None else top.delegations.roles
+
+    def _require_role(self, site: str, group: str) -> str:
+        role = role_of(site, group)
+        if role not in self.roles():
+            raise RepositoryError(f"{role} is not delegated: rosrv-fleet bundle delegate {site} {group}")
+        return role
+
+    def _versions(self, listed: Targets) -> list[int]:
+        return [BundlePath.parse(name).version for name in listed.targets]
+
+    def _last_version(self, site: str, group: str) -> int:
+        """Return the last version that was ever made for a group, also if it was withdrawn."""
+        names = (path.name.split(".")[1] for path in (self.targets / site / group).glob("*.tar"))
+        return max(map(int, names), default=0)

@@ -1,0 +1,1 @@
+"""Rollouts: which robot gets which signed bundle, in rings that advance only while the robots stay healthy."""

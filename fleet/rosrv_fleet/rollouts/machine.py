@@ -1,0 +1,250 @@
+"""Advance a rollout from ring to ring while its robots stay healthy, and stop it when they do not. No I/O, no clock.
+
+A rollout brings one signed bundle to the robots of a group. The rings are in the bundle's signed terms. The collector
+opens one ring after the other.
+
+Invariants:
+1. A robot gets the bundle only if its ring is open, and no ring opens before its signed time.
+2. The next ring opens only after enough robots of all open rings have had the bundle in force, healthy, for a time
+   without interruption.
+3. If too many robots of an open ring are unhealthy, the rollout stops. Then no further robot gets the bundle, until an
+   operator decides. A stopped rollout never starts again automatically.
+4. Every selection is the bundle of the rollout or the one before it; nothing else.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import msgspec
+
+from appliance.bundles.terms import BundlePath, Terms
+
+RolloutState = Literal["running", "stopped", "reverted", "done"]
+
+
+class RobotSeen(msgspec.Struct, frozen=True):
+    """The last report of a robot, at `seen` (seconds since the epoch)."""
+
+    seen: float
+    in_force: str = ""
+    trying: str = ""
+    refused: str = ""
+    reason: str = ""
+    changed: bool = False
+    denials: int = 0
+    failing: int = 0
+    trouble: str = ""
+
+
+class HealthGates(msgspec.Struct, frozen=True):
+    """When a ring is healthy. Shares are of the ring's robots, times in seconds.
+
+    A ring is taken when `share` of its robots have the bundle in force. It stays so for `healthy_seconds` before the
+    next ring opens. More than `tolerance` unhealthy robots stop the rollout, and so does a ring that is not taken after
+    `ring_seconds`. A robot is unhealthy if it refused the bundle, was silent for `silent_seconds`, has more failing
+    monitors than before, or `denial_factor` times as many denials a minute (and at least `least_denials`).
+    """
+
+    share: float = 0.95
+    tolerance: float = 0.05
+    healthy_seconds: float = 600.0
+    ring_seconds: float = 3600.0
+    silent_seconds: float = 120.0
+    denial_factor: float = 3.0
+    least_denials: int = 10
+
+
+class Baseline(msgspec.Struct, frozen=True):
+    """A robot's health when its ring opened."""
+
+    denials: int
+    failing: int
+
+
+class Rollout(msgspec.Struct, frozen=True):
+    """A rollout of the bundle `path` over the bundle `before` (empty: none).
+
+    The rings up to `ring` are open; -1: none yet. `opened` is when the last one opened, `healthy` since when all open
+    rings have been taken and healthy (None: they are not). `baselines` has the robots that count for the gates: those
+    that were not silent when their ring opened. `why` explains the state.
+    """
+
+    path: str
+    before: str
+    terms: Terms
+    gates: HealthGates
+    started: float
+    state: RolloutState = "running"
+    ring: int = -1
+    opened: float = 0.0
+    healthy: float | None = None
+    baselines: dict[str, Baseline] = {}
+    why: str = ""
+
+    @property
+    def bundle(self) -> BundlePath:
+        """Return the parsed path."""
+        return BundlePath.parse(self.path)
+
+
+def ring_of(rollout: Rollout, robot: str) -> int:
+    """Return the index of a robot's ring."""
+    return rollout.terms.ring_of(robot, rollout.bundle)
+
+
+def selected(rollout: Rollout, robot: str, seen: RobotSeen | None) -> str:
+    """Return the bundle that a robot should have; empty for none.
+
+    After a stop, a robot keeps the bundle if it has it in force, and no other robot gets it.
+    """
+    if rollout.state == "reverted":
+        return rollout.before
+    if rollout.state == "done":
+        return rollout.path
+    if ring_of(rollout, robot) > rollout.ring:
+        return rollout.before
+    stays = rollout.state == "running" or (seen is not None and seen.in_force == rollout.path)
+    return rollout.path if stays else rollout.before
+
+
+def advanced(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
+    """Return the rollout after a look at the robots of the group at `now`."""
+    if rollout.state != "running":
+        return rollout
+    if rollout.ring < 0:
+        return _opened(rollout, robots, now)
+    unhealthy = _unhealthy_ring(rollout, robots, now)
+    if unhealthy:
+        return _stopped(rollout, unhealthy)
+    missing = _not_taken(rollout, robots)
+    if missing:
+        if now - rollout.opened > rollout.gates.ring_seconds:
+            return _stopped(rollout, f"{missing}, after {rollout.gates.ring_seconds:g} s")
+        return msgspec.structs.replace(rollout, healthy=None, why=missing)
+    return _healthy(rollout, robots, now)
+
+
+def _healthy(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
+    """Open the next ring, or end the rollout, if all open rings have been healthy for long enough."""
+    healthy = now if rollout.healthy is None else rollout.healthy
+    since = msgspec.structs.replace(rollout, healthy=healthy, why="healthy")
+    if now - healthy < rollout.gates.healthy_seconds:
+        return since
+    if rollout.ring + 1 == len(rollout.terms.rings):
+        return msgspec.structs.replace(since, state="done", why="in force in all rings")
+    return _opened(since, robots, now)
+
+
+def stopped(rollout: Rollout, why: str) -> Rollout:
+    """Return a running rollout stopped by an operator."""
+    return _stopped(rollout, why) if rollout.state == "running" else rollout
+
+
+def reverted(rollout: Rollout, why: str) -> Rollout:
+    """Return the rollout reverted: all robots get the bundle from before."""
+    return msgspec.structs.replace(rollout, state="reverted", healthy=None, why=why)
+
+
+def counts(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
+    """Return each ring with its number of robots, of those with the bundle in force, refusing, and unhealthy ones."""
+    sick = _sick(rollout, robots, now)
+    rows: list[dict[str, object]] = []
+    for index, ring in enumerate(rollout.terms.rings):
+        members = [robot for robot in robots if ring_of(rollout, robot) == index]
+        rows.append(
+            {
+                "name": ring.name,
+                "open": index <= rollout.ring,
+                "robots": len(members),
+                "in_force": sum(robots[robot].in_force == rollout.path for robot in members),
+                "refused": sum(robots[robot].refused == rollout.path for robot in members),
+                "unhealthy": sum(robot in sick for robot in members),
+            }
+        )
+    return rows
+
+
+def _opened(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
+    """Open the next ring, if its signed time has come."""
+    index = rollout.ring + 1
+    earliest = rollout.terms.signed + rollout.terms.rings[index].after
+    if now < earliest:
+        why = f"ring {rollout.terms.rings[index].name} is signed to begin in {earliest - now:.0f} s"
+        return msgspec.structs.replace(rollout, why=why)
+    fresh = {
+        robot: Baseline(seen.denials, seen.failing)
+        for robot, seen in robots.items()
+        if ring_of(rollout, robot) == index and now - seen.seen <= rollout.gates.silent_seconds
+    }
+    if not fresh and index == 0:
+        why = f"no robot of the first ring, {rollout.terms.rings[0].name}, reports"
+        return msgspec.structs.replace(rollout, why=why)
+    return msgspec.structs.replace(
+        rollout,
+        ring=index,
+        opened=now,
+        healthy=None,
+        baselines=rollout.baselines | fresh,
+        why=f"ring {rollout.terms.rings[index].name} is open",
+    )
+
+
+def _members(rollout: Rollout, index: int) -> list[str]:
+    return [robot for robot in rollout.baselines if ring_of(rollout, robot) == index]
+
+
+def _sick(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> dict[str, str]:
+    """Return the unhealthy robots of the open rings, each with the reason."""
+    found = {}
+    for robot, baseline in rollout.baselines.items():
+        seen = robots.get(robot)
+        why = "its report is gone" if seen is None else _why(rollout, seen, baseline, now)
+        if why:
+            found[robot] = why
+    return found
+
+
+def _why(rollout: Rollout, seen: RobotSeen, baseline: Baseline, now: float) -> str:
+    gates = rollout.gates
+    if now - seen.seen > gates.silent_seconds:
+        return f"silent for {now - seen.seen:.0f} s"
+    if seen.refused == rollout.path:
+        return f"refused: {seen.reason[:200]}"
+    if rollout.path not in (seen.in_force, seen.trying):
+        return ""
+    if seen.failing > baseline.failing:
+        return f"{seen.failing} monitors fail, {baseline.failing} before"
+    if seen.denials >= max(gates.least_denials, gates.denial_factor * max(1, baseline.denials)):
+        return f"{seen.denials} denials a minute, {baseline.denials} before"
+    return ""
+
+
+def _unhealthy_ring(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> str:
+    """Return which open ring has too many unhealthy robots; empty for none."""
+    sick = _sick(rollout, robots, now)
+    for index in range(rollout.ring + 1):
+        members = _members(rollout, index)
+        ill = [robot for robot in members if robot in sick]
+        if len(ill) > rollout.gates.tolerance * len(members):
+            return _why_sick(rollout, index, ill, len(members), sick[ill[0]])
+    return ""
+
+
+def _why_sick(rollout: Rollout, index: int, ill: Sequence[str], size: int, why: str) -> str:
+    name = rollout.terms.rings[index].name
+    return f"{len(ill)} of {size} robots of ring {name} are unhealthy, such as {ill[0]}: {why}"
+
+
+def _not_taken(rollout: Rollout, robots: Mapping[str, RobotSeen]) -> str:
+    """Return which open ring has not taken the bundle; empty if all have."""
+    for index in range(rollout.ring + 1):
+        members = _members(rollout, index)
+        taken = sum(robots[robot].in_force == rollout.path for robot in members if robot in robots)
+        if taken < rollout.gates.share * len(members):
+            name = rollout.terms.rings[index].name
+            return f"{taken} of {len(members)} robots of ring {name} have it in force"
+    return ""
+
+
+def _stopped(rollout: Rollout, why: str) -> Rollout:
+    return msgspec.structs.replace(rollout, state="stopped", healthy=None, why=why)

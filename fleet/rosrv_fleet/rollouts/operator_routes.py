@@ -1,0 +1,143 @@
+"""The REST operations of operators: published bundles, rollouts, and the robots of a group."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import msgspec
+from fastapi import APIRouter, Depends, HTTPException, Request
+from psycopg import Error as DatabaseError
+from pydantic import BaseModel, ConfigDict, Field
+
+from appliance.bundles.terms import BundlePath, TermsError
+from rosrv_fleet.rollouts.machine import HealthGates
+from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
+from rosrv_fleet.rollouts.store import Group
+
+Authorize = Callable[[Request], str]
+"""Returns the name of the operator; raises `HTTPException` if the request is not authorized."""
+
+_DEFAULTS = HealthGates()
+_HISTORY = 20
+
+
+class Gates(BaseModel):
+    """When a ring is healthy; see docs/fleet-bundles.md."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    share: Annotated[float, Field(gt=0, le=1)] = _DEFAULTS.share
+    tolerance: Annotated[float, Field(ge=0, lt=1)] = _DEFAULTS.tolerance
+    healthy_seconds: Annotated[float, Field(ge=0, le=604_800)] = _DEFAULTS.healthy_seconds
+    ring_seconds: Annotated[float, Field(gt=0, le=2_592_000)] = _DEFAULTS.ring_seconds
+    silent_seconds: Annotated[float, Field(ge=60, le=86_400)] = _DEFAULTS.silent_seconds
+    denial_factor: Annotated[float, Field(ge=1, le=1000)] = _DEFAULTS.denial_factor
+    least_denials: Annotated[int, Field(ge=1, le=1_000_000)] = _DEFAULTS.least_denials
+
+
+class NewRollout(BaseModel):
+    """A bundle to roll out, `SITE/GROUP/VERSION.tar`, and its health gates."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    bundle: Annotated[str, Field(max_length=160)]
+    gates: Gates = Gates()
+
+
+def operator_routes(service: BundleService, may_read: Authorize, may_change: Authorize) -> APIRouter:
+    """Return the routes for operators."""
+    router = APIRouter(prefix="/v1/rollouts", tags=["rollouts"])
+    reader = Annotated[str, Depends(may_read)]
+    changer = Annotated[str, Depends(may_change)]
+
+    @router.get("")
+    async def overview(_who: reader) -> dict[str, Any]:
+        """Return the published bundles, and the last rollout and the robots of each group."""
+        groups = sorted({*service.rollouts, *service.robots})
+        return {
+            "trouble": service.trouble,
+            "expires": None if service.publication is None else service.publication.expires.timestamp(),
+            "published": sorted(() if service.publication is None else service.publication.bundles),
+            "groups": [group_state(service, group) for group in groups],
+        }
+
+    @router.get("/{site}/{group}")
+    async def one(site: str, group: str, _who: reader) -> dict[str, Any]:
+        """Return a group's last rollout, its robots and its earlier rollouts."""
+        place = _group(service, site, group)
+        history = await _answered(asyncio.to_thread(service.store.history, place, _HISTORY))
+        robots = service.robots.get(place, {})
+        return group_state(service, place) | {
+            "robots": [{"name": name, **msgspec.structs.asdict(seen)} for name, seen in robots.items()],
+            "history": [
+                {"number": stored.number, "bundle": stored.rollout.path, "state": stored.rollout.state,
+                 "started": stored.rollout.started, "why": stored.rollout.why}
+                for stored in history
+            ],
+        }  # fmt: skip
+
+    @router.post("")
+    async def start(body: NewRollout, _who: changer) -> dict[str, Any]:
+        """Begin the rollout of a published bundle."""
+        try:
+            path = BundlePath.parse(body.bundle)
+        except TermsError as error:
+            raise HTTPException(422, str(error)) from error
+        await _answered(service.start(path, HealthGates(**body.gates.model_dump())))
+        return group_state(service, Group(path.site, path.group))
+
+    @router.post("/{site}/{group}/stop")
+    async def stop(site: str, group: str, who: changer) -> dict[str, Any]:
+        """Stop the running rollout: no further robot gets the bundle."""
+        place = _group(service, site, group)
+        await _answered(service.stop(place, who))
+        return group_state(service, place)
+
+    @router.post("/{site}/{group}/revert")
+    async def revert(site: str, group: str, who: changer) -> dict[str, Any]:
+        """Give all robots the bundle from before the last rollout."""
+        place = _group(service, site, group)
+        await _answered(service.revert(place, who))
+        return group_state(service, place)
+
+    return router
+
+
+def group_state(service: BundleService, group: Group) -> dict[str, Any]:
+    """Return a group's last rollout with its rings, and the number of its robots by state."""
+    robots, stored = service.robots.get(group, {}), service.rollouts.get(group)
+    state: dict[str, Any] = {
+        "site": group.site,
+        "group": group.group,
+        "robots_known": len(robots),
+        "rollout": None,
+    }
+    if stored is not None:
+        rollout = stored.rollout
+        state["rollout"] = {
+            "number": stored.number,
+            "bundle": rollout.path,
+            "before": rollout.before,
+            "state": rollout.state,
+            "why": rollout.why,
+            "started": rollout.started,
+            "rings": service.counts(group),
+        }
+    return state
+
+
+def _group(service: BundleService, site: str, group: str) -> Group:
+    try:
+        return service.group(site, group)
+    except RolloutRefusedError as error:
+        raise HTTPException(422, str(error)) from error
+
+
+async def _answered(work: Any) -> Any:
+    """Return the result of an order; its refusal is 409, a database that does not answer 503."""
+    try:
+        return await work
+    except RolloutRefusedError as error:
+        raise HTTPException(409, str(error)) from error
+    except DatabaseError as error:
+        raise HTTPException(503, "the database is unreachable: try again later") from error

@@ -1,0 +1,140 @@
+"""Store rollouts, robots' reports and the timestamp in PostgreSQL. Each method blocks: call it in a thread.
+
+Several collectors may share the database. A change of a rollout names the state that it was computed from, so a
+collector that is behind changes nothing.
+"""
+
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+from psycopg import Connection
+
+from rosrv_fleet.rollouts.machine import RobotSeen, Rollout
+
+MOST_ROBOTS = 100_000
+
+
+class Group(NamedTuple):
+    """A robot group of a site."""
+
+    site: str
+    group: str
+
+
+class StoredRollout(NamedTuple):
+    """A rollout with its number."""
+
+    number: int
+    rollout: Rollout
+
+
+class Connections(Protocol):
+    """A pool of connections to the database; `writing` runs a block in one transaction."""
+
+    def writing(self) -> AbstractContextManager[Connection[tuple[Any, ...]]]:
+        """Run a block in one transaction. Raises `psycopg.Error`."""
+
+
+class RolloutStore:
+    """The tables of rollouts in a database. Each method raises `psycopg.Error` if it does not answer."""
+
+    def __init__(self, database: Connections) -> None:
+        self._database = database
+
+    # --- robots ---
+
+    def save_report(self, name: str, group: Group, seen: RobotSeen) -> None:
+        """Store a robot's last report."""
+        query = """
+            INSERT INTO bundle_robot (name, site, robot_group, report) VALUES (%s, %s, %s, %s)
+            ON CONFLICT (name) DO UPDATE SET site = excluded.site, robot_group = excluded.robot_group,
+                report = excluded.report
+        """
+        document = msgspec.json.encode(seen).decode()
+        with self._database.writing() as connection:
+            connection.execute(query, (name, *group, document))
+
+    def robots(self) -> dict[Group, dict[str, RobotSeen]]:
+        """Return the last report of every robot, by group and name."""
+        query = "SELECT name, site, robot_group, report::text FROM bundle_robot ORDER BY name LIMIT %s"
+        found: dict[Group, dict[str, RobotSeen]] = {}
+        with self._database.writing() as connection:
+            cursor = connection.execute(query, (MOST_ROBOTS,))
+            for name, site, group, report in cursor:
+                found.setdefault(Group(site, group), {})[name] = msgspec.json.decode(report, type=RobotSeen)
+        return found
+
+    def forget(self, name: str) -> bool:
+        """Remove a robot's report; return whether there was one."""
+        with self._database.writing() as connection:
+            cursor = connection.execute("DELETE FROM bundle_robot WHERE name = %s", (name,))
+            return bool(cursor.rowcount)
+
+    # --- rollouts ---
+
+    def latest(self) -> dict[Group, StoredRollout]:
+        """Return the last rollout of every group."""
+        query = """
+            SELECT DISTINCT ON (site, robot_group) id, site, robot_group, document::text FROM rollout
+            ORDER BY site, robot_group, id DESC
+        """
+        with self._database.writing() as connection:
+            cursor = connection.execute(query)
+            return {
+                Group(site, group): StoredRollout(number, msgspec.json.decode(document, type=Rollout))
+                for number, site, group, document in cursor
+            }
+
+    def begin(self, group: Group, rollout: Rollout, now: float) -> int | None:
+        """Store a new rollout and return its number; None if one runs already."""
+        query = """
+            INSERT INTO rollout (site, robot_group, document, state, changed) VALUES (%s, %s, %s, %s, %s)
+            ON CONFLICT (site, robot_group) WHERE state = 'running' DO NOTHING RETURNING id
+        """
+        document = msgspec.json.encode(rollout).decode()
+        with self._database.writing() as connection:
+            cursor = connection.execute(query, (*group, document, rollout.state, now))
+            row = cursor.fetchone()
+        return None if row is None else int(row[0])
+
+    def replace(self, before: StoredRollout, rollout: Rollout, now: float) -> bool:
+        """Store a rollout's next state; return False if another collector or operator has changed it."""
+        query = """
+            UPDATE rollout SET document = %s, state = %s, changed = %s WHERE id = %s AND document = %s::jsonb
+        """
+        new, old = (msgspec.json.encode(one).decode() for one in (rollout, before.rollout))
+        with self._database.writing() as connection:
+            cursor = connection.execute(query, (new, rollout.state, now, before.number, old))
+            return cursor.rowcount == 1
+
+    def history(self, group: Group, limit: int) -> list[StoredRollout]:
+        """Return the last rollouts of a group, the newest first."""
+        query = """
+            SELECT id, document::text FROM rollout WHERE site = %s AND robot_group = %s ORDER BY id DESC LIMIT %s
+        """
+        with self._database.writing() as connection:
+            cursor = connection.execute(query, (*group, limit))
+            return [
+                StoredRollout(number, msgspec.json.decode(document, type=Rollout))
+                for number, document in cursor
+            ]
+
+    # --- the timestamp ---
+
+    def timestamp(self) -> bytes | None:
+        """Return the last timestamp, if there is one."""
+        with self._database.writing() as connection:
+            cursor = connection.execute("SELECT document FROM bundle_timestamp")
+            row = cursor.fetchone()
+        return None if row is None else bytes(row[0])
+
+    def save_timestamp(self, version: int, document: bytes) -> None:
+        """Store a timestamp, unless a later one is there."""
+        query = """
+            INSERT INTO bundle_timestamp (version, document) VALUES (%s, %s)
+            ON CONFLICT (one) DO UPDATE SET version = excluded.version, document = excluded.document
+            WHERE bundle_timestamp.version < excluded.version
+        """
+        with self._database.writing() as connection:
+            connection.execute(query, (version, document))

@@ -1,0 +1,174 @@
+"""Run the collector's bundles in a test: the real routes and rollouts, PostgreSQL, TLS with certificates."""
+
+import asyncio
+import os
+import pwd
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Coroutine, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import psycopg
+import rosrv_fleet
+import uvicorn
+from fastapi import FastAPI, HTTPException, Request
+from psycopg_pool import ConnectionPool
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
+from rosrv_fleet.bundles.robot_routes import robot_routes
+from rosrv_fleet.rollouts.operator_routes import operator_routes
+from rosrv_fleet.rollouts.service import BundleService
+from rosrv_fleet.rollouts.store import RolloutStore
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from tests.support.fleet_certificates import FleetAuthority
+
+T = TypeVar("T")
+_PROGRAMS = Path("/usr/lib/postgresql/15/bin")
+
+
+@contextmanager
+def database() -> Iterator[str]:
+    """Run a PostgreSQL server on a Unix socket, and return the address of its database."""
+    folder = Path(tempfile.mkdtemp(prefix="rosrv-pg-"))
+    user = pwd.getpwnam("postgres") if os.geteuid() == 0 else pwd.getpwuid(os.geteuid())
+    os.chown(folder, user.pw_uid, user.pw_gid)
+
+    def run(program: str, *arguments: str) -> None:
+        subprocess.run(
+            [str(_PROGRAMS / program), *arguments],
+            user=user.pw_uid if os.geteuid() == 0 else None,
+            group=user.pw_gid if os.geteuid() == 0 else None,
+            cwd=folder,
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
+
+    run("initdb", "-D", "data", "-U", "fleet", "-A", "trust", "--no-sync")
+    options = f"-c listen_addresses='' -c unix_socket_directories={folder} -c fsync=off"
+    run("pg_ctl", "-D", "data", "-o", options, "-w", "-l", "log", "start")
+    try:
+        yield f"postgresql://fleet@/postgres?host={folder}"
+    finally:
+        run("pg_ctl", "-D", "data", "-m", "immediate", "-w", "stop")
+        shutil.rmtree(folder)
+
+
+class _Connections:
+    """A pool of connections to a database with the tables of rollouts."""
+
+    def __init__(self, address: str) -> None:
+        self._pool = ConnectionPool(address, min_size=1, max_size=8, open=False)
+
+    def __enter__(self) -> Self:
+        self._pool.open(wait=True)
+        text = Path(rosrv_fleet.__file__).with_name("migrations").joinpath("0002_rollouts.sql").read_text()
+        with self.writing() as connection:
+            if connection.execute("SELECT to_regclass('rollout')").fetchone() == (None,):
+                connection.execute(text.encode())
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._pool.close()
+
+    @contextmanager
+    def writing(self) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
+        """Run a block in one transaction."""
+        with self._pool.connection() as connection:
+            yield connection
+
+
+class _Protocol(HttpToolsProtocol):
+    """HTTP with the name in the client's certificate."""
+
+    def on_message_begin(self) -> None:
+        super().on_message_begin()
+        certificate = self.transport.get_extra_info("peercert") or {}
+        names = dict(pair[0] for pair in certificate.get("subject", ()))
+        self.scope.setdefault("state", {})["robot"] = names.get("commonName", "")
+
+
+def _robot(request: Request) -> str:
+    name = str(request.state.robot)
+    if not name:
+        raise HTTPException(401, "a robot proves who it is with its certificate")
+    return name
+
+
+def _operator(request: Request) -> str:
+    if request.state.robot != "operator":
+        raise HTTPException(403, "for operators")
+    return "operator"
+
+
+class RolloutCollector:
+    """A running collector; `call` runs a coroutine in its event loop."""
+
+    def __init__(self, folder: Path, authority: FleetAuthority, address: str) -> None:
+        self._address = address
+        self._authority = authority
+        self.folder = folder
+        self.loop = asyncio.new_event_loop()
+        self.service: BundleService
+        self.url = ""
+        self._started = threading.Event()
+        self._thread = threading.Thread(target=self.loop.run_until_complete, args=(self._run(),), daemon=True)
+
+    def call(self, work: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine in the collector's loop and return its result."""
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(60)
+
+    def start(self) -> None:
+        """Start, and return when robots are served."""
+        self._thread.start()
+        assert self._started.wait(30)
+
+    def stop(self) -> None:
+        """Stop serving."""
+        self._server.should_exit = True
+        self._thread.join(20)
+        self.loop.close()
+
+    async def _run(self) -> None:
+        with _Connections(self._address) as pool:
+            self.service = BundleService(self.folder, self.folder / TIMESTAMP_KEY, RolloutStore(pool))
+            app = FastAPI()
+            app.include_router(robot_routes(self.service, _robot))
+            app.include_router(operator_routes(self.service, _operator, _operator))
+            config = uvicorn.Config(
+                app, host="127.0.0.1", port=0, http=_Protocol, log_level="warning", lifespan="off", backlog=2048,
+                timeout_graceful_shutdown=1,
+            )  # fmt: skip
+            config.load()
+            config.ssl = self._authority.server_context
+            self._server = uvicorn.Server(config)
+            work = asyncio.create_task(self.service.run())
+            serving = asyncio.create_task(self._serve())
+            await serving
+            work.cancel()
+            await asyncio.gather(work, return_exceptions=True)
+            await asyncio.get_running_loop().shutdown_default_executor()
+
+    async def _serve(self) -> None:
+        async def announce() -> None:
+            while not self._server.started:
+                await asyncio.sleep(0.02)
+            port = self._server.servers[0].sockets[0].getsockname()[1]
+            self.url = f"https://127.0.0.1:{port}"
+            self._started.set()
+
+        await asyncio.gather(self._server.serve(), announce())
+
+
+@contextmanager
+def collector(folder: Path, authority: FleetAuthority, address: str) -> Iterator[RolloutCollector]:
+    """Run a collector that publishes a folder."""
+    made = RolloutCollector(folder, authority, address)
+    made.start()
+    try:
+        yield made
+    finally:
+        made.stop()

@@ -1,0 +1,111 @@
+"""`rosrv-fleet bundle` from the first key to the collector's folder, as an operator types it."""
+
+from pathlib import Path
+
+import pytest
+from rosrv_fleet.bundles.commands import bundle
+from rosrv_fleet.bundles.publication import PublicationError, read_publication
+from typer.testing import CliRunner, Result
+
+from tests.support.bundle_site import PASSPHRASE, POLICY
+
+
+class Desk:
+    """An operator's folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.secret = folder / "passphrase"
+        self.secret.write_text(f"{PASSPHRASE}\n")
+        self.robot = folder / "arms"
+        self.robot.mkdir()
+        (self.robot / "policy.ini").write_text(POLICY)
+        (self.robot / "hosts.yaml").write_text("hosts: []\n")
+
+    def run(self, *words: str, secret: Path | None = None) -> Result:
+        """Run a command of `rosrv-fleet bundle`."""
+        options = ["--repository", str(self.folder / "repository")]
+        if words[0] not in ("list", "publish"):
+            options += ["--passphrase-file", str(secret or self.secret)]
+        return CliRunner().invoke(bundle, [*words, *options])
+
+    def good(self, *words: str) -> str:
+        """Run a command that succeeds; return its output."""
+        done = self.run(*words)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Desk:
+    """Return a folder with a repository and one group."""
+    made = Desk(tmp_path)
+    made.good("init")
+    made.good("delegate", "site-a/arms")
+    return made
+
+
+def test_a_bundle_from_the_folder_to_the_collector(desk: Desk) -> None:
+    """Add, publish, withdraw and sign again; the collector's folder has a complete publication after each publish."""
+    served = desk.folder / "served"
+    rings = ["--ring", "canary=arm-1", "--ring", "rest=100%+4h"]
+    assert "site-a/arms/1.tar: signed" in desk.good("add", "site-a/arms", str(desk.robot), *rings)
+    with pytest.raises(PublicationError):
+        read_publication(served)
+    desk.good("publish", str(served))
+    assert [ring.after for ring in read_publication(served).bundles["site-a/arms/1.tar"].rings] == [0, 14_400]
+    desk.good("add", "site-a/arms", str(desk.robot))
+    desk.good("withdraw", "site-a/arms/1.tar")
+    desk.good("rotate", "site-a.arms")
+    desk.good("sign", "--root")
+    desk.good("publish", str(served))
+    assert list(read_publication(served).bundles) == ["site-a/arms/2.tar"]
+    assert "site-a/arms/2.tar" in desk.good("list")
+    assert not list(served.rglob("*.pem"))
+
+
+def test_a_bundle_with_errors_is_not_signed(desk: Desk) -> None:
+    """Errors of all parts are shown at once, and nothing is signed."""
+    (desk.robot / "policy.ini").write_text("[Nodes]\nnonsense\n")
+    (desk.robot / "hosts.yaml").write_text("hosts: [{nam: x}]\n")
+    (desk.robot / "monitors").mkdir()
+    (desk.robot / "monitors" / "m.rv").write_text("m() {")
+    done = desk.run("add", "site-a/arms", str(desk.robot))
+    assert done.exit_code == 1
+    for place in ("policy.ini:2", "hosts.yaml:1", "m.rv:1", "nothing was signed"):
+        assert place in done.output
+    assert "arms/1.tar" not in desk.good("list")
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("init",), "has a repository"),
+        (("delegate", "site-a/arms"), "delegated already"),
+        (("delegate", "Site/arms"), "not a valid name"),
+        (("delegate", "site-a"), "SITE/GROUP"),
+        (("withdraw", "site-a/arms/7.tar"), "not signed"),
+        (("rotate", "nothing"), "not a role"),
+        (("add", "site-a/lifts", "arms"), "not delegated"),
+        (("add", "site-a/arms", "arms", "--ring", "x=50%"), "100 percent"),
+        (("add", "site-a/arms", "arms", "--ring", "x=y=z"), "not a ring"),
+    ],
+)
+def test_mistakes_are_explained(desk: Desk, words: tuple[str, ...], reason: str) -> None:
+    """A mistake ends with status 1 and a reason; nothing changes."""
+    given = [str(desk.robot) if word == "arms" else word for word in words]
+    done = desk.run(*given)
+    assert done.exit_code == 1
+    assert reason in done.output
+
+
+def test_a_wrong_passphrase_signs_nothing(desk: Desk) -> None:
+    """The keys are encrypted: without the passphrase nothing is signed."""
+    wrong = desk.folder / "wrong"
+    wrong.write_text("another passphrase\n")
+    done = desk.run("add", "site-a/arms", str(desk.robot), secret=wrong)
+    assert done.exit_code == 1
+    assert "passphrase is wrong" in done.output
+    for key in (desk.folder / "repository" / "keys").iterdir():
+        assert "ENCRYPTED" in key.read_text()
+        assert key.stat().st_mode & 0o077 == 0

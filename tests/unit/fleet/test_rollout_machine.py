@@ -1,0 +1,160 @@
+"""The state machine of rollouts keeps its invariants for all robots, reports and times."""
+
+from collections.abc import Mapping
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosrv_fleet.rollouts.machine import (
+    HealthGates,
+    RobotSeen,
+    Rollout,
+    advanced,
+    counts,
+    reverted,
+    ring_of,
+    selected,
+    stopped,
+)
+
+from appliance.bundles.terms import Ring, Terms
+
+OLD, NEW = "s/g/1.tar", "s/g/2.tar"
+RINGS = [Ring("canary", ["r0", "r1"], 0, 0), Ring("some", [], 40, 100), Ring("rest", [], 100, 100)]
+GATES = HealthGates(healthy_seconds=50, ring_seconds=1000, silent_seconds=120)
+ROBOTS = [f"r{number}" for number in range(20)]
+
+reports = st.builds(
+    RobotSeen,
+    seen=st.just(0.0),
+    in_force=st.sampled_from([OLD, NEW, NEW]),
+    refused=st.sampled_from(["", "", "", "", NEW]),
+    denials=st.sampled_from([0, 0, 0, 5, 40]),
+    failing=st.sampled_from([0, 0, 0, 0, 1]),
+)
+looks = st.lists(
+    st.tuples(
+        st.floats(0, 200),
+        st.dictionaries(st.sampled_from(ROBOTS), st.tuples(reports, st.sampled_from([0.0, 0.0, 500.0]))),
+    ),
+    max_size=30,
+)
+
+
+def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> Rollout:
+    """Return a new rollout at time 0."""
+    return Rollout(NEW, OLD, terms or Terms(0, RINGS), gates, 0.0)
+
+
+def all_at(now: float, in_force: str = NEW) -> dict[str, RobotSeen]:
+    """Return robots that all report the same, now."""
+    return {robot: RobotSeen(now, in_force) for robot in ROBOTS}
+
+
+@given(looks)
+def test_the_invariants_hold_for_all_reports(
+    steps: list[tuple[float, Mapping[str, tuple[RobotSeen, float]]]],
+) -> None:
+    """Rings open singly, never early, only after healthy ones; a stop is final; a selection is old or new."""
+    rollout, now = begun(), 0.0
+    robots = {robot: RobotSeen(0.0, OLD) for robot in ROBOTS}
+    for passed, news in steps:
+        now += passed
+        for robot, (seen, ago) in news.items():
+            robots[robot] = RobotSeen(
+                now - ago, seen.in_force, "", seen.refused, "", False, seen.denials, seen.failing
+            )
+        before, rollout = rollout, advanced(rollout, robots, now)
+        assert rollout.ring - before.ring in (0, 1)
+        if rollout.ring > before.ring:
+            assert now >= rollout.terms.rings[rollout.ring].after
+            if before.ring >= 0:
+                assert before.healthy is not None
+                assert now - before.healthy >= GATES.healthy_seconds
+        if before.state != "running":
+            assert rollout == before
+        if rollout.state == "done":
+            assert rollout.ring == len(RINGS) - 1
+        for robot, seen in robots.items():
+            choice = selected(rollout, robot, seen)
+            assert choice in (OLD, NEW)
+            if choice == NEW and rollout.state != "done":
+                assert ring_of(rollout, robot) <= rollout.ring
+            if rollout.state == "stopped":
+                assert choice == OLD or seen.in_force == NEW
+        assert sum(row["robots"] for row in counts(rollout, robots, now)) == len(ROBOTS)  # type: ignore[misc]
+
+
+def test_healthy_robots_finish_a_rollout() -> None:
+    """If all robots take the bundle and stay healthy, every ring opens and the rollout ends."""
+    rollout, now = begun(), 0.0
+    while rollout.state == "running" and now < 10_000:
+        robots = {robot: RobotSeen(now, selected(rollout, robot, None)) for robot in ROBOTS}
+        rollout, now = advanced(rollout, robots, now), now + 10
+    assert rollout.state == "done"
+    assert 200 <= now <= 400
+
+
+@pytest.mark.parametrize(
+    ("sick", "word"),
+    [
+        (RobotSeen(60, OLD, refused=NEW, reason="a test failed"), "refused: a test failed"),
+        (RobotSeen(60, NEW, denials=12), "12 denials a minute, 4 before"),
+        (RobotSeen(60, NEW, failing=1), "1 monitors fail"),
+        (RobotSeen(60, "", trying=NEW, denials=12), "denials"),
+        (RobotSeen(-200, NEW), "silent"),
+        (None, "report is gone"),
+    ],
+)
+def test_a_bad_canary_stops(sick: RobotSeen | None, word: str) -> None:
+    """One canary that refuses, denies more, fails or is silent stops the rollout, with the reason."""
+    known = {robot: RobotSeen(0, OLD, denials=4) for robot in ROBOTS}
+    rollout = advanced(begun(), known, 0)
+    assert rollout.ring == 0
+    robots = all_at(60)
+    if sick is None:
+        del robots["r1"]
+    else:
+        robots["r1"] = sick
+    rollout = advanced(rollout, robots, 60)
+    assert rollout.state == "stopped"
+    assert word in rollout.why
+    assert selected(rollout, "r0", robots["r0"]) == NEW  # in force there: it stays
+    assert selected(rollout, "r0", RobotSeen(60, OLD)) == OLD
+    assert selected(rollout, "r5", robots["r5"]) == OLD
+    assert selected(reverted(rollout, ""), "r0", robots["r0"]) == OLD
+
+
+def test_more_denials_of_the_old_bundle_do_not_stop() -> None:
+    """A canary that still has the former bundle does not count against the new one."""
+    rollout = advanced(begun(), all_at(0, OLD), 0)
+    robots = all_at(60, OLD) | {"r0": RobotSeen(60, OLD, denials=90, failing=3)}
+    assert advanced(rollout, robots, 60).state == "running"
+
+
+def test_robots_that_were_off_do_not_count() -> None:
+    """A robot that was silent before its ring opened neither stops nor holds up the rollout."""
+    robots = all_at(0) | {"r1": RobotSeen(-5000, OLD)}
+    rollout = advanced(begun(), robots, 0)
+    for now in (10.0, 70.0, 130.0):
+        robots = all_at(now) | {"r1": RobotSeen(-5000, OLD)}
+        rollout = advanced(rollout, robots, now)
+    assert rollout.state == "running"
+    assert rollout.ring >= 1
+
+
+def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
+    """If robots neither take nor refuse the bundle, the rollout stops after `ring_seconds`."""
+    rollout = advanced(begun(), all_at(0, OLD), 0)
+    assert advanced(rollout, all_at(900, OLD), 900).state == "running"
+    late = advanced(rollout, all_at(1001, OLD), 1001)
+    assert late.state == "stopped"
+    assert "0 of 2 robots of ring canary" in late.why
+
+
+def test_a_canary_ring_without_robots_waits() -> None:
+    """Without a reporting canary no ring opens."""
+    rollout = advanced(begun(), {"r9": RobotSeen(0, OLD)}, 0)
+    assert rollout.ring == -1
+    assert "no robot of the first ring" in rollout.why
+    assert stopped(rollout, "by hand").state == "stopped"
