@@ -21,7 +21,7 @@ LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_agai
 	tests/unit/recorder/test_killed.py tests/unit/relay/transport/test_pump_fuzzer.py
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
-.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site release bench clean
+.PHONY: help setup demo check static unit test units nodes test-system test-fleet system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -80,6 +80,10 @@ system-namespaces:
 
 system-nodes: build/collected
 	$(PYTEST) $(LONGEST_NODES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+
+test-fleet: ## the collector: real logs, PostgreSQL, kills and attacks; `make test-system` runs it, too
+	@scripts/setup --system
+	$(PYTEST) tests/unit/fleet tests/system/fleet -n auto --dist loadfile --quiet --durations=5
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system

@@ -32,7 +32,8 @@ from appliance.bundles.terms import Ring
 from appliance.bundles.verified_bundles import VerifiedBundles
 from appliance.channel.messages import BundleOffered, BundleStated
 from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
-from tests.support.rollout_collector import RolloutCollector, collector, database
+from tests.support.rollout_collector import RolloutCollector, collector
+from tests.system.fleet.postgres import postgres
 
 _INTERVAL = 300.0
 _PAUSE = threading.Event()  # never set
@@ -104,7 +105,10 @@ def main() -> None:
     names = [f"robot-{number}" for number in range(wanted.robots)]
     certificates = [(name, *site.authority.issue(name)) for name in names]
     end = multiprocessing.get_context("spawn").Event()
-    with database() as address, collector(site.repository.folder, site.authority, address) as running:
+    with (
+        postgres() as cluster,
+        collector(site.repository.folder, site.authority, cluster.create("bundles")) as running,
+    ):
         operator = httpx.Client(
             base_url=running.url,
             verify=robot_context(site.authority.ca, *site.authority.issue("operator")),

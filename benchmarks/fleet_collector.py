@@ -52,11 +52,11 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp(prefix="rosrv-bench-"))
     try:
         with postgres() as cluster:
-            cluster.kill()
+            cluster.stop()
             cluster.start(shared_buffers="512MB", maintenance_work_mem="1GB", max_wal_size="4GB")
             site = FleetSite(folder / "site", cluster.create("bench"))
             _fill(site.database, given.rows)
-            cluster.kill()
+            cluster.stop()
             cluster.start(shared_buffers="512MB", fsync="on")
             with running(site):
                 _measure(site, cluster, given)
@@ -81,7 +81,8 @@ def _fill(database: str, rows: int) -> None:
             day = today - timedelta(back + 1)
             name = f"record_{day:%Y%m%d}"
             connection.execute(
-                f"CREATE TABLE {name} PARTITION OF record FOR VALUES FROM ('{day}') TO ('{day + timedelta(1)}')".encode()
+                f"CREATE TABLE {name} PARTITION OF record FOR VALUES"
+                f" FROM ('{day}') TO ('{day + timedelta(1)}')".encode()
             )
             with connection.cursor().copy(f"COPY {name} FROM STDIN".encode()) as copy:
                 for block in _blocks(day.isoformat(), rows // _DAYS, back):
@@ -119,11 +120,15 @@ def _row(day: str, begin: int, step: int, number: int, chance: random.Random) ->
         ("deny", "warning" if chance.random() < 0.1 else "notice") if denied else ("allow", "info")
     )
     reason = f"no rule lets {host} publish" if denied else f"[Publishers] /cmd_{topic} lets it"
-    return (
-        f"{day}\tsim{robot:04}\tsim\t{number}\t{moment:020x}\t{moment}\t1\tdecision\t{severity}\t{decision}\t10.0.{host // 250}."
-        f"{host % 250}\t/node{host}\tpublish\t/cmd_{topic}\tPublishers\t/cmd_*\trobot.ini\t12\t3\t{reason}\t40\t"
-        f'{{"call":"registerPublisher","node":"/node{host}","type":"geometry_msgs/Twist","serial":{number}}}\t\\N\n'
+    detail = (
+        f'{{"call":"registerPublisher","node":"/node{host}","type":"geometry_msgs/Twist","serial":{number}}}'
     )
+    fields = (
+        day, f"sim{robot:04}", "sim", number, f"{moment:020x}", moment, 1, "decision", severity, decision,
+        f"10.0.{host // 250}.{host % 250}", f"/node{host}", "publish", f"/cmd_{topic}", "Publishers", "/cmd_*",
+        "robot.ini", 12, 3, reason, 40, detail, "\\N",
+    )  # fmt: skip
+    return "\t".join(map(str, fields)) + "\n"
 
 
 # --- robots and searches ---------------------------------------------------------------------------------------------
@@ -164,20 +169,20 @@ def _measure(site: FleetSite, cluster: Any, given: argparse.Namespace) -> None:
     proofs = [json.loads(line) for line in site.run("verify", "--json").stdout.splitlines()]
     records = sum(proof["records"] for proof in proofs)
     missing = sum(proof["missing"] for proof in proofs)
+    rate = records / elapsed
     print(
-        f"{len(robots)} robots: {records} records in {elapsed:.0f} s = {records / elapsed:.1f} records/s; {missing} missing"
+        f"robots: {len(robots)}, {records} records in {elapsed:.0f} s = {rate:.1f} records/s; missing: {missing}"
     )
     print(f"kills: {given.kills}; searches that failed while a process was down: {failed}")
     lags.sort()
     print(
-        f"from record to receipt (a segment at a time): median {statistics.median(lags):.1f} s, p95 {_quantile(lags, 0.95):.1f} s"
+        f"from record to receipt: median {statistics.median(lags):.1f} s, p95 {_quantile(lags, 0.95):.1f} s"
     )
     everything = sorted(itertools.chain.from_iterable(spent.values()))
     for name, times in [*spent.items(), ("all searches", everything)]:
         times.sort()
-        print(
-            f"  {name:24} n={len(times):4} p50={_quantile(times, 0.5) * 1e3:7.1f} ms p95={_quantile(times, 0.95) * 1e3:7.1f} ms max={times[-1] * 1e3:7.1f} ms"
-        )
+        p50, p95, most = (1e3 * one for one in (_quantile(times, 0.5), _quantile(times, 0.95), times[-1]))
+        print(f"  {name:24} n={len(times):4} p50={p50:7.1f} ms p95={p95:7.1f} ms max={most:7.1f} ms")
     print(f"this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
     for robot in robots:
         robot.close()
@@ -232,6 +237,7 @@ def _search(site: FleetSite, chance: random.Random, spent: dict[str, list[float]
             answer = client.get("/v1/search", params=kinds[name](chance), headers=headers)
         except httpx.TransportError:
             failed += 1
+            threading.Event().wait(0.2)
             continue
         if answer.status_code == 200:
             spent[name].append(time.monotonic() - begun)

@@ -35,7 +35,7 @@ from appliance.audit.log_writer import ChainWriter
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.repetition import summary
-from appliance.audit.retention import ReceiptFloor, Retention
+from appliance.audit.retention import Retention
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
 from appliance.audit.waiters import Waiter, answer
 from appliance.quotas.pool import QuotaClass
@@ -86,8 +86,7 @@ class AuditLog:
     `checkpoint_every` records or `checkpoint_seconds`. The log's thread then calls `signer(number, text)`, and the
     owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
     a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that
-    lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free. Then
-    retention by age does not wait for `receipts` either.
+    lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free.
     """
 
     def __init__(
@@ -103,7 +102,6 @@ class AuditLog:
         retention: Retention | None = None,
         budget: Budget | None = None,
         reserve: int = AUDIT_RESERVE.bounds.whole,
-        receipts: ReceiptFloor | None = None,
         queue_limit: int = 100_000,
         held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  ignored
         clock: Callable[[], int] = time.time_ns,
@@ -130,7 +128,6 @@ class AuditLog:
                 removals,
                 clock=clock,
                 report=lambda reason, detail: self._own("records removed", Severity.NOTICE, reason, detail),
-                waits_for=lambda: None if receipts is None or self._room.scarce else receipts.through,
             ),
             clock=clock,
             make=self._own,

@@ -30,10 +30,7 @@ class _Wanted(NamedTuple):
 
 
 class Remover:
-    """Applies a log's retention, on the log's thread; `approve` requests a signature, `report` makes the record.
-
-    By age, only records up to the sequence `waits_for()` are removed; None: any.
-    """
+    """Applies a log's retention, on the log's thread; `approve` requests a signature, `report` makes the record."""
 
     def __init__(
         self,
@@ -43,14 +40,12 @@ class Remover:
         *,
         clock: Callable[[], int],
         report: Callable[[str, dict[str, object]], AuditRecord],
-        waits_for: Callable[[], int | None] = lambda: None,
     ) -> None:
         self._retention = retention
         self._signatures = signatures
         self._approve = approve
         self._clock = clock
         self._report = report
-        self._waits_for = waits_for
         self._wanted: _Wanted | None = None
         self._asked = self._aged = self._refused = 0.0
         self.due = 0.0
@@ -124,12 +119,9 @@ class Remover:
         gone = writer.removable(
             _AT_ONCE, signed=signed, between=(self._retention.oldest_kept(present), present)
         )
-        if gone is None:
+        if gone is None or gone.last_sequence > self._retention.collected():
             self._aged = now + _AGE_SECONDS
             return None
-        received = self._waits_for()
-        if received is not None and gone.last_sequence > received:
-            return None  # the collector does not have them yet
         return _Wanted(gone, f"older than {self._retention.days} days", by_size=False)
 
     def _remove(self, writer: ChainWriter, wanted: _Wanted, proof: dict[str, object]) -> None:

@@ -9,7 +9,7 @@ from one host cannot displace the records of another.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -22,27 +22,16 @@ _UNKNOWN_HOSTS = "(unknown hosts)"
 _DAY = 86_400_000_000_000
 
 
-class ReceiptFloor:
-    """The last record that the collector has a receipt for, if retention by age waits for it (None: it does not).
-
-    One thread writes it, another reads it.
-    """
-
-    def __init__(self, *, waits: bool = False) -> None:
-        self.through: int | None = 0 if waits else None
-
-    def received(self, sequence: int) -> None:
-        """Note that the collector has all records up to this sequence."""
-        if self.through is not None:
-            self.through = sequence
-
-
 @dataclass(frozen=True)
 class Retention:
-    """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any)."""
+    """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any).
+
+    By age, only records up to the sequence `collected()` are removed.
+    """
 
     days: float | None = None
     size: int | None = None
+    collected: Callable[[], int] = lambda: 1 << 63
 
     def __post_init__(self) -> None:
         if (self.days is not None and self.days <= 0) or (self.size is not None and self.size < 1 << 20):
@@ -50,9 +39,8 @@ class Retention:
 
     def excess(self, size: int) -> str | None:
         """Return why a log of `size` bytes is too large, or None."""
-        if self.size is None or size <= self.size:
-            return None
-        return f"the log was larger than {self.size} bytes"
+        too_large = self.size is not None and size > self.size
+        return f"the log was larger than {self.size} bytes" if too_large else None
 
     def oldest_kept(self, now: int) -> int:
         """Return the age limit in nanoseconds since the epoch; 0 without one."""

@@ -494,17 +494,24 @@ class Fleet:
 
     def __post_init__(self) -> None:
         if self.collector is None:
-            if any(getattr(self, field.name) != field.default for field in dataclasses.fields(self)):
+            files = (self.ca, self.certificate, self.key, self.receipt_key)
+            if any((self.name, *files, self.robot, self.retention_waits, self.bundles != Bundles())):
                 raise ValueError("the section has no effect without collector")
             return
-        needed: dict[str, Path | str | None] = {"ca": self.ca, "certificate": self.certificate, "key": self.key}
+        needed: dict[str, Path | str | None] = {
+            "ca": self.ca,
+            "certificate": self.certificate,
+            "key": self.key,
+        }
         if self.bundles.root is not None:
             needed |= {"robot": self.robot}
         missing = [name for name, value in needed.items() if not value]
         if missing:
             raise ValueError(f"{', '.join(missing)} must be given with collector")
         if self.receipt_key is None and self.bundles.root is None:
-            raise ValueError("collector needs receipt_key, to push segments, or bundles.root, to take bundles")
+            raise ValueError(
+                "collector needs receipt_key, to push segments, or bundles.root, to take bundles"
+            )
         if self.receipt_key is None and self.retention_waits:
             raise ValueError("retention_waits has no effect without receipt_key")
 

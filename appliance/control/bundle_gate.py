@@ -244,7 +244,7 @@ class BundleGate:
         sources = Sources(contents.files, contents.definitions, contents.signatures)
         await self._monitors.take_bundle(sources, trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
-        await self._policies.load(load, trial.who, _cases(contents))
+        await self._policies.load_with(load, trial.who, _cases(contents))
         await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
 
     async def _watched(self, before: RobotHealth) -> str:

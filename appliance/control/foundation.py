@@ -10,7 +10,6 @@ import structlog
 
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
-from appliance.audit.retention import ReceiptFloor
 from appliance.configuration.settings import Settings
 from appliance.control.host_authority import HostAuthority, make_host_authority
 from appliance.control.host_blocks import BlockTable
@@ -20,7 +19,7 @@ from appliance.control.policies import Policies
 from appliance.control.quota_class import HostQuotaClass, charged_to
 from appliance.control.replication import Pair, Replication, make_replication
 from appliance.control.robot import robot_addresses
-from appliance.control.signer_requests import SignerRequests
+from appliance.control.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DeclaredHosts
@@ -114,7 +113,7 @@ async def make_foundation(
     """
     audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
     signing = SignerRequests(audit)
-    receipts = ReceiptFloor(waits=settings.fleet.retention_waits)
+    receipts = ReceiptFloor(settings)
     held_by = lifeline.log_held()
     audit.set(open_audit(settings, signing, held_by, lambda host: _class_of(quota_class, host), receipts))
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
-from appliance.audit.retention import ReceiptFloor, Retention
+from appliance.audit.retention import Retention
 from appliance.configuration.settings import Settings
-from appliance.control.signer_requests import SignerRequests
+from appliance.control.signer_requests import ReceiptFloor, SignerRequests
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 
@@ -20,8 +20,10 @@ def open_audit(
     class_of: Callable[[str], QuotaClass],
     receipts: ReceiptFloor,
 ) -> AuditLog:
-    """Return the audit log. `class_of` returns a host's quota class; `held_by` gets processes that lock it;
-    `receipts` holds back retention."""
+    """Return the audit log.
+
+    `class_of` returns a host's quota class; `held_by` gets processes that lock it; `receipts` limits retention by age.
+    """
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
         int(audit.reserve_bytes), int(audit.reserve_bytes) // _HOSTS_IN_RESERVE
@@ -36,9 +38,9 @@ def open_audit(
         held_by=held_by,
         budget=Budget(class_of, reserve=reserve),
         reserve=reserve.whole,
-        receipts=receipts,
         retention=Retention(
             days=audit.retention_days,
             size=None if audit.retention_bytes is None else int(audit.retention_bytes),
+            collected=receipts.through,
         ),
     )

@@ -172,13 +172,16 @@ class Policies(Revisions[RevisionRow]):
         """Compile and test a text without loading it. Raises `PolicyRefusedError`."""
         await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
 
-    async def load(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None = None) -> Loaded:
+    async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a given text into force, as `reload` does with the file.
 
-        `cases` replace the test cases beside the file. Loading the same text again makes no new revision. Messages cite
-        its rules as `revision N:line`, because the lines of the file may differ. Raises `PolicyRefusedError` and
-        `RevisionChangedError`.
+        Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
+        lines of the file may differ. Raises `PolicyRefusedError` and `RevisionChangedError`.
         """
+        return await self.load_with(request, who, None)
+
+    async def load_with(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None) -> Loaded:
+        """Load as `load` does, with test cases that replace those beside the file (None: those of the file)."""
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
             now = self.in_force

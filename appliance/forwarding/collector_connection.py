@@ -45,11 +45,29 @@ class CollectorLink(Protocol):
         """Close the connection, if there is one."""
 
 
-class HttpsCollector:
-    """The collector at an address; `context` makes the TLS context of each connection."""
+class _NamedConnection(http.client.HTTPSConnection):
+    """A connection to a server whose certificate has the name `server`."""
 
-    def __init__(self, host: str, port: int, context: Callable[[], ssl.SSLContext]) -> None:
+    def __init__(self, place: tuple[str, int], server: str, context: ssl.SSLContext) -> None:
+        super().__init__(*place, timeout=_SECONDS, context=context)
+        self._tls, self._server = context, server
+
+    def connect(self) -> None:
+        http.client.HTTPConnection.connect(self)
+        self.sock = self._tls.wrap_socket(self.sock, server_hostname=self._server)
+
+
+class HttpsCollector:
+    """The collector at an address; `context` makes the TLS context of each connection.
+
+    `name` is the name in the collector's certificate (None: the address).
+    """
+
+    def __init__(
+        self, host: str, port: int, context: Callable[[], ssl.SSLContext], name: str | None = None
+    ) -> None:
         self._place = (host, port)
+        self._name = name or host
         self._context = context
         self._connection: http.client.HTTPSConnection | None = None
 
@@ -65,8 +83,7 @@ class HttpsCollector:
     def _ask(self, method: str, path: str, body: IO[bytes] | None = None, size: int = 0) -> bytes:
         connection = self._connection
         if connection is None:
-            context = self._context()
-            connection = http.client.HTTPSConnection(*self._place, timeout=_SECONDS, context=context)
+            connection = _NamedConnection(self._place, self._name, self._context())
             self._connection = connection
         headers = {} if body is None else {"Content-Length": str(size), "Content-Encoding": "gzip"}
         try:
@@ -100,7 +117,9 @@ class HttpsCollector:
             self._connection = None
 
 
-def https_collector(address: tuple[str, int], ca: Path, certificate: Path, key: Path) -> HttpsCollector:
+def https_collector(
+    address: tuple[str, int], ca: Path, certificate: Path, key: Path, name: str | None = None
+) -> HttpsCollector:
     """Return the collector at an address; files are read for each connection, so that replaced ones apply."""
 
     def context() -> ssl.SSLContext:
@@ -112,4 +131,4 @@ def https_collector(address: tuple[str, int], ca: Path, certificate: Path, key: 
             raise OSError(f"{ca}, {certificate}, {key}: cannot be read: {error.strerror or error}") from error
         return made
 
-    return HttpsCollector(*address, context)
+    return HttpsCollector(*address, context, name)

@@ -24,6 +24,6 @@ def make_pusher(settings: Settings, folder: Path) -> SegmentPusher:
     return SegmentPusher(
         settings.state / "control" / "audit.db",
         folder,
-        https_collector(fleet.destination, fleet.ca, fleet.certificate, fleet.key),
+        https_collector(fleet.destination, fleet.ca, fleet.certificate, fleet.key, fleet.name),
         read_public_key(fleet.receipt_key),
     )

@@ -250,7 +250,9 @@ def _supervise(
                 syslog_reads=_files_of_syslog(settings),
                 syslog_port=_port_of_syslog(settings),
                 fleet_reads=_files_of_fleet(settings),
-                collector_port=settings.fleet.destination[1] if settings.fleet.collector is not None else None,
+                collector_port=settings.fleet.destination[1]
+                if settings.fleet.collector is not None
+                else None,
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
             ),
             admin=state.open_admin_socket(),

@@ -13,6 +13,15 @@ COOKIE = "__Host-rosrv-fleet"
 """The console's cookie: only over TLS, for this host, for no script."""
 
 
+def name_of(identify: Callable[[Request], Robot | OperatorToken]) -> Callable[[Request], str]:
+    """Return the dependency that identifies the same caller, by name."""
+
+    def named(request: Request) -> str:
+        return identify(request).name
+
+    return named
+
+
 def robot_of(robots: Robots) -> Callable[[Request], Robot]:
     """Return the dependency that identifies a robot; it answers 403 for any other caller."""
 

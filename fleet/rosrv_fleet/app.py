@@ -7,23 +7,41 @@ from contextlib import asynccontextmanager
 
 from fastapi import APIRouter, FastAPI
 
+from rosrv_fleet.access import holder_of, name_of, robot_of
+from rosrv_fleet.bundles.robot_routes import robot_routes
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.console_routes import console_router
 from rosrv_fleet.health_routes import health_router
 from rosrv_fleet.push_routes import push_router
+from rosrv_fleet.rollouts.operator_routes import operator_routes
 from rosrv_fleet.search_routes import search_router
+from rosrv_fleet.tokens import FleetRole
+
+
+def bundle_router(collector: Collector) -> APIRouter:
+    """Return the routes of bundles and rollouts; none if the collector has no bundles."""
+    router = APIRouter()
+    if collector.bundles is not None:
+        reader, changer = (
+            name_of(holder_of(collector.tokens, role)) for role in (FleetRole.VIEWER, FleetRole.OPERATOR)
+        )
+        router.include_router(robot_routes(collector.bundles, name_of(robot_of(collector.robots))))
+        router.include_router(operator_routes(collector.bundles, reader, changer))
+    return router
+
 
 ROUTERS: tuple[Callable[[Collector], APIRouter], ...] = (
     push_router,
     search_router,
     health_router,
     console_router,
+    bundle_router,
 )
 """The parts of the API. To add one, write a function that returns its router, and name it here."""
 
 
 def make_app(collector: Collector) -> FastAPI:
-    """Return the application; its lifespan runs the indexer and the database's connections."""
+    """Return the application; its lifespan runs the indexer, the bundles and the database's connections."""
 
     @asynccontextmanager
     async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
@@ -31,9 +49,13 @@ def make_app(collector: Collector) -> FastAPI:
         collector.database.open()
         indexing = threading.Thread(target=collector.indexer.run, name="indexer", daemon=True)
         indexing.start()
+        bundles = [] if collector.bundles is None else [asyncio.create_task(collector.bundles.run())]
         try:
             yield
         finally:
+            for task in bundles:
+                task.cancel()
+            await asyncio.gather(*bundles, return_exceptions=True)
             collector.indexer.stop()
             await asyncio.to_thread(indexing.join, 30.0)
             collector.database.close()

@@ -1,4 +1,4 @@
-"""The command `rosrv-fleet`: run the collector, enrol robots, make tokens, search, verify, and rebuild the index."""
+"""The command `rosrv-fleet`: run the collector, enrol robots, make tokens, search, verify, roll out bundles."""
 
 import json
 import logging
@@ -16,12 +16,14 @@ import typer
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import printable
 from appliance.base.timestamps import TimestampError
+from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import ConfigError, FleetConfig, load_config
 from rosrv_fleet.database import migrate
 from rosrv_fleet.filtering import searched
 from rosrv_fleet.receipt_key import ReceiptKeyError, make_receipt_key
 from rosrv_fleet.robots import EnrolmentError, Robots, make_folder
+from rosrv_fleet.rollouts.commands import rollout
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
 from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.segment_store import SegmentStore
@@ -34,6 +36,8 @@ robot_app = typer.Typer(no_args_is_help=True, help="Enrol robots, renew and remo
 token_app = typer.Typer(no_args_is_help=True, help="Make and remove tokens of operators.")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
+app.add_typer(bundle, name="bundle")
+app.add_typer(rollout, name="rollout")
 _ERRORS = (
     ConfigError, EnrolmentError, TokenError, ReceiptKeyError, FilterError, TimestampError, SearchTooLongError,
     IndexDownError, OSError, ssl.SSLError, psycopg.Error, msgspec.MsgspecError,

@@ -9,10 +9,13 @@ from rosrv_fleet.database import Database
 from rosrv_fleet.indexer import Indexer
 from rosrv_fleet.receipt_key import read_receipt_key
 from rosrv_fleet.robots import Robots
+from rosrv_fleet.rollouts.service import BundleService
+from rosrv_fleet.rollouts.store import RolloutStore
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.tokens import Tokens
 
 _INDEX_CONNECTIONS = 2
+_BUNDLE_CONNECTIONS = 4
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,7 @@ class Collector:
     store: SegmentStore
     indexer: Indexer
     receipt_key: Ed25519PrivateKey
+    bundles: BundleService | None
 
 
 def make_collector(config: FleetConfig) -> Collector:
@@ -36,9 +40,12 @@ def make_collector(config: FleetConfig) -> Collector:
     store = SegmentStore(config.data, limits.reserve_bytes)
     database = Database(
         config.database,
-        connections=limits.searches + _INDEX_CONNECTIONS,
+        connections=limits.searches + _INDEX_CONNECTIONS + (_BUNDLE_CONNECTIONS if config.bundles else 0),
         statement_seconds=limits.search_seconds,
     )
+    bundles = None
+    if config.bundles is not None:
+        bundles = BundleService(config.bundles.folder, config.bundles.timestamp_key, RolloutStore(database))
     return Collector(
         config=config,
         database=database,
@@ -47,4 +54,5 @@ def make_collector(config: FleetConfig) -> Collector:
         store=store,
         indexer=Indexer(store, robots, database, limits.segment_bytes),
         receipt_key=key,
+        bundles=bundles,
     )

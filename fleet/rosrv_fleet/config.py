@@ -30,7 +30,7 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     segment_bytes: _Positive = 512 << 20
     upload_bytes: _Positive = 128 << 20
     upload_seconds: _Seconds = 120.0
-    uploads: _Positive = 16
+    uploads: _Positive = 64
     robot_bytes_per_day: _Positive = 2 << 30
     reserve_bytes: _Positive = 256 << 20
     search_seconds: _Seconds = 10.0
@@ -39,12 +39,22 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     connections: _Positive = 4096
 
 
+class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The bundles that robots get. `folder` is the one of `rosrv-fleet bundle publish`.
+
+    `timestamp_key` is the file `timestamp.pem` of the operator's repository.
+    """
+
+    folder: Path
+    timestamp_key: Path
+
+
 class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The configuration of a collector.
 
     `data` is the folder with robots, tokens, keys and segments. `listen` is HOST:PORT. `certificate` and `key` are the
     server's (PEM). `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is
-    silent after `silent_seconds` without a segment.
+    silent after `silent_seconds` without a segment. Without `bundles`, robots get none.
     """
 
     data: Path = Path("/var/lib/rosrv-fleet")
@@ -54,6 +64,7 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     database: str = "dbname=rosrv_fleet"
     silent_seconds: _Seconds = 600.0
     limits: Limits = Limits()
+    bundles: BundlesConfig | None = None
 
     @property
     def address(self) -> tuple[str, int]:
@@ -74,8 +85,15 @@ def load_config(path: Path) -> FleetConfig:
     except (yaml.YAMLError, msgspec.ValidationError, ValueError) as error:
         raise ConfigError(f"{path}: {error}; see docs/fleet.md") from error
     folder = path.absolute().parent
+    bundles = found.bundles and BundlesConfig(
+        folder=folder / found.bundles.folder, timestamp_key=folder / found.bundles.timestamp_key
+    )
     return msgspec.structs.replace(
-        found, data=folder / found.data, certificate=folder / found.certificate, key=folder / found.key
+        found,
+        data=folder / found.data,
+        certificate=folder / found.certificate,
+        key=folder / found.key,
+        bundles=bundles,
     )
 
 

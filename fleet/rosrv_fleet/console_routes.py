@@ -15,6 +15,7 @@ from appliance.base.timestamps import TimestampError
 from rosrv_fleet.access import COOKIE
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.health import FleetHealth, RobotState, health_of
+from rosrv_fleet.rollouts.console_section import rollouts_section
 from rosrv_fleet.search import FleetPage, IndexDownError, SearchTooLongError, search_fleet
 from rosrv_fleet.search_routes import MOST_WAITING
 from rosrv_fleet.search_sql import FleetFilter
@@ -43,7 +44,8 @@ def console_router(collector: Collector) -> APIRouter:
         found = _Found()
         if any(asked.values()):
             found = _search(collector, asked)
-        return _html("Robots", _robots(health_of(collector)) + _form(asked) + found.shown(asked))
+        rollouts = "" if collector.bundles is None else rollouts_section(collector.bundles)
+        return _html("Robots", _robots(health_of(collector)) + rollouts + _form(asked) + found.shown(asked))
 
     @router.get("/login")
     def login() -> Response:
@@ -112,8 +114,9 @@ def _robots(health: FleetHealth) -> str:
         f"<main><p>{lead}</p>"
         + "".join(f'<p class="bad">{escape(text)}</p>' for text in troubles)
         + '<table><caption>Robots</caption><thead><tr><th scope="col">Robot</th><th scope="col">State</th>'
-        '<th scope="col">Newest segment</th><th scope="col">Arrived</th><th scope="col">Gaps</th>'
-        f'<th scope="col">Forks</th></tr></thead><tbody>{rows}</tbody></table>'
+        '<th scope="col" class="number">Newest segment</th><th scope="col">Arrived</th>'
+        '<th scope="col" class="number">Gaps</th>'
+        f'<th scope="col" class="number">Forks</th></tr></thead><tbody>{rows}</tbody></table>'
     )
 
 
@@ -123,7 +126,8 @@ def _robot(robot: RobotState) -> str:
         for word, wrong in (("silent", robot.silent), ("gap", robot.gaps), ("fork", robot.forks))
         if wrong
     ]
-    state = f'<td class="{"bad" if wrong else "good"}">{", ".join(wrong) or "complete"}</td>'
+    good = "no segment yet" if robot.number is None else "complete"
+    state = f'<td class="{"bad" if wrong else "good"}">{", ".join(wrong) or good}</td>'
     link = f'<a href="/?{escape(urlencode({"robot": robot.name}))}">{escape(robot.name)}</a>'
     arrived = "never" if robot.age_seconds is None else f"{_span(robot.age_seconds)} ago"
     number = "" if robot.number is None else str(robot.number)

@@ -15,6 +15,7 @@ from rosrv_fleet.access import PEER_CERTIFICATE
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.robots import EnrolmentError, Robot, Robots
+from rosrv_fleet.rollouts.service import BundleService
 
 _RELOAD_SECONDS = 1.0
 _log = structlog.get_logger()
@@ -80,11 +81,12 @@ def _protocol(header_seconds: float) -> type[HttpToolsProtocol]:
 
 
 class _Server(uvicorn.Server):
-    """The server, which also watches for enrolled robots."""
+    """The server, which also watches for enrolled robots, and ends the robots' event streams when it stops."""
 
-    def __init__(self, config: uvicorn.Config, tls: ServerTls) -> None:
+    def __init__(self, config: uvicorn.Config, tls: ServerTls, bundles: BundleService | None) -> None:
         super().__init__(config)
         self._tls = tls
+        self._bundles = bundles
 
     async def main_loop(self) -> None:
         watching = asyncio.create_task(self._watch())
@@ -92,6 +94,8 @@ class _Server(uvicorn.Server):
             await super().main_loop()
         finally:
             watching.cancel()
+            if self._bundles is not None:
+                self._bundles.end_streams()
 
     async def _watch(self) -> None:
         while True:
@@ -122,4 +126,4 @@ def serve(collector: Collector) -> None:
         ssl_context_factory=lambda _config, _default: tls.context,
         **options,
     )
-    _Server(settings, tls).run()
+    _Server(settings, tls, collector.bundles).run()

@@ -1,24 +1,18 @@
 """Run the collector's bundles in a test: the real routes and rollouts, PostgreSQL, TLS with certificates."""
 
 import asyncio
-import os
-import pwd
-import shutil
-import subprocess
-import tempfile
 import threading
 from collections.abc import Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import psycopg
-import rosrv_fleet
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request
-from psycopg_pool import ConnectionPool
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from rosrv_fleet.bundles.robot_routes import robot_routes
+from rosrv_fleet.database import Database, migrate
 from rosrv_fleet.rollouts.operator_routes import operator_routes
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore
@@ -27,58 +21,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from tests.support.fleet_certificates import FleetAuthority
 
 T = TypeVar("T")
-_PROGRAMS = Path("/usr/lib/postgresql/15/bin")
-
-
-@contextmanager
-def database() -> Iterator[str]:
-    """Run a PostgreSQL server on a Unix socket, and return the address of its database."""
-    folder = Path(tempfile.mkdtemp(prefix="rosrv-pg-"))
-    user = pwd.getpwnam("postgres") if os.geteuid() == 0 else pwd.getpwuid(os.geteuid())
-    os.chown(folder, user.pw_uid, user.pw_gid)
-
-    def run(program: str, *arguments: str) -> None:
-        subprocess.run(
-            [str(_PROGRAMS / program), *arguments],
-            user=user.pw_uid if os.geteuid() == 0 else None,
-            group=user.pw_gid if os.geteuid() == 0 else None,
-            cwd=folder,
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
-
-    run("initdb", "-D", "data", "-U", "fleet", "-A", "trust", "--no-sync")
-    options = f"-c listen_addresses='' -c unix_socket_directories={folder} -c fsync=off"
-    run("pg_ctl", "-D", "data", "-o", options, "-w", "-l", "log", "start")
-    try:
-        yield f"postgresql://fleet@/postgres?host={folder}"
-    finally:
-        run("pg_ctl", "-D", "data", "-m", "immediate", "-w", "stop")
-        shutil.rmtree(folder)
-
-
-class _Connections:
-    """A pool of connections to a database with the tables of rollouts."""
-
-    def __init__(self, address: str) -> None:
-        self._pool = ConnectionPool(address, min_size=1, max_size=8, open=False)
-
-    def __enter__(self) -> Self:
-        self._pool.open(wait=True)
-        text = Path(rosrv_fleet.__file__).with_name("migrations").joinpath("0002_rollouts.sql").read_text()
-        with self.writing() as connection:
-            if connection.execute("SELECT to_regclass('rollout')").fetchone() == (None,):
-                connection.execute(text.encode())
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._pool.close()
-
-    @contextmanager
-    def writing(self) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
-        """Run a block in one transaction."""
-        with self._pool.connection() as connection:
-            yield connection
 
 
 class _Protocol(HttpToolsProtocol):
@@ -133,8 +75,12 @@ class RolloutCollector:
         self.loop.close()
 
     async def _run(self) -> None:
-        with _Connections(self._address) as pool:
-            self.service = BundleService(self.folder, self.folder / TIMESTAMP_KEY, RolloutStore(pool))
+        with psycopg.connect(self._address) as connection:
+            migrate(connection)
+        database = Database(self._address, connections=8, statement_seconds=30)
+        database.open()
+        with closing(database):
+            self.service = BundleService(self.folder, self.folder / TIMESTAMP_KEY, RolloutStore(database))
             app = FastAPI()
             app.include_router(robot_routes(self.service, _robot))
             app.include_router(operator_routes(self.service, _operator, _operator))

@@ -12,6 +12,7 @@ READERS = {
         "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
         "control/policies.py", "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
+        "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "relay/recorder_ring.py",

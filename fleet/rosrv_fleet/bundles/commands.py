@@ -12,11 +12,11 @@ from appliance.base.atomic_files import write_whole
 from appliance.base.input_files import read_given
 from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, contents_of, is_bundle_file
 from appliance.bundles.terms import BundlePath, Ring, Terms, TermsError, terms_of
-from rosmop.tool.terminal import say
-from rosrv_fleet.bundles.checks import findings_of
+from appliance.channel.messages import BundleContents
 from rosrv_fleet.bundles.keys import KeyFileError, KeyFolder
 from rosrv_fleet.bundles.publication import PublicationError, read_publication
 from rosrv_fleet.bundles.repository import BundleRepository, RepositoryError
+from rosrv_fleet.output import say
 
 bundle = typer.Typer(help="Make, sign and publish bundles on the operator's machine.", no_args_is_help=True)
 
@@ -87,7 +87,7 @@ def add(
     """
     with _opened(repository, keys, passphrase_file) as opened:
         files = _files_in(folder)
-        findings = findings_of(contents_of(files))
+        findings = _findings_of(contents_of(files))
         if findings:
             raise BundleArchiveError("\n".join([*findings, f"{folder}: nothing was signed"]))
         rings = [_ring(text) for text in ring or ["all=100%"]]
@@ -206,6 +206,19 @@ def _opened(repository: Path, keys: Path | None, passphrase_file: Path | None) -
     ) as error:
         typer.echo(f"rosrv-fleet bundle: {error}", err=True)
         raise typer.Exit(1) from error
+
+
+def _findings_of(contents: BundleContents) -> list[str]:
+    """Return the errors of a bundle. Raises `BundleArchiveError` if this machine cannot check it."""
+    try:
+        # The collector's machine has no compiler of policies and specifications, and signs no bundles.
+        from rosrv_fleet.bundles.checks import findings_of  # noqa: PLC0415  only where bundles are signed
+    except ImportError as error:
+        raise BundleArchiveError(
+            f"bundles are checked with the appliance's own code, and {error.name} is not installed:"
+            " install rosrv-appliance of the same version on this machine"
+        ) from error
+    return findings_of(contents)
 
 
 def _split(place: str) -> tuple[str, str]:

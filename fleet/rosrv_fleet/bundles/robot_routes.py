@@ -29,10 +29,11 @@ _TARGET_NAME = re.compile(r"[0-9a-f]{64}\.[1-9][0-9]{0,8}\.tar")
 _FOREVER = {"Cache-Control": "public, max-age=31536000, immutable"}
 _HEARTBEAT_SECONDS = 30.0
 _LONGEST_REPORT = 16_384
+_REPORT_SECONDS = 30.0
 _MOST_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
 
 Identify = Callable[[Request], str]
-"""Returns the name of the robot in the client's certificate; raises `HTTPException` without one."""
+"""Returns the name of the robot with the client's certificate; raises `HTTPException` for any other caller."""
 
 
 class EventStreams:
@@ -60,6 +61,8 @@ class EventStreams:
                 except TimeoutError:
                     yield b": still there\n\n"
                     continue
+                if self._service.stopping:
+                    return
                 listener.changed.clear()
                 yield b"event: selection\ndata: {}\n\n"
         finally:
@@ -111,10 +114,13 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     async def report(request: Request, robot: robot_name) -> None:
         """Store what the robot reports about itself."""
         try:
-            body = await _body(request)
+            async with asyncio.timeout(_REPORT_SECONDS):
+                body = await _body(request)
             await service.report(robot, msgspec.json.decode(body, type=RobotReport))
         except ClientDisconnect as error:
             raise HTTPException(400, "the robot ended the connection") from error
+        except TimeoutError as error:
+            raise HTTPException(408, f"a report takes at most {_REPORT_SECONDS:g} s") from error
         except (msgspec.DecodeError, RolloutRefusedError) as error:
             raise HTTPException(422, str(error)) from error
         except DatabaseError as error:

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 import httpx
 import typer
 
+from appliance.audit.record_format import printable
 from appliance.base.input_files import read_given
-from rosmop.tool.terminal import say, say_json
+from rosrv_fleet.output import say, say_json
 
 rollout = typer.Typer(
     help="Bring a signed bundle to the robots of a group, ring by ring.", no_args_is_help=True
@@ -28,6 +29,7 @@ Token = Annotated[
 Place = Annotated[str, typer.Argument(metavar="SITE/GROUP")]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 _NO_TOKEN = Path("token")
+_NOT_FOUND = 404
 
 
 @rollout.command()
@@ -106,9 +108,11 @@ def _asked(  # noqa: PLR0917  a request and its connection
         return dict(answer.json())
     except httpx.HTTPStatusError as error:
         reason = f"{error.response.status_code}: {error.response.text[:1000]}"
+        if error.response.status_code == _NOT_FOUND:
+            reason += "; without the section `bundles` of its configuration, a collector has no rollouts"
     except (httpx.HTTPError, OSError, ValueError) as error:
         reason = str(error)
-    typer.echo(f"rosrv-fleet rollout: {reason}", err=True)
+    typer.echo(f"rosrv-fleet rollout: {printable(reason)}", err=True)
     raise typer.Exit(1)
 
 

@@ -19,7 +19,7 @@ from tuf.api.metadata import Metadata
 
 from appliance.bundles.poller import RobotReport
 from appliance.bundles.terms import ROBOT_NAME, BundlePath, TermsError, role_of
-from rosrv_fleet.bundles.keys import load_online_key
+from rosrv_fleet.bundles.keys import KeyFileError, load_online_key
 from rosrv_fleet.bundles.publication import Publication, PublicationError, next_timestamp, read_publication
 from rosrv_fleet.rollouts import machine
 from rosrv_fleet.rollouts.machine import HealthGates, RobotSeen, Rollout
@@ -62,6 +62,7 @@ class BundleService:
         self.rollouts: dict[Group, StoredRollout] = {}
         self._stamp: _Stamp | None = None
         self._listeners: set[Listener] = set()
+        self.stopping = False
 
     async def run(self) -> None:
         """Keep the state up to date until the task is cancelled."""
@@ -124,6 +125,12 @@ class BundleService:
     def unlisten(self, listener: Listener) -> None:
         """Remove a listener."""
         self._listeners.discard(listener)
+
+    def end_streams(self) -> None:
+        """End the event streams of all robots, because the collector stops."""
+        self.stopping = True
+        for listener in self._listeners:
+            listener.changed.set()
 
     # --- orders ---
 
@@ -202,7 +209,7 @@ class BundleService:
             last = await asyncio.to_thread(self.store.timestamp)
             now = datetime.datetime.fromtimestamp(self._clock(), datetime.UTC)
             made = next_timestamp(self.publication, last, load_online_key(self._key), now)
-        except (PublicationError, OSError) as error:
+        except (PublicationError, KeyFileError, OSError) as error:
             if self.trouble != str(error):
                 _log.error("bundles cannot be published", reason=str(error))
             self.trouble = str(error)

@@ -46,6 +46,8 @@ MAY = {
     "api": (UNIX, False, [False, False]),
     "charon": (ROUTES, False, [False, False]),
     "syslog": (ROUTES, False, [True, False]),
+    "fleet": (ROUTES, False, [True, False]),
+    "bundles": (ROUTES, False, [True, False]),
     "recorder": (UNIX, False, [False, False]),
 }
 WITHOUT_PRIVILEGE = {
@@ -78,7 +80,9 @@ class Place:
     """The surroundings in which the roles are started."""
 
     def __init__(self, directory: Path) -> None:
-        self.roles = {role.name: role for role in roles_of(syslog=True, recorder=True)}
+        self.roles = {
+            role.name: role for role in roles_of(syslog=True, fleet=True, bundles=True, recorder=True)
+        }
         self.state = StateDirectory(directory / "state")
         self.state.prepare(self.roles.values())
         self.state.write_config("{}")
@@ -128,7 +132,12 @@ class Place:
         """Start a function in the role's sandbox; return the ended process and its reports."""
         here, there = socket.socketpair()
         facts = Facts(
-            self.state.path, self.state.config, self.ports[0], "http://127.0.0.1:1", syslog_port=self.ports[0]
+            self.state.path,
+            self.state.config,
+            self.ports[0],
+            "http://127.0.0.1:1",
+            syslog_port=self.ports[0],
+            collector_port=self.ports[0],
         )
         plan = ProcessSlot(role, 0).plan(facts, there.fileno())
         sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))

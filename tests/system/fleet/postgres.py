@@ -1,5 +1,6 @@
 """A private PostgreSQL 15 for tests: a cluster in a temporary folder, on a Unix socket only, as user postgres."""
 
+import contextlib
 import os
 import pwd
 import shutil
@@ -56,7 +57,7 @@ class PostgresCluster:
         with (self.folder / "log").open("ab") as log:
             self._process = subprocess.Popen(
                 [_PROGRAMS / "postgres", "-D", self.data, *given],
-                stdout=log, stderr=log, cwd="/", start_new_session=True, **self._as_postgres,  # type: ignore[call-overload]  # user, group
+                stdout=log, stderr=log, cwd="/", **self._as_postgres,  # type: ignore[call-overload]  # user, group
             )  # fmt: skip
         eventually(
             self._answers,
@@ -70,12 +71,27 @@ class PostgresCluster:
             return False
         return True
 
+    def stop(self) -> None:
+        """Shut the server down."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGINT)
+            self._process.wait(120)
+            self._process = None
+
     def kill(self) -> None:
         """Kill the server and all its processes, as a power cut would end them."""
         if self._process is not None:
-            os.killpg(self._process.pid, signal.SIGKILL)
+            # Its processes have groups of their own; one that outlived the server would keep it from starting again.
+            server = self._process.pid
+            self._process.send_signal(signal.SIGSTOP)
+            children = Path(f"/proc/{server}/task/{server}/children").read_text().split()
+            for child in map(int, children):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(child, signal.SIGKILL)
+            self._process.kill()
             self._process.wait()
             self._process = None
+            eventually(lambda: not any(map(_runs, children)), "all processes of PostgreSQL have ended")
             (self.data / "postmaster.pid").unlink(missing_ok=True)
 
     def create(self, name: str) -> str:
@@ -83,6 +99,13 @@ class PostgresCluster:
         with psycopg.connect(self.database("postgres"), autocommit=True) as connection:
             connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(name)))
         return self.database(name)
+
+
+def _runs(pid: str) -> bool:
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return False
 
 
 @contextmanager

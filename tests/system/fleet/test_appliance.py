@@ -14,7 +14,7 @@ from tests.support.rosmaster import master_at
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetSite
 
-PUSHER = (61021, 61014)  # its user, in the group that may read the log
+PUSHER = (61023, 61014)  # its user, in the group that may read the log
 
 
 def pushing(site: FleetSite, folder: Path) -> dict[str, Any]:

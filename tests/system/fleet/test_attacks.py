@@ -10,13 +10,14 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import httpx
 import pytest
 
 from appliance.audit.segments import SegmentSummary, write_segment
-from appliance.forwarding.collector_connection import CollectorRefusedError
+from appliance.forwarding.collector_connection import CollectorRefusedError, StoredHead
+from appliance.signing.receipts import SegmentReceipt
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
@@ -54,7 +55,7 @@ def test_a_robot_cannot_push_the_log_of_another(site: FleetSite, make_robot: Mak
 
 
 def test_a_stolen_certificate_forges_nothing(site: FleetSite, make_robot: MakeRobot) -> None:
-    """Who has the certificate of a robot, but not its signer's key, can push only what the robot sealed."""
+    """An attacker with a robot's certificate, but without its signer's key, can push only what the robot sealed."""
     victim = make_robot("victim")
     victim.record(10)
     forger = FleetRobot(site, "forger", enrolled=False)
@@ -293,6 +294,21 @@ def test_a_collector_with_another_key_is_not_believed(site: FleetSite, make_robo
     assert not (robot.folder / "state" / "receipts.ndjson").exists()
 
 
+class _Busy:
+    """A collector that asks every robot to wait for ten minutes."""
+
+    def head(self, log: str, upto: int) -> StoredHead:
+        """Refuse."""
+        raise CollectorRefusedError(f"not now: {log} {upto}", 600.0)
+
+    def push(self, log: str, number: int, name: str, body: IO[bytes], size: int) -> SegmentReceipt:
+        """Refuse."""
+        raise CollectorRefusedError(f"not now: {log} {number} {name} {body} {size}", 600.0)
+
+    def close(self) -> None:
+        """Do nothing: no connection is open."""
+
+
 def test_the_pause_grows_and_obeys_the_collector(site: FleetSite, make_robot: MakeRobot) -> None:
     """After failures the client waits longer each time, at most a minute, or as long as the collector asks for."""
     robot = make_robot("arm1")
@@ -302,4 +318,7 @@ def test_the_pause_grows_and_obeys_the_collector(site: FleetSite, make_robot: Ma
     site.kill()
     pauses = [pusher.step() for _ in range(9)]
     assert pauses == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
-    assert pusher._failed(CollectorRefusedError("later", 600.0)) == 600.0
+    pusher = robot.pusher()
+    pusher.jitter = lambda: 0.5
+    pusher.collector = _Busy()
+    assert pusher.step() == 600.0

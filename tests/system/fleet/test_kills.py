@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -62,7 +63,7 @@ def test_nothing_is_missing_after_kills(own_cluster: PostgresCluster, tmp_path: 
             try:
                 for number in range(_ROUNDS):
                     before = site.stored()
-                    eventually(lambda before=before: site.stored() > before + _ROBOTS, "segments arrive")
+                    eventually(partial(_more_than, site, before + _ROBOTS), "segments arrive")
                     (site if number % 2 == 0 else own_cluster).kill()
                     (site if number % 2 == 0 else own_cluster).start()
             finally:
@@ -80,6 +81,10 @@ def test_nothing_is_missing_after_kills(own_cluster: PostgresCluster, tmp_path: 
             found = site.all(robot=robot.name)
             assert sorted(one["sequence"] for one in found) == list(range(1, proof["last"] + 1))
         assert [one["gaps"] + one["forks"] for one in site.health()["robots"]] == [0] * _ROBOTS
+
+
+def _more_than(site: FleetSite, count: int) -> bool:
+    return site.stored() > count
 
 
 def _check_receipts(site: FleetSite, robot: FleetRobot) -> None:

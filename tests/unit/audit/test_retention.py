@@ -13,7 +13,7 @@ import pytest
 from appliance.audit.chain_findings import FindingKind
 from appliance.audit.query import Filter
 from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.retention import ReceiptFloor, Retention, worth_keeping
+from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
 from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
@@ -69,15 +69,15 @@ def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: P
 def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """With `fleet.retention_waits`, old records stay until the collector has them; then they are removed."""
     make_old(make_log, notary)
-    receipts = ReceiptFloor(waits=True)
-    receipts.received(700)
-    log = make_log(checkpoint_every=100, retention=Retention(days=1), receipts=receipts)
+    received = [700]
+    log = make_log(checkpoint_every=100, retention=Retention(days=1, collected=lambda: received[0]))
     log.record(decision(log))
     settle(log)
     eventually(lambda: next(export(path, Filter(), page=1)).sequence > 400, "the collected ones are removed")
     log.housekeeping.remover.sealed()
     assert next(export(path, Filter(), page=1)).sequence <= 701
-    receipts.received(2100)
+    received[0] = 2100
+    log.housekeeping.remover.sealed()
     await_removal(path, 1900)
     log.close()
     assert verify(path).ok
@@ -85,7 +85,7 @@ def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary
 
 def test_removal_by_size_does_not_wait_for_receipts(make_log: MakeLog, path: Path) -> None:
     """The log's size limit wins: uncollected records are removed."""
-    log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20), receipts=ReceiptFloor(waits=True))
+    log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20, collected=lambda: 0))
     for number in range(6000):
         log.record(decision(log, number, reason="x" * 400))
         if number % 200 == 199:

@@ -135,8 +135,11 @@ _FLEET = {"collector": "https://10.0.0.9:8444", "ca": "a", "certificate": "b", "
 
 
 def test_a_collector() -> None:
-    """A collector has an address and a port, and needs all files."""
+    """A collector has an address and a port; an appliance may push segments, take bundles, or both."""
     assert read({"fleet": _FLEET}).fleet.destination == ("10.0.0.9", 8444)
+    bundles = {"robot": "arm1", "bundles": {"root": "r", "site": "s", "group": "g"}}
+    only_bundles = {name: value for name, value in _FLEET.items() if name != "receipt_key"} | bundles
+    assert read({"fleet": only_bundles}).fleet.receipt_key is None
 
 
 @pytest.mark.parametrize(
@@ -148,9 +151,11 @@ def test_a_collector() -> None:
         (_FLEET | {"collector": "https://127.0.0.1:8444"}, "loopback of the appliance's own namespace"),
         (
             {name: value for name, value in _FLEET.items() if name != "receipt_key"},
-            "receipt_key must be given",
+            "collector needs receipt_key, to push segments, or bundles.root",
         ),
         ({"ca": "x.pem"}, "no effect without collector"),
+        (_FLEET | {"bundles": {"root": "r", "site": "s", "group": "g"}}, "robot must be given"),
+        (_FLEET | {"bundles": {"root": "r", "site": "s"}}, "root needs site and group"),
         (_FLEET | {"retention_waits": True}, "no effect without audit.retention_days"),
     ],
 )

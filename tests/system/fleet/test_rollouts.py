@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import httpx
-import psycopg
 import pytest
 from rosrv_fleet.rollouts.console_section import rollouts_section
 from rosrv_fleet.rollouts.store import Group
@@ -20,7 +19,7 @@ from appliance.bundles.poller import Poller
 from appliance.bundles.terms import BundlePath, Ring
 from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
-from tests.support.rollout_collector import RolloutCollector, collector, database
+from tests.support.rollout_collector import RolloutCollector, collector
 from tests.support.waiting import eventually
 
 QUICK = {"healthy_seconds": 0, "share": 0.9}
@@ -135,20 +134,11 @@ def _context(site: BundleSite, certificate: Path, key: Path) -> Any:
     return robot_context(site.authority.ca, certificate, key)
 
 
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    """Run a database."""
-    with database() as address:
-        yield address
-
-
 @pytest.fixture
-def fleet(tmp_path: Path, address: str) -> Iterator[Fleet]:
+def fleet(tmp_path: Path, database: str) -> Iterator[Fleet]:
     """Run a site and its collector."""
     site = BundleSite(tmp_path / "site")
-    with psycopg.connect(address, autocommit=True) as connection:
-        connection.execute("DROP TABLE IF EXISTS rollout, bundle_robot, bundle_timestamp")
-    with collector(site.repository.folder, site.authority, address) as running:
+    with collector(site.repository.folder, site.authority, database) as running:
         made = Fleet(site, running, tmp_path)
         try:
             yield made

@@ -1,0 +1,27 @@
+"""The collector runs with the parts of the appliance that its wheel and its image contain."""
+
+import re
+import subprocess
+import sys
+
+from tests.support.sources import ROOT
+
+SHIPPED = set(re.findall(r'"appliance/(\w+)"', (ROOT / "fleet/pyproject.toml").read_text()))
+
+
+def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
+    """`rosrv-fleet` loads only the shipped modules of the appliance, and none of the other products."""
+    program = "import rosrv_fleet.cli, sys; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT / "fleet"
+    )
+    loaded = {name.split(".")[1] for name in done.stdout.split() if name.startswith("appliance.")}
+    assert loaded <= SHIPPED
+    assert loaded >= {"audit", "signing"}
+    assert not {"rosmop", "roswire"} & set(done.stdout.split())
+
+
+def test_the_image_has_the_folders_of_the_wheel() -> None:
+    """The Dockerfile copies the same folders."""
+    copied = set(re.findall(r"^COPY appliance/(\w+) ", (ROOT / "fleet/Dockerfile").read_text(), re.MULTILINE))
+    assert copied == SHIPPED
