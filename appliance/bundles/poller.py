@@ -65,7 +65,7 @@ class Poller:
     progress: BundlePollReported = field(default_factory=BundlePollReported)
     _failures: int = 0
     _reported: RobotReport | None = None
-    _due: float = 0.0
+    report_due: float = 0.0
     _retry_at: float = 0.0
 
     def step(self) -> float:
@@ -125,16 +125,16 @@ class Poller:
         )
         now = time.monotonic()
         pressing = self._reported is None or _fate_of(report) != _fate_of(self._reported)
-        if now < (self._retry_at if pressing else self._due):
+        if now < (self._retry_at if pressing else self.report_due):
             return
         try:
             self.connection.put(REPORT, msgspec.json.encode(report))
         except CollectorError as error:
-            self._retry_at = self._due = now + _jittered(_REPORT_AGAIN_SECONDS)
+            self._retry_at = self.report_due = now + _jittered(_REPORT_AGAIN_SECONDS)
             if not self.progress.trouble:
                 self.progress = BundlePollReported(self.progress.checked, str(error)[:1000])
             return
-        self._reported, self._due = report, now + _jittered(_REPORT_SECONDS)
+        self._reported, self.report_due = report, now + _jittered(_REPORT_SECONDS)
 
 
 def _fate_of(report: RobotReport) -> RobotReport:

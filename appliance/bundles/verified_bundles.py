@@ -117,7 +117,7 @@ class VerifiedBundles:
         self._metadata = folder / "metadata"
         self._download = folder / "bundle.tar"
         self._root = root
-        self._connection = connection
+        self.connection = connection
         self._place = (site, group)
         self._selection = f"{SELECTION}/{site}/{group}"
         self._robot = robot
@@ -136,9 +136,9 @@ class VerifiedBundles:
                 left.unlink(missing_ok=True)
             updater = Updater(
                 str(self._metadata),
-                f"{self._connection.url}/{METADATA}",
-                target_base_url=f"{self._connection.url}/{TARGETS}",
-                fetcher=_Fetcher(self._connection),
+                f"{self.connection.url}/{METADATA}",
+                target_base_url=f"{self.connection.url}/{TARGETS}",
+                fetcher=_Fetcher(self.connection),
                 config=_limits(),
                 bootstrap=self._root,
             )
@@ -154,7 +154,7 @@ class VerifiedBundles:
         Call `refresh` before. Raises its errors, and `BundleTooEarlyError`.
         """
         text = (
-            self._connection.get_changed(self._selection, _LONGEST_SELECTION)
+            self.connection.get_changed(self._selection, _LONGEST_SELECTION)
             .decode("utf-8", "replace")
             .strip()
         )

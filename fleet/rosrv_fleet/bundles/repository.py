@@ -77,7 +77,7 @@ class BundleRepository:
         self.folder = folder
         self.metadata = folder / "metadata"
         self.targets = folder / "targets"
-        self._keys = keys
+        self.keys = keys
         self._lifetimes = lifetimes or Lifetimes()
         self.now = now
 
@@ -90,7 +90,7 @@ class BundleRepository:
         self.metadata.mkdir(parents=True)
         root = Root(consistent_snapshot=True)
         for role in ("root", "targets", "snapshot"):
-            root.add_key(self._keys.make(role), role)
+            root.add_key(self.keys.make(role), role)
         root.add_key(make_online_key(self.folder / TIMESTAMP_KEY), "timestamp")
         self._save_root(root, root)
         targets = Targets()
@@ -109,7 +109,7 @@ class BundleRepository:
         delegated = DelegatedRole(role, [], 1, terminating=True, paths=[f"{site}/{group}/*.tar"])
         assert top.delegations is not None and top.delegations.roles is not None  # noqa: S101  made by `init`
         top.delegations.roles[role] = delegated
-        top.add_key(self._keys.make(role), role)
+        top.add_key(self.keys.make(role), role)
         self._save("targets", top)
         self._save(role, Targets())
         self.snapshot()
@@ -164,7 +164,7 @@ class BundleRepository:
             before = self._open("root", Root)
             root = self._open("root", Root)
             key = (
-                make_online_key(self.folder / TIMESTAMP_KEY) if role == "timestamp" else self._keys.make(role)
+                make_online_key(self.folder / TIMESTAMP_KEY) if role == "timestamp" else self.keys.make(role)
             )
             for keyid in list(root.roles[role].keyids):
                 root.revoke_key(keyid, role)
@@ -174,7 +174,7 @@ class BundleRepository:
             top = self._open("targets", Targets)
             for keyid in list(self._delegated(top)[role].keyids):
                 top.revoke_key(keyid, role)
-            top.add_key(self._keys.make(role), role)
+            top.add_key(self.keys.make(role), role)
             self._save("targets", top)
             self._save(role, self._open(role, Targets))
         else:
@@ -232,8 +232,8 @@ class BundleRepository:
         signed.version = 1 + self._newest(role)
         signed.expires = self.now() + datetime.timedelta(days=self._days(role))
         document: Metadata[Any] = Metadata(signed)
-        wanted = set(self._keyids(role) if keyids is None else keyids)
-        for signer in self._keys.signers(role, wanted):
+        wanted = set(self.keyids_of(role) if keyids is None else keyids)
+        for signer in self.keys.signers(role, wanted):
             document.sign(signer, append=True)
         path = self.metadata / f"{signed.version}.{role}.json"
         write_whole(path, document.to_bytes(JSONSerializer(compact=False)), 0o644)
@@ -243,7 +243,8 @@ class BundleRepository:
         days = self._lifetimes
         return {"root": days.root, "targets": days.targets, "snapshot": days.snapshot}.get(role, days.group)
 
-    def _keyids(self, role: str) -> list[str]:
+    def keyids_of(self, role: str) -> list[str]:
+        """Return the ids of the keys that may sign for a role."""
         if role in _TOP:
             return list(self._open("root", Root).roles[role].keyids)
         return list(self._delegated(self._open("targets", Targets))[role].keyids)

@@ -61,7 +61,7 @@ class BundleService:
         self.robots: dict[Group, dict[str, RobotSeen]] = {}
         self.rollouts: dict[Group, StoredRollout] = {}
         self._stamp: _Stamp | None = None
-        self._listeners: set[Listener] = set()
+        self.listeners: set[Listener] = set()
         self.stopping = False
 
     async def run(self) -> None:
@@ -119,17 +119,17 @@ class BundleService:
         seen = self.robots.get(group, {}).get(robot)
         if listener.last and (seen is None or seen.in_force != listener.last):
             listener.changed.set()
-        self._listeners.add(listener)
+        self.listeners.add(listener)
         return listener
 
     def unlisten(self, listener: Listener) -> None:
         """Remove a listener."""
-        self._listeners.discard(listener)
+        self.listeners.discard(listener)
 
     def end_streams(self) -> None:
         """End the event streams of all robots, because the collector stops."""
         self.stopping = True
-        for listener in self._listeners:
+        for listener in self.listeners:
             listener.changed.set()
 
     # --- orders ---
@@ -234,7 +234,7 @@ class BundleService:
                 )
 
     def _wake(self) -> None:
-        for listener in self._listeners:
+        for listener in self.listeners:
             selection = self.selection(listener.robot, listener.group)
             if selection != listener.last:
                 listener.last = selection

@@ -88,11 +88,11 @@ LOOKING = [
     ("record", "remove", "a" * 20), ("record", "timeline", "a" * 20), ("monitor", "rollback", "777"),
     ("monitor", "confirm"), ("monitor", "promote", "nobody"),
 ]  # fmt: skip
-# These verbs are tested over REST elsewhere, with their preconditions (a recording, a host's key, a policy). The last
+# These verbs are tested over REST elsewhere, with their preconditions (a recording, a host's key, a pair). The last
 # three have options with these names that do not select the appliance.
 ELSEWHERE = {
-    "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff", "up",
-    "selftest", "protect",
+    "monitor replay", "record messages", "record fetch", "host add", "host kit", "policy check", "monitor diff",
+    "standby status", "standby promote", "up", "selftest", "protect",
 }  # fmt: skip
 
 

@@ -69,10 +69,10 @@ class Fleet:
             client = self.site.robot(self.collector.url, self.folder / name, name)
             robot = Robot(
                 name,
-                Poller(client, client._connection, (SITE, GROUP), 60, BundleStated, print),
+                Poller(client, client.connection, (SITE, GROUP), 60, BundleStated, print),
                 lambda _bundle: "",
             )
-            robot.poller.stated = lambda robot=robot: robot.stated  # type: ignore[misc]
+            robot.poller.stated = lambda robot=robot: robot.stated  # type: ignore[misc]  # mypy infers no type for a lambda's default
             robot.poller.offer = robot.offered
             self.robots[name] = robot
 
@@ -83,9 +83,9 @@ class Fleet:
 
         def run(part: list[Robot]) -> None:
             for robot in part:
-                robot.poller._due = 0.0  # report each time
+                robot.poller.report_due = 0.0  # report each time
                 robot.poller.step()
-                robot.poller._due = 0.0
+                robot.poller.report_due = 0.0
                 robot.poller.report()
 
         threads = [threading.Thread(target=run, args=(part,)) for part in parts]
@@ -231,7 +231,7 @@ def test_an_event_wakes_the_robot(fleet: Fleet) -> None:
 
     thread = threading.Thread(target=listen)
     thread.start()
-    eventually(lambda: fleet.collector.service._listeners, "the robot listens")
+    eventually(lambda: fleet.collector.service.listeners, "the robot listens")
     fleet.start(path)
     assert woken.wait(20)
     thread.join()

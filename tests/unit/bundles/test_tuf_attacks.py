@@ -247,7 +247,7 @@ def test_a_group_key_signs_for_no_other_group(field: Field) -> None:
     target.unrecognized_fields["custom"] = custom_of(everywhere())
     listed.signed.targets[str(path)] = target
     listed.signed.version = 2
-    for signer in repository._keys.signers(f"{SITE}.lifts", repository._keyids(f"{SITE}.lifts")):
+    for signer in repository.keys.signers(f"{SITE}.lifts", repository.keyids_of(f"{SITE}.lifts")):
         listed.sign(signer)
     listed.to_file(str(repository.metadata / f"2.{SITE}.lifts.json"))
     (repository.targets / SITE / GROUP).mkdir(parents=True, exist_ok=True)
@@ -297,7 +297,9 @@ def test_a_later_ring_does_not_take_a_bundle_early(field: Field) -> None:
 def test_a_compromised_root_key_is_replaced(field: Field) -> None:
     """After a rotation of root, targets, snapshot and group keys, robots follow; the old keys sign nothing any more."""
     site, repository = field.site, field.site.repository
-    old = {role: repository._keys.signers(role, repository._keyids(role)) for role in ("snapshot", "targets")}
+    old = {
+        role: repository.keys.signers(role, repository.keyids_of(role)) for role in ("snapshot", "targets")
+    }
     for role in ("root", "targets", "snapshot", f"{SITE}.{GROUP}"):
         repository.rotate(role)
     path = site.add()

@@ -82,7 +82,7 @@ def test_the_invariants_hold_for_all_reports(
                 assert ring_of(rollout, robot) <= rollout.ring
             if rollout.state == "stopped":
                 assert choice == OLD or seen.in_force == NEW
-        assert sum(row["robots"] for row in counts(rollout, robots, now)) == len(ROBOTS)  # type: ignore[misc]
+        assert sum(row["robots"] for row in counts(rollout, robots, now)) == len(ROBOTS)  # type: ignore[misc]  # the values of a row are objects
 
 
 def test_healthy_robots_finish_a_rollout() -> None:
