@@ -5,6 +5,7 @@ import secrets
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -86,15 +87,16 @@ class Cluster:
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """Return a cluster with its head."""
+def cluster() -> Iterator[Cluster]:
+    """Return a cluster with its head. Its folder has a short name, because its sockets have long ones."""
     needs(find_spec("ray"), "Ray: pip install 'rosmop[ray]'")
-    cluster = Cluster(tmp_path_factory.mktemp("ray"))
-    try:
-        cluster.start(0)
-        yield cluster
-    finally:
-        cluster.kill()
+    with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp") as folder:
+        cluster = Cluster(Path(folder))
+        try:
+            cluster.start(0)
+            yield cluster
+        finally:
+            cluster.kill()
 
 
 @pytest.fixture(scope="module")
