@@ -160,6 +160,9 @@ CALLS = {
     "revoke_host": of(name=NAME), "block_host": of(), "host_blocks": of(), "unblock_host": of(address="192.0.2.66"),
     "remove_recording": Call(lambda done: {"recording_id": done["record_now"]["id"]}),
 }  # fmt: skip
+FOR_PAIRS = {"standby", "promote_standby"}
+"""The operations of two appliances; on a single one they return the promised problem."""
+
 FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag", "recording_evidence"}
 
 
@@ -260,7 +263,7 @@ def test_every_operation_is_called_and_its_answer_parsed(
     contract = site.attacker.run(lambda: rest.get("/v1/openapi.json")).json
     assert not [name for name in contract["components"]["schemas"] if "." in name], "no module's name leaks"
     operations = {one["operationId"]: one for path in contract["paths"].values() for one in path.values()}
-    assert sorted(operations) == sorted(CALLS)
+    assert sorted(operations) == sorted(CALLS.keys() | FOR_PAIRS)
     generate(generator, contract, tmp_path)
     added = site.appliance.rosrv("token", "add", "eve", "--role", "investigator", "--json").stdout
     investigator = str(json.loads(added)["token"])
@@ -280,6 +283,9 @@ def test_every_operation_is_called_and_its_answer_parsed(
                 site.recorded(0, event="recording closed")
             token = investigator if name in FOR_INVESTIGATORS else site.appliance.token
             done[name] = asked(asking, token, operations[name], call, done)
+        for name in FOR_PAIRS:
+            assert "404" in operations[name]["responses"]
+            assert client.ask(site.appliance.token, name, {}, None, False)[0] == 404
 
 
 def kit_of(done: Done, folder: Path) -> Path:
