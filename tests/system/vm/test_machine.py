@@ -46,11 +46,6 @@ def test_the_kernels_esp(machine: Machine) -> None:
     passes(machine, f"{HERE}/inside_kernel_esp.py")
 
 
-def test_a_takeover_of_tunnels_in_the_kernel(machine: Machine) -> None:
-    """With the kernel's ESP too, tunnels move to the second appliance, and the first one keeps no IPsec state."""
-    passes(machine, "tests/system/ipsec/test_two_appliances.py", "-k", "nodes_behind or lost_the_lease")
-
-
 def test_the_appliance_on_a_machine(machine: Machine) -> None:
     """Run isolation netns and container on the machine itself, from the start until the machine is restored."""
     passes(machine, f"{HERE}/inside_whole_machine.py", "-k", "appliance")
