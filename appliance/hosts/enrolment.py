@@ -296,7 +296,6 @@ class HostEnrolment:
 
 
 def _fingerprint(certificate: bytes) -> str:
-    """Return the SHA-256 of a certificate (PEM), in hexadecimal."""
     return hashlib.sha256(ssl.PEM_cert_to_DER_cert(certificate.decode("ascii"))).hexdigest()
 
 

@@ -15,6 +15,7 @@ import time
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.policy.model import Address
 from appliance.store.host_tables import (
     CertificateRow,
     HostRow,
@@ -89,6 +90,10 @@ class HostTable:
     def admitted(self) -> list[HostRow]:
         """Return the enrolled hosts, except hosts whose tunnel hosts.yaml closes."""
         return [row for row in self.enrolled() if self.declared.wants(row.name)]
+
+    def addresses(self) -> dict[str, Address]:
+        """Return the addresses that `host:NAME` means in the policy while the tunnels are open."""
+        return {row.name: ipaddress.ip_address(row.address) for row in self.admitted()}
 
     def enrolled_row(self, name: str) -> HostRow:
         """Return an enrolled host. Raises `UnknownHostError`."""

@@ -175,7 +175,6 @@ class _Reading:
         self.mistakes: list[str] = []
 
     def file(self, node: yaml.Node | None) -> None:
-        """Read the whole file."""
         if node is None:
             return
         for _, value in self._pairs(node, ["hosts"], "`hosts:`, and under it `- name: ocu-1` for each host"):

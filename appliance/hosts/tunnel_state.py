@@ -11,7 +11,6 @@ Invariants:
 
 import asyncio
 import contextlib
-import ipaddress
 import time
 from collections.abc import Callable
 
@@ -124,9 +123,7 @@ class Tunnels:
     @property
     def addresses(self) -> dict[str, Address]:
         """Return the addresses that `host:NAME` means in the policy now."""
-        if not self.enclosed:
-            return {}
-        return {row.name: ipaddress.ip_address(row.address) for row in self._table.admitted()}
+        return self._table.addresses() if self.enclosed else {}
 
     async def start(self) -> None:
         """Open tunnels if hosts are enrolled; log a failure. Call this before nodes are served."""
@@ -269,7 +266,6 @@ class Tunnels:
             return
 
     def _again(self) -> float:
-        """Return the seconds until the authority is asked again."""
         self._failures += 1
         return _AGAIN_SECONDS[min(self._failures, len(_AGAIN_SECONDS)) - 1]
 

@@ -16,8 +16,7 @@ from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
 CONNECTION, SECOND = "rosrv", "rosrv-2"  # the scripts find both by the beginning of these names
-_SCRIPTS = {script: script for script in ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")}
-_OF_TWO = {"keep.sh": "keep_either.sh"}
+_SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 
 @dataclass(frozen=True)
@@ -57,20 +56,19 @@ def members(kit: Kit) -> list[tuple[str, str, int]]:
         "connections": " ".join(kit.remotes),
         "child": CHILD,
     }
-    values["ping"] = "iputils-ping" if len(kit.remotes) > 1 else ""
     renews = bool(host.rest_url and host.pin)
     values |= {"rest": host.rest_url if renews else "", "pin": host.pin if renews else ""}
     values |= {"ike": ", ".join(IKE_PROPOSALS), "esp": ", ".join(ESP_PROPOSALS)}
-    sources = _SCRIPTS | (_OF_TWO if len(kit.remotes) > 1 else {})
-    for script, source in sources.items():
-        found.append((script, filled(source, values), 0o644 if script == "README" else 0o755))
+    for script in _SCRIPTS:
+        found.append((script, filled(script, values), 0o644 if script == "README" else 0o755))
     return found
 
 
 def filled(script: str, values: Mapping[str, str]) -> str:
-    """Return a script of `kit_files` with its values filled in."""
-    text = files("appliance.ipsec").joinpath("kit_files", script).read_text(encoding="utf-8")
-    return _Template(text).substitute(values)
+    """Return a script of `kit_files` with its values filled in; `@stop@` is `stop.inc`."""
+    folder = files("appliance.ipsec").joinpath("kit_files")
+    text, stop = (folder.joinpath(name).read_text(encoding="utf-8") for name in (script, "stop.inc"))
+    return _Template(text.replace("@stop@\n", stop)).substitute(values)
 
 
 def archive(kit: Kit) -> bytes:
@@ -87,11 +85,9 @@ def archive(kit: Kit) -> bytes:
 
 def swanctl_conf(kit: Kit) -> str:
     """Return the host's tunnel in swanctl's format, to each of two appliances if there are two."""
-    # charon opens the tunnel to a single appliance. With two, keep_either.sh opens the one that answers: if charon also
-    # did, both tunnels could be open at the same time.
-    alone = len(kit.remotes) == 1
-    start, dpd = ("start", "restart") if alone else ("none", "clear")
-    connections = "".join(_connection(kit, name, remote, start, dpd) for name, remote in kit.remotes.items())
+    # charon opens no tunnel: keep.sh notices a lost one in seconds (charon with its own settings in minutes), and opens
+    # only one if there are two appliances.
+    connections = "".join(_connection(kit, name, remote) for name, remote in kit.remotes.items())
     return f"""\
 # The tunnel of {kit.host.name} to the ROSRV appliance. Made by `rosrv host add`.
 connections {{
@@ -99,7 +95,7 @@ connections {{
 """
 
 
-def _connection(kit: Kit, name: str, remote: str, start: str, dpd: str) -> str:
+def _connection(kit: Kit, name: str, remote: str) -> str:
     return f"""\
   {name} {{
     version = 2
@@ -126,9 +122,9 @@ def _connection(kit: Kit, name: str, remote: str, start: str, dpd: str) -> str:
         local_ts = dynamic
         remote_ts = {kit.host.appliance}/32
         esp_proposals = {", ".join(ESP_PROPOSALS)}
-        start_action = {start}
-        close_action = {start}
-        dpd_action = {dpd}
+        start_action = none
+        close_action = none
+        dpd_action = clear
       }}
     }}
   }}

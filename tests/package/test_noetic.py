@@ -26,7 +26,7 @@ PACKAGES = (
     *("python3-rospy", "python3-rostopic", "python3-std-msgs", "topic-tools"),
     # for a kit
     *("charon-systemd", "strongswan-swanctl", "libcharon-extra-plugins", "libstrongswan-standard-plugins"),
-    *("nftables", "iproute2", "openssl", "curl", "procps"),
+    *("nftables", "iproute2", "iputils-ping", "openssl", "curl", "procps"),
 )
 API = 8443
 CONFIG = f"api: 0.0.0.0:{API}\napi_networks: [10.88.0.0/24]\napi_names: [{MIDDLE}]\n"
@@ -78,6 +78,26 @@ def site(tmp_path: Path) -> Iterator[TunnelSite]:
             yield one
 
 
+LOST = (
+    "add table inet lost; add chain inet lost pings { type filter hook output priority 0; };"
+    " add rule inet lost pings meta l4proto icmp drop"
+)
+
+
+def lose_pings(site: TunnelSite, laptop: ScriptHost) -> None:
+    """Assert that strongSwan 5.9.1, which would add a CHILD_SA to an open tunnel, gets one CHILD_SA per tunnel."""
+    count = "grep -c 'CHILD_SA ros{[0-9]*} established' /run/rosrv/charon.log"
+    before = int(laptop.run("sh", "-c", count).stdout)
+    mark = site.mark
+    laptop.run("nft", LOST)
+    site.recorded(mark, event="tunnel down")
+    laptop.run("nft", "delete", "table", "inet", "lost")
+    site.recorded(mark, event="tunnel up")
+    tunnels = laptop.run("swanctl", "--list-sas").stdout
+    assert tunnels.count("INSTALLED") == 1, tunnels
+    assert int(laptop.run("sh", "-c", count).stdout) == before + 1, laptop.log()
+
+
 def test_a_laptop_joins_renews_and_leaves_without_python(
     site: TunnelSite, system: Path, tmp_path: Path
 ) -> None:
@@ -103,6 +123,7 @@ def test_a_laptop_joins_renews_and_leaves_without_python(
         assert "in force" in laptop.run("/etc/rosrv/renew.sh", "--now").stdout
         site.recorded(mark, event="host renewed")
         site.recorded(mark, event="tunnel up")
+        lose_pings(site, laptop)
         for path in pythons:
             (hidden / path.name).rename(path)
         laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]

@@ -13,7 +13,7 @@ cd "$(dirname "$0")"
 
 missing=""
 for package in charon-systemd strongswan-swanctl libcharon-extra-plugins libstrongswan-standard-plugins nftables \
-    iproute2 @ping@ openssl curl; do
+    iproute2 iputils-ping openssl curl; do
     dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q "ok installed" || missing="$missing $package"
 done
 if [ -n "$missing" ]; then
@@ -121,29 +121,33 @@ UNIT
 
 # Where there is no systemd: a program in the background, by its pid file.
 run=/run/rosrv
-# What has ended runs no more, also where process 1 of a container does not collect it.
-runs() { kill -0 "$1" 2>/dev/null && ! grep -q ') Z ' "/proc/$1/stat" 2>/dev/null; }
-running() { [ -s "$run/$1.pid" ] && runs "$(cat "$run/$1.pid")"; }
+@stop@
 background() {
     what=$1
     shift
-    running "$what" && return
+    stop "$what"
     mkdir -p "$run"
     setsid "$@" </dev/null >>"$run/$what.log" 2>&1 &
     echo $! > "$run/$what.pid"
 }
 restart_charon() {
-    if running charon; then
-        pid=$(cat "$run/charon.pid")
-        kill "$pid"
-        tries=0
-        while runs "$pid" && [ "$tries" -lt 150 ]; do
-            tries=$((tries + 1))
-            [ "$tries" -ne 100 ] || kill -KILL "$pid" 2>/dev/null || true
-            sleep 0.1
-        done
-    fi
+    stop keep  # it would ask for tunnels, too
+    stop charon
     rm -f /run/charon.vici
+    # charon writes to syslog, which a container does not have.
+    cat > /etc/strongswan.d/rosrv.conf <<'CONF'
+charon-systemd {
+  filelog {
+    stderr {
+      default = 0
+      lib = 1
+      dmn = 1
+      time_format = %FT%T
+      flush_line = yes
+    }
+  }
+}
+CONF
     background charon charon-systemd
     tries=0
     while [ ! -S /run/charon.vici ]; do
@@ -160,6 +164,7 @@ if [ -d /run/systemd/system ]; then
     systemctl enable --quiet rosrv-protect.service
     systemctl restart rosrv-protect.service
     systemctl enable --quiet strongswan.service
+    systemctl stop --quiet rosrv-tunnel.service  # it would ask for tunnels, too
     systemctl restart strongswan.service
 else
     why="/run/rosrv/charon.log"
@@ -186,7 +191,10 @@ for connection in @connections@; do
 done
 if ! up; then
     printf '%s\n' "$said" >&2
-    die "no tunnel. $why says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
+    die "no tunnel: the lines above say why; on the appliance: rosrv audit search --event 'tunnel refused'"
+fi
+if ! ping -q -n -c 5 -i 0.3 -W 2 -I @address@ @appliance@ >/dev/null 2>&1; then
+    die "the appliance answers no ping through the tunnel; keep.sh needs it: allow ICMP echo in this machine's firewall"
 fi
 if [ -d /run/systemd/system ]; then
     systemctl enable --quiet rosrv-tunnel.service
@@ -199,8 +207,12 @@ if [ -z "@rest@" ]; then
 elif [ -d /run/systemd/system ]; then
     systemctl enable --quiet rosrv-renew.timer
     systemctl restart rosrv-renew.timer
-else
-    background renew sh -c 'while sleep 3600; do /etc/rosrv/renew.sh; done'
+fi
+if ! [ -d /run/systemd/system ]; then
+    background renew sh -c 'while sleep 3600; do
+        [ -z "@rest@" ] || /etc/rosrv/renew.sh
+        for log in /run/rosrv/*.log; do [ "$(wc -c < "$log")" -lt 1000000 ] || : > "$log"; done
+    done'
 fi
 if [ -n "@rest@" ] && ! curl --silent --fail --max-time 20 --insecure --pinnedpubkey "@pin@" -o /dev/null "@rest@/v1/authority"; then
     say "warning: the appliance does not answer at @rest@ in the tunnel: the certificate cannot be renewed by itself"

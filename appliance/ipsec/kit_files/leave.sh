@@ -7,20 +7,7 @@ set -eu
 cd /
 
 systemd() { [ -d /run/systemd/system ]; }
-# What has ended runs no more, also where process 1 of a container does not collect it.
-runs() { kill -0 "$1" 2>/dev/null && ! grep -q ') Z ' "/proc/$1/stat" 2>/dev/null; }
-stop() {
-    pid=$(cat "/run/rosrv/$1.pid" 2>/dev/null) || return 0
-    # Each was started in a session of its own, so what it has started ends with it.
-    kill -- "-$pid" 2>/dev/null || kill "$pid" 2>/dev/null || true
-    tries=0
-    while runs "$pid" && [ "$tries" -lt 150 ]; do
-        tries=$((tries + 1))
-        [ "$tries" -ne 100 ] || kill -KILL -- "-$pid" 2>/dev/null || true
-        sleep 0.1
-    done
-    rm -f "/run/rosrv/$1.pid"
-}
+@stop@
 
 if systemd; then
     systemctl disable --quiet --now rosrv-tunnel.service rosrv-renew.timer 2>/dev/null || true
@@ -28,7 +15,7 @@ else
     stop keep
     stop renew
 fi
-rm -f /etc/swanctl/conf.d/rosrv.conf /etc/swanctl/x509/rosrv.pem /etc/swanctl/x509ca/rosrv-ca.pem
+rm -f /etc/strongswan.d/rosrv.conf /etc/swanctl/conf.d/rosrv.conf /etc/swanctl/x509/rosrv.pem /etc/swanctl/x509ca/rosrv-ca.pem
 rm -f /etc/swanctl/x509crl/rosrv.crl /etc/swanctl/x509crl/rosrv-crl.pem
 rm -f /etc/swanctl/private/rosrv.key /etc/swanctl/private/rosrv.key.unconfirmed
 for connection in @connections@; do swanctl --terminate --ike "$connection" >/dev/null 2>&1 || true; done

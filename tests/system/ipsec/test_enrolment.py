@@ -85,6 +85,7 @@ def test_a_laptop_joins_renews_and_leaves(site: TunnelSite, laptop: ScriptHost, 
     mark = site.mark
     joined = laptop.run("sh", str(script), token)
     site.recorded(mark, event="tunnel up")
+    assert "established" in laptop.log()
     address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]
     found = row(site, "laptop")
     assert (found["state"], found["address"], found["token_expires"]) == ("up", address, None)
@@ -159,10 +160,14 @@ def dropped(laptop: ScriptHost) -> int:
 
 
 def again(site: TunnelSite, laptop: ScriptHost, script: Path) -> None:
-    """Assert that a second run of the script changes nothing and needs no token."""
+    """Assert that a second run needs no token, and that the kit's programs run instead of the earlier ones."""
     serial = row(site, "laptop")["serial"]
     mark = site.mark
+    earlier = [laptop.run("cat", f"/run/rosrv/{what}.pid").stdout.strip() for what in ("keep", "renew")]
     done = laptop.run("sh", str(script))
+    for pid in earlier:
+        gone = laptop.run("sh", "-c", f"! kill -0 {pid} || grep -q ') Z ' /proc/{pid}/stat", check=False)
+        assert gone.returncode == 0
     assert "already enrolled" in done.stdout
     site.recorded(mark, event="tunnel up")
     assert row(site, "laptop")["serial"] == serial

@@ -4,8 +4,11 @@
 """
 
 import contextlib
+import os
 import re
+import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -20,7 +23,7 @@ from appliance.supervisor.users import account_of
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession
-from tests.support.processes import LIMIT, Event
+from tests.support.processes import LIMIT, Event, Process
 from tests.support.requirements import need_root
 from tests.support.standby_site import ADDRESSES, OCU, ROBOT, StandbySite
 from tests.support.tunnel_site import numbers
@@ -79,10 +82,10 @@ class TunnelledStandbySite:
         eventually(lambda: one.rosrv("host", "list", check=False).returncode == 0, self.site.story)
         return one
 
-    def join(self, kit: Path, host: Host | None = None) -> JoinedHost:
-        """Return a host with a kit, with strongSwan's own settings, not started."""
+    def join(self, kit: Path, host: Host | None = None, programs: Path | None = None) -> JoinedHost:
+        """Return a host with a kit, not started."""
         folder = self.home / f"joined-{time.monotonic_ns()}"
-        return JoinedHost(host or self.ocu, kit, folder, retransmission="")
+        return JoinedHost(host or self.ocu, kit, folder, programs=programs)
 
     def cut(self) -> str:
         """Cut the active appliance's power; return its name."""
@@ -134,6 +137,14 @@ def is_later(number: int, event: Event) -> bool:
     return event.get("event") == "received" and int(str(event["data"]).split()[-1]) > number
 
 
+def opened_connection(joined: JoinedHost) -> Process:
+    """Open a connection to the master through the tunnel."""
+    command = [sys.executable, "-m", "tests.support.held_connection", OWN, joined.address]
+    process = Process(joined.outer, command, env=dict(os.environ), label="connection")
+    process.wait_for(event="opened")
+    return process
+
+
 def test_nodes_behind_tunnels_are_back(tunnelled: TunnelledStandbySite, tmp_path: Path) -> None:
     """After each power cut topics in both directions are back in five seconds, then calls work; no node restarts."""
     site, found = tunnelled.site, []
@@ -162,6 +173,50 @@ def test_nodes_behind_tunnels_are_back(tunnelled: TunnelledStandbySite, tmp_path
                 assert listener.running
     print(f"seconds until messages arrived in both directions: {found}")  # noqa: T201  a figure for the reader of the run
     assert max(found) < allowed(BACK_SECONDS), found
+
+
+def test_a_takeover_after_the_host_has_ended_its_tunnel(
+    tunnelled: TunnelledStandbySite, tmp_path: Path
+) -> None:
+    """If the second appliance is reached late, nodes that only read receive messages again soon as well."""
+    site = tunnelled.site
+    with tunnelled.join(tunnelled.kit("add", "ocu-1")) as joined:
+        joined.wait_until_up()
+        with RosSession(joined.master, tmp_path, joined) as there, site.ros() as here:
+            here.talker("roscpp", "/state", "--rate", str(RATE))
+            listener = there.listener("rospy", "/state")
+            listener.wait_for(event="received", timeout=2 * LIMIT)
+            tunnelled.cut()
+            second = site.lab.hosts["b"].namespace
+            interfaces.set_link(second, INTERFACE, up=False)
+            joined.wait_until_replaced()
+            last = numbers(listener)[-1]
+            interfaces.set_link(second, INTERFACE, up=True)
+            listener.wait_for(partial(is_later, last + RATE // 2), timeout=LIMIT)
+            assert listener.running
+
+
+def test_connections_through_the_new_tunnel_stay(tunnelled: TunnelledStandbySite, tmp_path: Path) -> None:
+    """On a host whose swanctl is slow, the reset of the earlier connections spares those of the new tunnel."""
+    programs = tmp_path / "slow"
+    programs.mkdir()
+    slow = programs / "swanctl"
+    slow.write_text(f'#!/bin/sh\n[ "$1" = --initiate ] || sleep 1\nexec {shutil.which("swanctl")} "$@"\n')
+    slow.chmod(0o755)
+    with tunnelled.join(tunnelled.kit("add", "ocu-1"), programs=programs) as joined:
+        joined.wait_until_up()
+        earlier = opened_connection(joined)
+        mark = joined.events()
+        tunnelled.cut()
+        joined.wait_until_up(mark)
+        new = opened_connection(joined)
+        earlier.wait_for(event="closed")
+        joined.wait_until_replaced()
+        eventually(lambda: reaches(joined), tunnelled.site.story)
+        new.send("")
+        new.wait_for(event="answered")
+        earlier.stop()
+        new.stop()
 
 
 def test_revoked_certificates_and_new_ones(tunnelled: TunnelledStandbySite) -> None:
@@ -249,6 +304,30 @@ def test_an_appliance_that_lost_the_lease_ends_its_tunnels(tunnelled: TunnelledS
         tunnelled.site.until_both_in_sync()
         assert open_tunnel_parts(host) == []
         eventually(lambda: reaches(joined), tunnelled.site.story)
+
+
+def test_an_appliance_without_a_lease_has_no_tunnels(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Without the witness it ends its tunnels with their IPsec state, and opens them again with a new lease."""
+    need_root()
+    need_strongswan()
+    with Lab("rosrv-one") as lab:
+        tunnelled = TunnelledStandbySite(lab, tmp_path_factory.mktemp("one"))
+        with tunnelled.site as site:
+            site.start_witness()
+            site.start("a")
+            eventually(lambda: site.holder() == "a", site.story)
+            host = site.appliances["a"].host
+            assert isinstance(host, Host)
+            kit = tunnelled.kit("add", "ocu-1")
+            with JoinedHost(tunnelled.ocu, kit, tunnelled.home / "joined") as joined:
+                joined.wait_until_up()
+                assert open_tunnel_parts(host)
+                mark = joined.events()
+                site.stop_witness()
+                eventually(lambda: open_tunnel_parts(host) == [], site.story)
+                site.start_witness()
+                joined.wait_until_up(mark)
+                eventually(lambda: reaches(joined), site.story)
 
 
 def open_tunnel_parts(host: Host) -> list[str]:

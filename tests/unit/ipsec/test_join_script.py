@@ -82,7 +82,7 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
 
 @pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
 def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str, status: int) -> None:
-    """A tunnel that comes up prints none of its two dozen lines; a failed one prints all, and where to look."""
+    """A tunnel that comes up prints none of its two dozen lines; a failed one prints all, and what to do."""
     text = filled(
         "join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2", connections="rosrv rosrv-2")
     )
@@ -95,7 +95,7 @@ def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str
     )
     swanctl.chmod(0o755)
     done = subprocess.run(
-        ["sh", "-eu", "-c", f"why=charon.log\n{functions}{text[begin:end]}"],
+        ["sh", "-eu", "-c", f"{functions}{text[begin:end]}"],
         env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
         capture_output=True,
         text=True,
@@ -104,4 +104,16 @@ def test_output_of_charon_is_shown_only_after_a_failure(tmp_path: Path, sas: str
     )
     assert done.returncode == status
     assert done.stdout == "join.sh: waiting for the tunnel to 10.0.0.2\n"
-    assert ("AUTHENTICATION_FAILED" in done.stderr) == ("charon.log says why" in done.stderr) == bool(status)
+    assert ("AUTHENTICATION_FAILED" in done.stderr) == ("rosrv audit search" in done.stderr) == bool(status)
+
+
+def test_a_long_log_begins_again(tmp_path: Path) -> None:
+    """Without systemd nothing else rotates it; a program that has it open continues at its new beginning."""
+    (line,) = [one.strip() for one in filled("join.sh", defaultdict(str)).splitlines() if "for log in" in one]
+    long, short = tmp_path / "charon.log", tmp_path / "keep.log"
+    long.write_bytes(b"x" * 1_000_000)
+    short.write_bytes(b"x" * 999_999)
+    with long.open("ab", buffering=0) as writer:
+        subprocess.run(["dash", "-eu", "-c", line.replace("/run/rosrv", str(tmp_path))], check=True)
+        writer.write(b"next")
+    assert (long.read_bytes(), short.stat().st_size) == (b"next", 999_999)
