@@ -1,1 +1,1 @@
-"""Process many recordings: one job each, on this machine or on a cluster, with results that do not depend on where."""
+"""Process many recordings, one job each, on this machine or on a cluster; the results are the same."""

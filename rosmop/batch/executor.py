@@ -1,4 +1,4 @@
-"""The interface of a place that executes jobs, and the loop that gives it jobs and retries those whose worker died.
+"""Define the interface of executors, and the loop that submits jobs and retries those whose worker died.
 
 A job and its result are bytes; `work` of `rosmop.batch.jobs` turns one into the other and depends on nothing else but
 the recording. So the result is the same everywhere.
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 ATTEMPTS = 3
-"""How often a job is tried whose worker dies."""
+"""The number of times that a job is tried if its worker dies."""
 
 Work = Callable[[bytes], bytes]
 
@@ -23,7 +23,7 @@ class WorkerDeath:
 
 
 class Executor(Protocol):
-    """A place that executes jobs at the same time."""
+    """An executor of several jobs at the same time."""
 
     @property
     def capacity(self) -> int:

@@ -4,6 +4,8 @@ A job has all that its result depends on, except the messages. Results are bound
 recording's length.
 """
 
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -12,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from rosmop.batch.object_store import SCHEME, fetched
-from rosmop.batch.recording_list import RecordingName
+from rosmop.batch.recording_list import RecordingName, local_recording
 from rosmop.batch.replay_job import Replayed, ReplayJob, Specifications, replayed
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
@@ -75,6 +77,13 @@ Job = SurveyJob | LearnJob | CoverageJob | ReplayJob
 Result = Survey | TimeFacts | ContentFacts | AlarmFacts | Coverage | Replayed
 
 
+_SECONDS, _SECONDS_PER_MB = 600.0, 10.0  # of processor time
+
+
+class _TooLong(BaseException):
+    """A job takes too long. No reader of damaged files handles it by accident."""
+
+
 class _Envelope(msgspec.Struct, frozen=True):
     """A job, and the version of the program that made it."""
 
@@ -88,13 +97,13 @@ def packed(job: Job) -> bytes:
 
 
 def unpacked(result: bytes) -> Result | Failure:
-    """Return the result that `work` returned as bytes. Raises `msgspec.DecodeError`."""
+    """Return the result that `work` returned as bytes. Raises `ValueError`."""
     decoded: Result | Failure = msgspec.msgpack.decode(result, type=Result | Failure)
     return decoded
 
 
 def work(job: bytes) -> bytes:
-    """Execute a job. Whatever goes wrong is a `Failure`: one recording never ends the work on others."""
+    """Execute a job. Every error becomes a `Failure`, so one recording never ends the work on others."""
     result: Result | Failure
     try:
         envelope = msgspec.msgpack.decode(job, type=_Envelope)
@@ -103,14 +112,38 @@ def work(job: bytes) -> bytes:
                 f"the worker has version {_version()}, the command {envelope.version}; install the same"
             )
         else:
-            result = _result(envelope.job)
+            with _limited(_SECONDS + _SECONDS_PER_MB * envelope.job.recording.size / 1e6) as seconds:
+                result = _result(envelope.job)
     except SpecificationError as error:
-        result = Failure(str(error), [str(finding) for finding in error.findings])
+        result = Failure(_text(str(error)), [_text(str(finding)) for finding in error.findings])
     except (RecordingError, LearningError) as error:
         result = Failure(_text(str(error)))
+    except _TooLong:
+        result = Failure(f"it takes more than {seconds:.0f} s of processor time")
     except Exception as error:  # noqa: BLE001  a recording may be damaged in ways that no reader knows
         result = Failure(_text(f"{type(error).__name__}: {error}"))
     return msgspec.msgpack.encode(result)
+
+
+@contextmanager
+def _limited(seconds: float) -> Iterator[float]:
+    """Raise `_TooLong` in the block when it has used the processor for this time.
+
+    Each message has limits, but timers and few bytes can make many messages slow. Unlike elapsed time, processor time
+    depends neither on the machine's load nor on pauses.
+    """
+
+    def end(_signal: int, _frame: object) -> None:
+        raise _TooLong
+
+    before = signal.signal(signal.SIGPROF, end)
+    # It is repeated, because a callback from compiled code may lose an exception.
+    signal.setitimer(signal.ITIMER_PROF, seconds, 1)
+    try:
+        yield seconds
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _result(job: Job) -> Result:
@@ -145,15 +178,23 @@ def definitions_by_type(texts: dict[str, str]) -> Definitions:
 
 @contextmanager
 def local_file(recording: RecordingName) -> Iterator[Path]:
-    """Open a block with the path of a recording, which is fetched if it is remote. Errors have the name of the user."""
+    """Open a block with the path of a recording, which is fetched if it is remote. Errors have the name of the user.
+
+    Also raises `RecordingError` if a local file changed after the command listed it, or during the block.
+    """
     with ExitStack() as opened:
-        path = Path(recording.path)
         if recording.uri.startswith(SCHEME):
             path = opened.enter_context(fetched(recording.uri, recording.version))
+        else:
+            path = Path(os.fsdecode(recording.path))
         try:
             yield path
         except RecordingError as error:
             raise RecordingError(str(error).replace(str(path), recording.uri)) from error
+        if recording.path:
+            now = local_recording(path)
+            if (now.size, now.version) != (recording.size, recording.version):
+                raise RecordingError(f"{recording.uri} changed after the command began")
 
 
 def _name(recording: RecordingName) -> str:

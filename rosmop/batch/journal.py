@@ -1,31 +1,30 @@
-"""Keep the results of finished jobs in a file, so that a command that was interrupted can continue.
+"""Keep the results of finished jobs in a file, so that an interrupted command can continue, or only temporarily.
 
 The key of a result is the hash of its job. A job contains the specifications, the options, the version, and the
-recording's name, size and time of change: if one of them differs, the job runs again. A line that was cut off by a
-crash is ignored.
+recording's name, size and time of change: if one of them differs, the job runs again. It also runs again if its result
+is damaged, because each line has a checksum. A line that was cut off by a crash is removed.
 """
 
 import base64
+import binascii
 import fcntl
 import hashlib
 import os
+import stat
 from collections.abc import Iterator
+from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from tempfile import TemporaryFile, gettempdir
 from types import TracebackType
 from typing import Self
 
-import msgspec
-
-_LONGEST = 256 << 20  # bytes of a line
+_HEAD = b"rosmop results 1\n"
+_DIGEST = 64  # characters
 
 
 class JournalError(Exception):
     """The journal cannot be used, with the reason."""
-
-
-class _Line(msgspec.Struct):
-    job: str
-    result: str
 
 
 class ResumeJournal:
@@ -33,19 +32,27 @@ class ResumeJournal:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self._places: dict[bytes, tuple[int, int]] = {}
         try:
-            self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+b")
+            # O_NONBLOCK: a named pipe is rejected, and not waited for.
+            flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+            self._file = os.fdopen(os.open(path, flags, 0o600), "r+b", buffering=0)
         except OSError as error:
             raise JournalError(f"cannot open {path}: {error.strerror}") from error
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            self._places = dict(self._read())
+            if not stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
+                raise JournalError(f"cannot open {path}: not a regular file")
+            fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._read()
+        except BlockingIOError as error:
+            self._file.close()
+            raise JournalError(f"{path} is in use by another command") from error
+        except OSError as error:
+            self._file.close()
+            raise JournalError(f"cannot use {path}: {error.strerror}") from error
         except JournalError:
             self._file.close()
             raise
-        except OSError as error:
-            self._file.close()
-            raise JournalError(f"{path} is in use by another command") from error
 
     def __enter__(self) -> Self:
         return self
@@ -55,46 +62,95 @@ class ResumeJournal:
     ) -> None:
         self._file.close()
 
-    def __len__(self) -> int:
-        return len(self._places)
-
     def result(self, job: bytes) -> bytes | None:
-        """Return the result of a job, or None."""
-        place = self._places.get(_key(job))
+        """Return the result of a job, or None if it is missing or damaged."""
+        place = self._places.get(_digest(job))
         if place is None:
             return None
-        self._file.seek(place)
-        return base64.b64decode(msgspec.json.decode(self._file.readline(_LONGEST), type=_Line).result)
+        _key, checksum, text = os.pread(self._file.fileno(), place[1], place[0]).split(b" ", 2)
+        try:
+            result = base64.b64decode(text, validate=True)
+        except binascii.Error:
+            return None
+        return result if checksum == _digest(job + result) else None
 
     def add(self, job: bytes, result: bytes) -> None:
         """Write a result to the disk."""
-        line = _Line(_key(job), base64.b64encode(result).decode("ascii"))
+        line = b"%b %b %b\n" % (_digest(job), _digest(job + result), base64.b64encode(result))
         try:
-            self._places[line.job] = self._file.seek(0, os.SEEK_END)
-            self._file.write(msgspec.json.encode(line) + b"\n")
-            self._file.flush()
+            self._places[_digest(job)] = os.lseek(self._file.fileno(), 0, os.SEEK_END), len(line) - 1
+            append(self._file.fileno(), line)
             os.fdatasync(self._file.fileno())
         except OSError as error:
             raise JournalError(f"cannot write {self._path}: {error.strerror}") from error
 
-    def _read(self) -> Iterator[tuple[str, int]]:
-        """Yield the job and the position of each line, and cut off what is not a line."""
-        place = 0
-        while text := self._file.readline(_LONGEST):
-            try:
-                line = msgspec.json.decode(text, type=_Line)
-            except msgspec.DecodeError as error:
-                if text.endswith(b"\n"):
-                    raise JournalError(
-                        f"{self._path} is not a journal of this command; give a new file"
-                    ) from error
-                break
-            if not text.endswith(b"\n"):
-                break
-            yield line.job, place
-            place += len(text)
-        self._file.truncate(place)
+    def _read(self) -> None:
+        """Index the lines, and cut off a part of a line at the end."""
+        with os.fdopen(os.dup(self._file.fileno()), "rb") as file:
+            head = file.readline(len(_HEAD))
+            if not _HEAD.startswith(head):
+                raise JournalError(f"{self._path} is not a journal of this version; give a new file")
+            if head != _HEAD:  # it is new, or the first write was cut off
+                os.ftruncate(self._file.fileno(), 0)
+                append(self._file.fileno(), _HEAD)
+                return
+            place = len(_HEAD)
+            for line in file:
+                if not line.endswith(b"\n"):
+                    os.ftruncate(self._file.fileno(), place)
+                    break
+                if line.count(b" ") == 2:  # otherwise it is damaged
+                    self._places[line[:_DIGEST]] = place, len(line) - 1
+                place += len(line)
 
 
-def _key(job: bytes) -> str:
-    return hashlib.sha256(job).hexdigest()
+def append(descriptor: int, data: bytes) -> None:
+    """Write all data, which one system call may not do. Raises `OSError`."""
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]
+
+
+class TemporaryStore:
+    """A file without a name in the temporary folder (`TMPDIR`). Raises `JournalError`."""
+
+    def __init__(self) -> None:
+        with self._errors():
+            self._file = TemporaryFile(buffering=0)  # noqa: SIM115  closed by __exit__
+        self.size = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def append(self, data: bytes) -> tuple[int, int]:
+        """Write data, and return its place for `read`."""
+        with self._errors():
+            append(self._file.fileno(), data)
+        self.size += len(data)
+        return self.size - len(data), len(data)
+
+    def read(self, place: tuple[int, int]) -> bytes:
+        """Return what `append` wrote."""
+        with self._errors():
+            return os.pread(self._file.fileno(), place[1], place[0])
+
+    def whole(self) -> bytes | mmap:
+        """Return all data, without reading it into memory."""
+        return mmap(self._file.fileno(), self.size, access=ACCESS_READ) if self.size else b""
+
+    @staticmethod
+    @contextmanager
+    def _errors() -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise JournalError(f"cannot use a temporary file in {gettempdir()}: {error.strerror}") from error
+
+
+def _digest(data: bytes) -> bytes:
+    return hashlib.sha256(data).hexdigest().encode("ascii")

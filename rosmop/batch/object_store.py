@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryFile
 from typing import Any
 
 from rosmop.recordings.recording import RecordingError
@@ -28,15 +28,18 @@ def listed(prefix: str) -> Iterator[tuple[str, int, str]]:
 
 @contextmanager
 def fetched(uri: str, version: str) -> Iterator[Path]:
-    """Copy an object into a temporary file for the block. Raises `RecordingError`, also if it changed."""
+    """Copy an object into a temporary file for the block. Raises `RecordingError`, also if it changed.
+
+    The file has no name, so it ends with the process, even if that is killed.
+    """
     bucket, key = _parts(uri)
-    with TemporaryDirectory(prefix="rosmop-") as folder:
-        path = Path(folder) / "recording"
-        with _errors(uri), path.open("wb") as file:
+    with TemporaryFile(prefix="rosmop-") as file:
+        with _errors(uri):
             answer = _client().get_object(Bucket=bucket, Key=key, IfMatch=version)
             with answer["Body"] as body:
                 shutil.copyfileobj(body, file, _PIECE)
-        yield path
+            file.flush()
+        yield Path(f"/proc/self/fd/{file.fileno()}")
 
 
 def _parts(uri: str) -> tuple[str, str]:

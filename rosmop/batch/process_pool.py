@@ -7,7 +7,7 @@ a pipe of its own. Jobs and results are bytes, so nothing is unpickled.
 import ctypes
 import os
 import signal
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 
@@ -69,7 +69,13 @@ class ProcessPool:
     def _start(self) -> tuple[BaseProcess, Connection]:
         near, far = self._context.Pipe()
         process = self._context.Process(target=_serve, args=(self._work, far, os.getpid()), daemon=True)
-        process.start()
+        resource_tracker.ensure_running()  # its start, with the first process, would unblock SIGINT
+        # The process inherits the mask: Ctrl-C ends the parent only, which ends its processes.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         far.close()
         return process, near
 
@@ -90,7 +96,6 @@ def _reason(status: int | None) -> str:
 
 def _serve(work: Work, pipe: Connection, parent: int) -> None:
     """Execute jobs until the parent closes the pipe or dies."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the parent, which ends its workers
     ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
     if os.getppid() != parent:
         return

@@ -5,6 +5,7 @@ Ray's token authentication is on unless the environment switches it off (`RAY_AU
 
 import logging
 import os
+import sys
 from typing import Any
 
 from rosmop.batch.executor import Work, WorkerDeath
@@ -29,6 +30,8 @@ class RayCluster:
         except ImportError:
             raise ClusterError("Ray is not installed: pip install 'rosmop[ray]'") from None
         self._ray: Any = ray
+        # Ray prints errors of nodes to standard output, which has the results; it has no option for this.
+        self._ray._private.worker.print_to_stdstream = _print_to_stderr
         try:
             ray.init(
                 address if address.startswith("ray://") else "auto",
@@ -38,7 +41,7 @@ class RayCluster:
             processors = int(self._ray.cluster_resources().get("CPU", 0))
         except Exception as error:
             ray.shutdown()
-            raise ClusterError(f"cannot use the cluster {address}: {_first_line(error)}") from error
+            raise ClusterError(f"cannot use the cluster {address}: {_reason(error)}") from error
         self.capacity = max(processors, 1) * _AHEAD
         # `execute` tries again, as on one machine.
         self._task = ray.remote(num_cpus=1, max_retries=0)(work)
@@ -55,13 +58,21 @@ class RayCluster:
         try:
             return [(number, self._ray.get(ready))]
         except self._ray.exceptions.RayError as error:
-            return [(number, WorkerDeath(f"its worker in the cluster failed: {_first_line(error)}"))]
+            return [(number, WorkerDeath(f"its worker in the cluster failed: {_reason(error)}"))]
 
     def close(self) -> None:
         """Cancel all tasks, and leave the cluster."""
         self._ray.shutdown()
 
 
-def _first_line(error: Exception) -> str:
+def _print_to_stderr(data: dict[str, Any], **_options: object) -> None:
+    sys.stderr.writelines(f"ray: {line!a}\n" for line in data["lines"])
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of a message, with the line that it announces: the next one, or the end of a traceback."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    if "Traceback (most recent call last):" in lines:
+        lines = [lines[0], lines[-1]]
+    said = " ".join(lines[:2] if lines and lines[0].endswith(":") else lines[:1])
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__

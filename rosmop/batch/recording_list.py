@@ -1,6 +1,5 @@
 """List the recordings that a user names: files, folders, patterns and S3 prefixes."""
 
-import glob
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,13 +15,14 @@ ENDINGS = (".bag", ".mcap")
 class RecordingName(msgspec.Struct, frozen=True):
     """A path or an S3 URI, with the size in bytes, and the time of change or the hash, which identify the contents.
 
-    `path` is the absolute path of a local file, because workers have other current folders.
+    Bytes of a path outside UTF-8 are escaped in `uri`. `path` is the absolute path of a local file, because workers
+    have other current folders.
     """
 
     uri: str
     size: int
     version: str
-    path: str = ""
+    path: bytes = b""
 
 
 def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingName]:
@@ -33,7 +33,7 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
     """
     found: dict[str, RecordingName] = {}
     for file in files:
-        found.setdefault(os.path.realpath(file), _local(str(file)))
+        found.setdefault(os.path.realpath(file), local_recording(file))
     for one in sets:
         if one.startswith(object_store.SCHEME):
             objects = [RecordingName(*row) for row in object_store.listed(one) if row[0].endswith(ENDINGS)]
@@ -42,7 +42,7 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
         else:
             paths = sorted(_paths(one))
             for path in paths:
-                found.setdefault(os.path.realpath(path), _local(path))
+                found.setdefault(os.path.realpath(path), local_recording(Path(path)))
             empty = not paths
         if empty:
             raise RecordingError(f"there are no recordings ({', '.join(ENDINGS)}) in {one}")
@@ -51,18 +51,28 @@ def recordings_of(files: Sequence[Path], sets: Sequence[str]) -> list[RecordingN
 
 def _paths(one: str) -> Iterator[str]:
     if Path(one).is_dir():
-        for folder, _folders, names in os.walk(one):
+        for folder, _folders, names in os.walk(one, onerror=_unreadable):
             chosen = (name for name in names if name.endswith(ENDINGS))
             yield from (str(Path(folder, name)) for name in chosen)
-    else:
-        found = glob.glob(one, recursive=True)  # noqa: PTH207  Path.glob accepts no absolute pattern
-        yield from (path for path in found if not Path(path).is_dir())
+    elif one:
+        # Unlike those of `glob`, the `**` of `Path.glob` does not follow symbolic links, which may form loops.
+        pattern = Path(one)
+        try:
+            found = list(Path(pattern.anchor).glob(str(pattern.relative_to(pattern.anchor))))
+        except ValueError as error:
+            raise RecordingError(f"{one}: {error}") from error
+        yield from (str(path) for path in found if not path.is_dir())
 
 
-def _local(uri: str) -> RecordingName:
-    path = Path(uri).absolute()
+def _unreadable(error: OSError) -> None:
+    raise RecordingError(f"cannot read the folder {error.filename}: {error.strerror}") from error
+
+
+def local_recording(path: Path) -> RecordingName:
+    """Return a file as it is now."""
+    uri, place = os.fsencode(path).decode("utf-8", "backslashreplace"), os.fsencode(path.absolute())
     try:
         status = path.stat()
     except OSError:
-        return RecordingName(uri, 0, "", str(path))  # opening it reports the reason
-    return RecordingName(uri, status.st_size, str(status.st_mtime_ns), str(path))
+        return RecordingName(uri, 0, "", place)  # opening it reports the reason
+    return RecordingName(uri, status.st_size, str(status.st_mtime_ns), place)

@@ -5,9 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import msgspec
+
 from rosmop.batch.executor import Executor, ThisProcess, WorkerDeath, execute
 from rosmop.batch.jobs import Failure, Job, Result, packed, unpacked, work
-from rosmop.batch.journal import ResumeJournal
+from rosmop.batch.journal import ResumeJournal, TemporaryStore
 from rosmop.batch.process_pool import ProcessPool
 from rosmop.batch.ray_cluster import RayCluster
 
@@ -36,7 +38,10 @@ class JobRunner:
                 done(number)
                 yield number, Failure(answer.reason)
                 continue
-            result = unpacked(answer)
+            try:
+                result = unpacked(answer)
+            except ValueError as error:
+                result = Failure(f"its worker answered something else: {error}")
             if self.journal is not None and not isinstance(result, Failure):
                 self.journal.add(packed(jobs[number]), answer)
             done(number)
@@ -45,14 +50,19 @@ class JobRunner:
     def in_order(
         self, jobs: Sequence[Job], done: Callable[[int], None] = lambda _number: None
     ) -> Iterator[Result | Failure]:
-        """Yield the results in the order of the jobs."""
-        early: dict[int, Result | Failure] = {}
+        """Yield the results in the order of the jobs. Early results wait in a temporary file."""
         following = 0
-        for number, result in self.run(jobs, done):
-            early[number] = result
-            while following in early:
-                yield early.pop(following)
+        places: dict[int, tuple[int, int]] = {}
+        with TemporaryStore() as early:
+            for number, result in self.run(jobs, done):
+                if number != following:
+                    places[number] = early.append(msgspec.msgpack.encode(result))
+                    continue
+                yield result
                 following += 1
+                while following in places:
+                    yield unpacked(early.read(places.pop(following)))
+                    following += 1
 
 
 @contextmanager

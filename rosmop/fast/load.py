@@ -15,7 +15,7 @@ def prepare() -> None:
 def loaded(data: bytes) -> tuple[Compiled, WasmFastPath]:
     """Return the specifications of a part and its fast path, for `MonitorSet.of`; without data, return an empty set.
 
-    Raises `msgspec.ValidationError` or `msgspec.DecodeError` if the data are not a part.
+    Raises `ValueError` if the data are not a part.
     """
     part = decoded_part(data) if data else SetPart.empty()
     return part.compiled, WasmFastPath(part.module)

@@ -30,11 +30,13 @@ from rosmop.learn.passes import (
     TimeStep,
 )
 from rosmop.learn.recordings import LearnedSpan, LearningError, RecordingFacts, split
+from rosmop.learn.rv_text import one_line
 from rosmop.learn.rv_writer import on, specifications
 from rosmop.learn.topic_orders import TopicOrders
 from rosmop.learn.topics import MOST_GAPS, TopicContent, TopicRhythm
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
+from roswire.names import is_global_name, is_valid_type_name
 
 _WIDENS = frozenset({"range", "rate", "unchanged", "often", "late", "age", "requires", "causes"})
 _WINDOWS = 24  # the minimum number for all recordings together
@@ -85,6 +87,9 @@ class _Learner:
         self._skipped: list[str] = []
         self._failed: dict[int, str] = {}
         for topic, kind in sorted(self._types.items()):
+            if not is_global_name(topic) or not is_valid_type_name(kind):
+                self._skipped.append(f"{topic} ({kind}): not a valid name")
+                continue
             try:
                 self._fields[topic] = Fields(definitions.layout(kind)).types
             except DefinitionError as error:
@@ -235,7 +240,7 @@ class _Learner:
         ]
         if known.orders.left_out:
             lines.append(f"Not compared with other topics: {', '.join(known.orders.left_out)}")
-        return "".join(f"// {' '.join(line.split())}\n" for line in lines)
+        return "".join(f"// {one_line(line)}\n" for line in lines)
 
 
 def _names(parts: Sequence[LearnedSpan]) -> str:

@@ -53,6 +53,12 @@ def quoted(text: str) -> str:
     return "".join(_ESCAPES.get(letter, letter) for letter in text)
 
 
+def one_line(text: str) -> str:
+    """Return text for a comment: spaces instead of line ends, and other control characters escaped."""
+    words = " ".join(text.split())
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in words)
+
+
 def formatted(text: str) -> str:
     """Return text for use in a printf format."""
     return quoted(text).replace("%", "%%")

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count, groupby
 
 from rosmop.learn.candidates import Candidate, CandidateSupport, LearntFacts
-from rosmop.learn.rv_text import CPP, WORDS, formatted, identifier, number, short_names
+from rosmop.learn.rv_text import CPP, WORDS, formatted, identifier, number, one_line, short_names
 
 _TOLD_EVERY = "1.0"  # seconds
 _WIDTH = 104  # the maximum number of columns of a statement
@@ -132,7 +132,7 @@ def _comment(row: Candidate) -> str:
     text = f"// {row.place or row.topic}: {row.seen}"
     if row.widened:
         text += f"; {row.widened}"
-    return " ".join(text.split())
+    return one_line(text)
 
 
 def _wrapped(line: str) -> list[str]:

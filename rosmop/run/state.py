@@ -91,7 +91,7 @@ def states_of(
     for group in groups:
         try:
             states = _decoded(group)
-        except (msgspec.MsgspecError, ValueError, struct.error, LookupError, TypeError) as error:
+        except (ValueError, struct.error, LookupError, TypeError) as error:
             states = f"its state cannot be read: {error}"
         if isinstance(states, PartSnapshot):
             slices.setdefault(group[0][0], []).extend(states.slices)

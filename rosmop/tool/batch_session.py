@@ -4,6 +4,7 @@ Exit status 3 if one of several recordings failed. A single recording that fails
 """
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import msgspec
 import typer
 
 from rosmop.batch.jobs import Failure, Job, Result
-from rosmop.batch.journal import JournalError, ResumeJournal
+from rosmop.batch.journal import JournalError, ResumeJournal, TemporaryStore
 from rosmop.batch.ray_cluster import ClusterError
 from rosmop.batch.recording_list import RecordingName, recordings_of
 from rosmop.batch.runner import JobRunner, executor_for
@@ -54,6 +55,7 @@ class BatchSession:
     recordings: Sequence[RecordingName]
     options: RecordingsOptions
     runner: JobRunner
+    kept: TemporaryStore
 
     def results(self, what: str, jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failure]]:
         """Yield the number and result of each job, in the order in which they end, and show progress by bytes."""
@@ -84,13 +86,18 @@ class BatchSession:
             rows.append({"kind": "recording", "bag": uri, "error": failure.text})
         return rows
 
-    def write_report(self, rows: Sequence[dict[str, Any]]) -> None:
+    def keep(self, rows: Iterable[dict[str, Any]]) -> None:
+        """Keep rows for `write_report`, in a temporary file."""
+        if self.options.report is not None:
+            lines = "".join(json.dumps(msgspec.to_builtins(row)) + "\n" for row in rows)
+            self.kept.append(lines.encode("ascii"))
+
+    def write_report(self) -> None:
         """Write the rows to the file of --report, if it is given."""
         if self.options.report is None:
             return
-        lines = "".join(json.dumps(msgspec.to_builtins(row)) + "\n" for row in rows)
         try:
-            self.program.write(self.options.report, lines.encode("utf-8", "surrogateescape"))
+            self.program.write(self.options.report, self.kept.whole())
         except OSError as error:
             raise self.program.usage_error(f"cannot write {self.options.report}: {error.strerror}") from error
 
@@ -113,17 +120,20 @@ def batch_session(program: CommandContext, options: RecordingsOptions) -> Iterat
     """Open a block with the recordings of the options. Exits with status 2 if there are none or an option is wrong."""
     if not options.bags and not options.sets:
         raise program.usage_error("give recordings: --bag FILE, or --bags with a folder, a pattern or s3://…")
+    if options.report is not None and not os.access(options.report.parent, os.W_OK):
+        raise program.usage_error(f"cannot write {options.report}: its folder is missing or not writable")
     with ExitStack() as opened:
         try:
             recordings = recordings_of(options.bags, options.sets)
             journal = None if options.resume is None else opened.enter_context(ResumeJournal(options.resume))
             executor = opened.enter_context(executor_for(len(recordings), options.workers, options.on))
-            yield BatchSession(program, recordings, options, JobRunner(executor, journal))
+            kept = opened.enter_context(TemporaryStore())
+            yield BatchSession(program, recordings, options, JobRunner(executor, journal), kept)
         except (RecordingError, JournalError, ClusterError) as error:
             raise program.usage_error(str(error)) from error
         except KeyboardInterrupt:
-            kept = "add --resume FILE to keep what is finished"
+            advice = "add --resume FILE to keep what is finished"
             if options.resume is not None:
-                kept = f"{options.resume} has what is finished; the same command continues"
-            program.warn(f"interrupted; {kept}")
+                advice = f"{options.resume} has what is finished; the same command continues"
+            program.warn(f"interrupted; {advice}")
             raise typer.Exit(_INTERRUPTED) from None

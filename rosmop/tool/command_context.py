@@ -5,6 +5,7 @@ import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 
 import typer
@@ -25,7 +26,7 @@ class CommandContext:
     """
 
     name: str
-    write: Callable[[Path, bytes], object]
+    write: Callable[[Path, bytes | mmap], object]
 
     def read(self, path: Path) -> bytes:
         """Return the bytes of a regular file, `MAX_FILE` at most. Raises `OSError`."""

@@ -12,8 +12,8 @@ from rosmop.form.findings import SpecificationError
 from rosmop.learn.exercised import CoverageItem, items_of, merged
 from rosmop.tool.batch_session import SOME_FAILED, BatchSession, RecordingsOptions, batch_session
 from rosmop.tool.command_context import CommandContext
-from rosmop.tool.specification_input import read_definition_files, read_specifications
-from rosmop.tool.tables import table_of
+from rosmop.tool.specification_input import read_for_recordings
+from rosmop.tool.tables import add_row, table_of
 from rosmop.tool.terminal import refused, say, say_json
 
 _KINDS = ("event", "branch", "function", "handler", "state", "transition")
@@ -30,8 +30,7 @@ def coverage(
 ) -> int:
     """Report the exercised and the missing parts; return the exit status."""
     try:
-        definitions = read_definition_files(program, files, folders)
-        specifications = Specifications(read_specifications(program, files), definitions)
+        specifications = read_for_recordings(program, files, folders)
         items = items_of(specifications.texts)
     except SpecificationError as error:
         raise refused(error.findings) from None
@@ -44,7 +43,8 @@ def coverage(
                 "file": item.position.file, "line": item.position.line, "count": count,
             } for item, count in counts.items()
         ]  # fmt: skip
-        session.write_report(rows)
+        session.keep(rows)
+        session.write_report()
     exercised = sum(count > 0 for count in counts.values())
     percent = 100 * exercised / len(counts) if counts else 100.0
     if as_json:
@@ -80,8 +80,8 @@ def _show(counts: dict[CoverageItem, int]) -> None:
     table = table_of("monitor", *columns)
     for name in dict.fromkeys(item.specification for item in counts):
         own = [(item, count) for item, count in counts.items() if item.specification == name]
-        table.add_row(
-            name, *(_fraction(count for item, count in own if item.kind == kind) for kind in _KINDS)
+        add_row(
+            table, name, *(_fraction(count for item, count in own if item.kind == kind) for kind in _KINDS)
         )
     Console(highlight=False).print(table)
     for item, count in counts.items():

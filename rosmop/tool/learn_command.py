@@ -50,7 +50,8 @@ def learn_monitors(
             raise program.usage_error(str(error)) from error
         failures |= {surveys[place][0]: Failure(text) for place, text in learnt.failed.items()}
         rows = [*session.failed_rows(sorted(failures.items())), *_rows(learnt)]
-        session.write_report(rows)
+        session.keep(rows)
+        session.write_report()
     _show(program, learnt, rows, recorded, out, as_json=as_json)
     return SOME_FAILED if failures else 0
 

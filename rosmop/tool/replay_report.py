@@ -10,7 +10,7 @@ from rosmop.batch.jobs import Failure
 from rosmop.batch.replay_job import KINDS, ClosestMargin, Occurrence, Replayed
 from rosmop.form.findings import Position, line_of
 from rosmop.tool.monitor_output import BILLION
-from rosmop.tool.tables import say_table, table_of
+from rosmop.tool.tables import add_row, say_table, table_of
 from rosmop.tool.terminal import counted, say, say_json
 
 MOST_IN_ROWS = 10_000
@@ -21,10 +21,9 @@ _HEADS = ("would drop", "would change", "verdicts", "warnings", "faults")
 
 
 class ReplayReport:
-    """Collects the results of recordings in their order. `rows` are those for programs."""
+    """Collects the results of recordings in their order."""
 
     def __init__(self, most: int, *, as_json: bool) -> None:
-        self.rows: list[dict[str, Any]] = []
         self.failures: list[Failure] = []
         self.messages = 0
         self._most = most
@@ -34,13 +33,13 @@ class ReplayReport:
         self._recordings: list[_Line] = []
         self._closest: dict[tuple[Position, int, bool], tuple[ClosestMargin, str]] = {}
 
-    def add(self, recording: str, result: Replayed | Failure) -> None:
-        """Add the result of a recording, and print its first effects."""
-        self._add_rows(_rows(recording, result))
+    def add(self, recording: str, result: Replayed | Failure) -> list[dict[str, Any]]:
+        """Add the result of a recording, print its first effects, and return its rows for programs."""
+        rows = self._printed(_rows(recording, result))
         self._recordings.append(_Line.of(recording, result))
         if isinstance(result, Failure):
             self.failures.append(result)
-            return
+            return rows
         self.messages += result.messages
         for occurrence in result.occurrences:
             self._say(recording, occurrence)
@@ -50,25 +49,28 @@ class ReplayReport:
             key = Position(margin.file, margin.line, margin.column), margin.number, not margin.holds
             if key not in self._closest or margin.distance < self._closest[key][0].distance:
                 self._closest[key] = margin, recording
+        return rows
 
-    def show(self, texts: Mapping[str, str]) -> None:
-        """Print the counts by monitor and topic, by recording if there are several, and the margins."""
+    def show(self, texts: Mapping[str, str]) -> list[dict[str, Any]]:
+        """Print the counts by monitor and topic and by recording, and the margins. Return the rows for programs."""
         closest = [row for _key, row in sorted(self._closest.items())]
-        self._add_rows(_margin_row(margin, recording) for margin, recording in closest)
+        rows = self._printed(_margin_row(margin, recording) for margin, recording in closest)
         if self._as_json:
-            return
+            return rows
         self._show_counts()
         if len(self._recordings) > 1:
             self._show_recordings()
         for margin, recording in closest:
             say(_margin_line(margin, recording, line_of(texts[margin.file], margin.line)))
         say(f"{counted(self.messages, 'message')} of {counted(len(self._recordings), 'recording')}")
+        return rows
 
-    def _add_rows(self, rows: Iterable[dict[str, Any]]) -> None:
-        for row in rows:
-            self.rows.append(row)
-            if self._as_json:
-                say_json(row)
+    def _printed(self, rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return the rows, which are printed with --json."""
+        printed = list(rows)
+        for row in printed if self._as_json else ():
+            say_json(row)
+        return printed
 
     def _say(self, recording: str, found: Occurrence) -> None:
         where = found.topic or found.timer or ""
@@ -90,7 +92,7 @@ class ReplayReport:
         columns = (Column(head, justify="right") for head in _HEADS)
         table = table_of("monitor", Column("topic", overflow="fold"), *columns)
         for monitor, where in dict.fromkeys((monitor, where) for monitor, where, _kind in counts):
-            table.add_row(monitor, where, *(str(counts[monitor, where, kind]) for kind in KINDS))
+            add_row(table, monitor, where, *(str(counts[monitor, where, kind]) for kind in KINDS))
         say_table(table)
 
     def _show_recordings(self) -> None:
@@ -100,7 +102,7 @@ class ReplayReport:
         table = table_of(Column("recording", overflow="fold"), *columns)
         for row in rows[:_MOST_RECORDINGS]:
             times = (f"{time / BILLION:.3f}" for time in (row.first, row.last))
-            table.add_row(row.recording, str(row.messages), *map(str, row.counts), *times)
+            add_row(table, row.recording, str(row.messages), *map(str, row.counts), *times)
         if rows:
             say_table(table)
         failed = [row for row in self._recordings if row.error]

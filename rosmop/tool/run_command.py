@@ -16,7 +16,7 @@ from rosmop.tool.command_context import CommandContext
 from rosmop.tool.monitor_output import lines, record
 from rosmop.tool.progress_bar import progress
 from rosmop.tool.replay_report import MOST_IN_ROWS, ReplayReport
-from rosmop.tool.specification_input import read_definition_files, read_specifications
+from rosmop.tool.specification_input import read_for_recordings
 from rosmop.tool.terminal import counted, refused, say, say_json
 
 _PROGRESS_EVERY = 1000
@@ -33,8 +33,7 @@ def run(
 ) -> int:
     """Report the outcome of every message of a single recording, or the effects on many; return the exit status."""
     try:
-        definitions = read_definition_files(program, files, folders)
-        specifications = Specifications(read_specifications(program, files), definitions)
+        specifications = read_for_recordings(program, files, folders)
         if options.single is not None:
             with program.reports():
                 _run_single(program, specifications, options.single, output, as_json=as_json)
@@ -65,10 +64,10 @@ def run_batch(
     results = session.in_order("replaying", jobs)
     for recording, result in zip(session.recordings, results, strict=True):
         assert isinstance(result, Replayed | Failure)  # noqa: S101  for mypy: jobs of one kind
-        report.add(recording.uri, result)
+        session.keep(report.add(recording.uri, result))
     session.require(report.failures)
-    report.show(specifications.texts)
-    session.write_report(report.rows)
+    session.keep(report.show(specifications.texts))
+    session.write_report()
     return SOME_FAILED if report.failures else 0
 
 

@@ -1,8 +1,10 @@
 """Read specifications and folders of message definitions."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rosmop.batch.replay_job import Specifications
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Position, SpecificationError
@@ -33,7 +35,8 @@ def load(
 def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[str, str]:
     """Return the texts of specifications by name, in the order of file names.
 
-    Bytes outside UTF-8 become surrogates, which the parser rejects with their position.
+    Bytes outside UTF-8 are escaped in names. In texts they become surrogates, which the parser rejects with their
+    position.
     """
     texts: dict[str, str] = {}
     for file in sorted(files, key=lambda path: (path.name, str(path))):
@@ -41,7 +44,8 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
             raw = program.read(file)
         except OSError as error:
             raise program.usage_error(f"cannot read {file}: {error.strerror}") from error
-        texts[str(file)] = raw.decode("utf-8-sig", "surrogateescape")
+        name = os.fsencode(file).decode("utf-8", "backslashreplace")
+        texts[name] = raw.decode("utf-8-sig", "surrogateescape")
     return texts
 
 
@@ -73,18 +77,26 @@ def read_definitions(program: CommandContext, files: Sequence[Path], folders: Se
     return definitions
 
 
-def read_definition_files(
+def read_for_recordings(
     program: CommandContext, files: Sequence[Path], folders: Sequence[Path]
-) -> dict[str, str]:
-    """Return the texts of these definitions, except those of ROS, by name (`package/File`).
+) -> Specifications:
+    """Return specifications that workers compile, with the definitions that are not those of ROS.
 
-    Raises `SpecificationError` for a definition that cannot be read.
+    Raises `SpecificationError` for a text that cannot be parsed and a definition that cannot be read.
     """
     read_definitions(program, files, folders)
-    texts: dict[str, str] = {}
+    definitions: dict[str, str] = {}
     for folder in definition_folders(program, files, folders):
-        texts |= definition_texts(program, folder)[0]
-    return texts
+        definitions |= definition_texts(program, folder)[0]
+    # Their comments may have other encodings, which do not matter.
+    escaped = {
+        name: text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        for name, text in definitions.items()
+    }
+    texts = read_specifications(program, files)
+    for name, text in texts.items():
+        parse(text, name)
+    return Specifications(texts, escaped)
 
 
 def definition_folders(program: CommandContext, files: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
@@ -100,9 +112,15 @@ def definition_texts(program: CommandContext, folder: Path) -> tuple[dict[str, s
     """Return the definitions below a folder by name (`package/File`), and their paths by this name and by type."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
-    for path in sorted(path for path in folder.rglob("*") if path.suffix in (".msg", ".srv")):
-        if not path.is_file():
-            continue
+
+    def refuse(error: OSError) -> None:
+        raise program.usage_error(f"cannot read the folder {error.filename}: {error.strerror}") from error
+
+    # `rglob` would take a folder that may not be read for an empty one.
+    found = (
+        Path(place, name) for place, _folders, names in os.walk(folder, onerror=refuse) for name in names
+    )
+    for path in sorted(path for path in found if path.suffix in (".msg", ".srv") and path.is_file()):
         package = path.parent.parent if path.parent.name in ("msg", "srv") else path.parent
         if package == folder.parent or path.parent == folder:
             text = f"a definition belongs in the folder of its package: {folder}/package/{path.name}"

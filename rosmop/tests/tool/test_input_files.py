@@ -1,5 +1,6 @@
 """The command reads regular files only, and with a size limit."""
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -43,3 +44,23 @@ def test_other_files_are_usage_errors(
     done = CliRunner().invoke(app, command.split())
     assert done.exit_code == 2
     assert reason in done.stderr
+
+
+def test_an_unreadable_folder_of_definitions_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It does not count as an empty one."""
+    monkeypatch.chdir(tmp_path)
+    Path("m.rv").write_text(SPECIFICATION)
+    Path("own/package").mkdir(parents=True)
+    listed = os.scandir
+
+    def refuse(path: str) -> object:
+        if Path(path).name == "package":
+            raise PermissionError(errno.EACCES, "Permission denied", path)
+        return listed(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    done = CliRunner().invoke(app, ["check", "m.rv", "--msg", "own"])
+    assert done.exit_code == 2
+    assert "cannot read the folder own/package: Permission denied" in done.stderr

@@ -1,0 +1,296 @@
+"""Many recordings with odd names, kinds and contents: each is a row, and none stops or misleads the others."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Writer
+
+from rosmop.batch import jobs
+from rosmop.batch.executor import ThisProcess
+from rosmop.batch.jobs import Failure, SurveyJob, packed, unpacked, work
+from rosmop.batch.journal import JournalError, ResumeJournal
+from rosmop.batch.recording_list import recordings_of
+from rosmop.batch.runner import JobRunner
+from rosmop.recordings.recording import RecordingError
+from rosmop.tests.acting import message
+from rosmop.tests.batch.test_many_recordings import KIND, ROSMOP, SPECIFICATION, make_bag, rosmop
+from roswire.standard import standard_definitions
+
+RUN = "run limit.rv --bags bags"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the current folder, with a specification and two recordings."""
+    monkeypatch.chdir(tmp_path)
+    Path("limit.rv").write_text(SPECIFICATION)
+    Path("bags").mkdir()
+    for seed in range(2):
+        make_bag(Path("bags", f"{seed}.bag"), seed)
+    return tmp_path
+
+
+def rows_of(path: str) -> list[dict[str, object]]:
+    """Return the rows of a report."""
+    return [json.loads(line) for line in Path(path).read_text(encoding="ascii").splitlines()]
+
+
+@pytest.mark.parametrize("command", ["run limit.rv", "learn", "coverage limit.rv"])
+def test_any_name_is_reported(command: str, folder: Path) -> None:
+    """Names may have any bytes: they are escaped on the screen, and the report is valid Unicode for any reader."""
+    for seed, name in enumerate((b"a\n\x1b[2Jb.bag", b"c\xff.bag", "d\u202e\u00e9.bag".encode())):
+        make_bag(Path("bags", os.fsdecode(name)), seed + 2)
+        Path("bags", os.fsdecode(b"broken-" + name)).write_bytes(b"nonsense")
+    one = rosmop(f"{command} --bags bags --workers 1 --resume journal --report one")
+    assert one == rosmop(f"{command} --bags bags --workers 2 --report two")
+    assert Path("one").read_bytes() == Path("two").read_bytes()
+    assert one[0] == 3
+    assert all(letter.isprintable() or letter == "\n" for letter in one[1] + one[2])
+    assert "broken-a\\n\\x1b[2Jb.bag failed" in one[1] + one[2]
+    assert "broken-c\\xff.bag failed" in (one[1] + one[2]).replace("\\\\", "\\")
+    failed = [str(row["bag"]) for row in rows_of("one") if "error" in row]
+    assert failed == [
+        "bags/broken-a\n\x1b[2Jb.bag", "bags/broken-c\\xff.bag", "bags/broken-d\u202e\u00e9.bag"
+    ]  # fmt: skip
+    "".join(failed).encode()  # no surrogates
+
+
+def test_bytes_outside_utf8_in_specifications(folder: Path) -> None:
+    """A specification with such bytes is refused with their position. File names and definitions may have them."""
+    definition = Path("msg/own/msg/Level.msg")
+    definition.parent.mkdir(parents=True)
+    definition.write_bytes(b"int32 data  # \xb0C\n")
+    Path(os.fsdecode(b"limit-\xff.rv")).write_text(SPECIFICATION)
+    status, out, _err = rosmop(os.fsdecode(b"run limit-\xff.rv --bags bags --workers 2"))
+    assert status == 0
+    assert "800 messages of 2 recordings" in out
+    Path("limit.rv").write_bytes(
+        b"// \xb0C\n" + SPECIFICATION.replace('"high"', '"\udcb0"').encode("utf-8", "surrogateescape")
+    )
+    status, _out, err = rosmop(f"{RUN} --workers 2")
+    assert status == 1
+    assert err.startswith("limit.rv:")
+
+
+def test_other_kinds_of_files_are_rows(folder: Path) -> None:
+    """Pipes, devices and links that lead nowhere or in a circle fail alone, and at once."""
+    os.mkfifo("bags/pipe.bag")
+    Path("bags/device.bag").symlink_to("/dev/zero")
+    Path("bags/circle.bag").symlink_to("circle.bag")
+    Path("bags/gone.bag").symlink_to("none")
+    Path("bags/folder.bag").mkdir()
+    assert rosmop(f"{RUN} --report report --workers 2")[0] == 3
+    errors = {row["bag"]: str(row["error"]) for row in rows_of("report") if "error" in row}
+    for name, reason in (
+        ("pipe", "a named pipe"), ("device", "a device"), ("circle", "does not exist"), ("gone", "does not exist")
+    ):  # fmt: skip
+        assert reason in errors.pop(f"bags/{name}.bag"), name
+    assert not errors
+
+
+def test_circles_of_folders_are_not_followed(folder: Path) -> None:
+    """Links to folders above do not multiply the search of a pattern or of a folder."""
+    for name in ("x", "y", "z"):
+        Path("bags", name).symlink_to(".")
+    begin = time.perf_counter()
+    assert len(recordings_of([], ["bags"])) == 2
+    assert len(recordings_of([], ["bags/**/*.bag", str(folder / "bags" / "**" / "?.bag")])) == 2
+    assert time.perf_counter() - begin < 5
+    with pytest.raises(RecordingError, match=r"'\*\*' can only be an entire path component"):
+        recordings_of([], ["bags**/x.bag"])
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recordings in it are not silently left out."""
+    for _level in range(20):  # longer than a path may be
+        deep = Path("x" * 250)
+        (Path("bags") if not _level else Path()).joinpath(deep).mkdir()
+        monkeypatch.chdir(Path("bags", deep) if not _level else deep)
+    monkeypatch.chdir(folder)
+    with pytest.raises(RecordingError, match=r"cannot read the folder bags/x.*: File name too long"):
+        recordings_of([], ["bags"])
+
+
+def test_a_recording_that_changes_fails(folder: Path) -> None:
+    """The result of contents that were not listed does not count."""
+    (first, second) = recordings_of([], ["bags"])
+    with Path("bags/1.bag").open("ab") as file:
+        file.write(b"\0")
+    Path("bags/0.bag").touch()
+    for recording in (first, second):
+        result = unpacked(work(packed(SurveyJob(recording, ["*"]))))
+        assert isinstance(result, Failure)
+        assert result.text == f"{recording.uri} changed after the command began"
+
+
+# The limit may end a callback of the garbage collector, where Python only reports it; the next signal ends the work.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_recording_cannot_take_for_ever(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording that makes timers work for hours fails alone, after a limit of processor time."""
+    Path("limit.rv").write_text(
+        "m() { event t() every 1ms { } event e(int n) /n std_msgs/Int32 '{data:n}' { } }"
+    )
+    make_bag(Path("bags/slow.bag"), 0, 400, step=10**12)
+    make_bag(Path("bags/2.bag"), 0, 2)
+    monkeypatch.setattr(jobs, "_SECONDS", 0.5)
+    monkeypatch.setattr(jobs, "_SECONDS_PER_MB", 0)
+    before = signal.getsignal(signal.SIGPROF)
+    assert rosmop("run limit.rv --bag bags/slow.bag --bag bags/2.bag --workers 1 --report report")[0] == 3
+    assert [row.get("error") for row in rows_of("report") if row["kind"] == "recording"] == [
+        "it takes more than 0 s of processor time", None
+    ]  # fmt: skip
+    assert signal.getsignal(signal.SIGPROF) is before
+    assert signal.getitimer(signal.ITIMER_PROF) == (0, 0)
+
+
+def test_a_worker_that_answers_something_else_fails_alone(folder: Path) -> None:
+    """Answers of workers are data of the expected form; nothing else is decoded."""
+    jobs_ = [SurveyJob(recording, ["*"]) for recording in recordings_of([], ["bags"])]
+    for answer in (b"", b"\x80\x04K\x01.", b"\xc0", b"\x81\xa4type\xa5Other"):
+
+        def answering(_job: bytes, answer: bytes = answer) -> bytes:
+            return answer
+
+        results = list(JobRunner(ThisProcess(answering), None).in_order(jobs_))
+        assert all(
+            isinstance(result, Failure) and "answered something else" in result.text for result in results
+        )
+        assert len(results) == 2
+
+
+def test_a_damaged_journal_gives_no_other_result(tmp_path: Path) -> None:
+    """Cut off or changed at any byte, it has each result, or lacks it, or is rejected; and it can be continued."""
+    path = tmp_path / "journal"
+    with ResumeJournal(path) as journal:
+        journal.add(b"one", b"1")
+        journal.add(b"two", b"22")
+    whole = path.read_bytes()
+    variants = [whole[:length] for length in range(len(whole))]
+    variants += [
+        whole[:place] + bytes([byte]) + whole[place + 1 :]
+        for place in range(len(whole))
+        for byte in (whole[place] ^ 1, 10, 32, 255)
+    ]
+    found = set()
+    for variant in variants:
+        path.write_bytes(variant)
+        try:
+            with ResumeJournal(path) as journal:
+                assert journal.result(b"one") in (b"1", None)
+                assert journal.result(b"two") in (b"22", None)
+                journal.add(b"three", b"3")
+            with ResumeJournal(path) as journal:
+                assert journal.result(b"three") == b"3"
+                found.add((journal.result(b"one"), journal.result(b"two")))
+        except JournalError as error:
+            assert "is not a journal" in str(error)
+            assert path.read_bytes() == variant
+    assert len(found) == 4
+
+
+def test_only_a_journal_is_written(tmp_path: Path) -> None:
+    """A file of the user, a pipe, a device or a folder is rejected and unchanged."""
+    for text in ("one line", '{"job": 1}', "two\nlines"):
+        (tmp_path / "file").write_text(text)
+        with pytest.raises(JournalError, match="is not a journal"):
+            ResumeJournal(tmp_path / "file")
+        assert (tmp_path / "file").read_text() == text
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(JournalError, match="not a regular file"):
+            ResumeJournal(path)
+    with pytest.raises(JournalError, match="Is a directory"):
+        ResumeJournal(tmp_path)
+
+
+@pytest.mark.parametrize("option", ["--resume", "--report"])
+def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
+    """The command ends with the reason; afterwards it continues, and no report was begun."""
+    words = [*ROSMOP, *RUN.split(), "--workers", "2", option, "file"]
+
+    def fill() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+    done = subprocess.run(words, preexec_fn=fill, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert Path("file").exists() is (option == "--resume")
+    subprocess.run(words, check=True, capture_output=True)
+    assert Path("file").stat().st_size > 1000
+
+
+def test_a_report_without_a_folder_is_refused_first(folder: Path) -> None:
+    """The command does not work for hours first."""
+    status, out, err = rosmop(f"{RUN} --report none/report")
+    assert (status, out) == (2, "")
+    assert err == "rosmop: cannot write none/report: its folder is missing or not writable\n"
+
+
+def children(pid: int) -> list[int]:
+    """Return the child processes of a process."""
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def command_line(pid: int) -> bytes:
+    """Return the arguments of a process; nothing if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None:
+    """Ctrl-C in the first second prints no traceback of a worker; a worker that is killed then is replaced."""
+    assert rosmop(f"{RUN} --report expected")[0] == 0
+    words = [*ROSMOP, *RUN.split(), "--workers", "2", "--report", "report"]
+    with subprocess.Popen(
+        words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        # The first one is multiprocessing's own.
+        while len(found := children(process.pid)) < 2 or b"spawn_main" not in command_line(found[1]):
+            assert process.poll() is None
+        status = Path(f"/proc/{found[1]}/status").read_text()
+        blocked = int(status.partition("\nSigBlk:")[2].split()[0], 16)
+        assert blocked & 1 << signal.SIGINT - 1, "a worker that starts must not see Ctrl-C"
+        if end is signal.SIGINT:
+            os.killpg(process.pid, end)
+        else:
+            os.kill(found[1], end)
+        _out, err = process.communicate(timeout=120)
+    if end is signal.SIGINT:
+        assert err == "rosmop: interrupted; add --resume FILE to keep what is finished\n"
+        assert process.returncode == 130
+        assert not [pid for pid in found if command_line(pid)]
+    else:
+        assert (process.returncode, err) == (0, "")
+        assert Path("report").read_bytes() == Path("expected").read_bytes()
+
+
+def test_a_topic_cannot_add_to_the_learnt_text(folder: Path) -> None:
+    """A topic with an invalid name is listed in a comment, on one line, and the others are learnt from."""
+    name = "/n\n} evil() { event e() /n std_msgs/Int32 '{}' { DROP; } }\x1b[2J"
+    definitions = standard_definitions()
+    for seed in range(2, 4):
+        with Writer(Path("bags", f"{seed}.bag")) as writer:
+            connection = writer.add_connection(
+                name,
+                "std_msgs/msg/Int32",
+                msgdef=definitions.full_text(KIND),
+                md5sum=definitions.md5sum(KIND),
+            )
+            writer.write(connection, 10**12, message(KIND, data=1))
+    status, out, _err = rosmop("learn --bags bags")
+    assert status == 0
+    assert [line[:20] for line in out.splitlines() if "evil" in line] == ["// Not looked at: /n"]
+    assert "\x1b" not in out
+    Path("learnt.rv").write_text(out)
+    assert rosmop("check learnt.rv")[0] == 0
