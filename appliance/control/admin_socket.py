@@ -53,7 +53,7 @@ class AdminServer:
     async def _answer(self, line: bytes) -> admin.AdminAnswer[Any]:
         try:
             request = self._decoder.decode(line)
-        except msgspec.MsgspecError as error:
+        except ValueError as error:
             return admin.AdminAnswer(
                 False, error=f"not a request of this version: {error}", trouble="request"
             )

@@ -172,7 +172,6 @@ def _make_calls(
     registration: RegistrationCalls,
     monitor_calls: MonitorCalls,
 ) -> tuple[Pipeline, Table]:
-    """Return the pipeline that serves calls, and the table of the Master API."""
     settings, trail, offload = base.settings, base.trail, int(base.settings.limits.offload_bytes)
     lookups = LookupCalls(
         core.registry,

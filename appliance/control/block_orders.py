@@ -179,7 +179,6 @@ class BlockOrders:
             )
 
     def _lift(self, addresses: Iterable[Address]) -> int:
-        """Remove blocks, and decide again. Return the number of registrations that returned."""
         before = self._registrations()
         for address in addresses:
             self._blocks.take(address)
@@ -209,7 +208,6 @@ class BlockOrders:
         return plain_address(enrolled[name])
 
     def _require_not_the_robot(self, address: Address, held: answers.BlockEnded) -> None:
-        """Raise `HostRefusedError` for the robot's own host, and for a host with most of all registrations."""
         own, whole = _registrations_of(held), self._registrations()
         if any(address in network for network in self._policies.current.robot):
             why = "is the robot's own host"
@@ -223,7 +221,6 @@ class BlockOrders:
         )
 
     def _same_machine(self, address: str) -> set[str]:
-        """Return the other addresses of a host with a tunnel: its virtual address and its real address."""
         enrolled = self._enrolled()
         pairs = ({enrolled[name], remote} for name, remote in self._remotes().items() if name in enrolled)
         return {other for pair in pairs if address in pair for other in pair - {address}}

@@ -162,7 +162,6 @@ class BundleGate:
         self._poll = message
 
     def _state(self) -> None:
-        """State the bundle in force to the process, if something has changed."""
         record, health = self._record, self._health()
         stated = BundleStated(
             record.in_force,
@@ -189,7 +188,12 @@ class BundleGate:
 
     async def _take(self, offered: BundleOffered) -> None:
         record, contents = self._record, offered.contents
-        if (offered.path, offered.sha256) == (record.in_force, record.sha256):
+        refused = record.refused
+        # The process may have offered the bundle again before it heard of the trial.
+        if (offered.path, offered.sha256) in (
+            (record.in_force, record.sha256),
+            refused and (refused.path, refused.sha256),
+        ):
             return
         self._waits = ""
         if self._policies.confirm_by is not None or self._monitors.confirm_by is not None:
@@ -261,7 +265,6 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - time.monotonic())))
 
     def _refuse(self, path: str, sha256: str, reason: str) -> None:
-        """Record why a bundle is refused, and end its trial."""
         refused = RefusedBundle(path, sha256, reason[:4000])
         self._save(msgspec.structs.replace(self._record, refused=refused, trial=None))
         stays = self._record.in_force or "no bundle"
@@ -305,7 +308,6 @@ class BundleGate:
                 return
 
     async def _keep(self, record: BundleRecord) -> None:
-        """Store a record, and wait until it is on the disk. Raises `StoreError`."""
         self._save(record)
         await self._store.settled()
 

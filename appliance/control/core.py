@@ -14,6 +14,7 @@ from appliance.master.graph.registry import Registry
 from appliance.master.graph.revocation import Revocation
 from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameter_mirror import ParameterMirror
+from appliance.master.reconcile.liveness import Watchlist
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import Pool
 from appliance.quotas.table import PARAMETER_BYTES
@@ -27,6 +28,7 @@ class Core:
 
     policy: Callable[[], Policy]
     registry: Registry
+    watchlist: Watchlist
     carried: RelayTraffic
     grants: Grants
     mediation: Mediation
@@ -45,7 +47,8 @@ def make_core(base: Foundation) -> Core:
     def policy() -> Policy:
         return base.policies.current
 
-    carried = RelayTraffic(base.trail, registry, settings.relays)
+    watchlist = Watchlist()
+    carried = RelayTraffic(base.trail, registry, settings.relays, watchlist.cut_off)
     grants = Grants(carried.used)
     mediation = Mediation(
         policy,
@@ -64,6 +67,7 @@ def make_core(base: Foundation) -> Core:
     return Core(
         policy=policy,
         registry=registry,
+        watchlist=watchlist,
         carried=carried,
         grants=grants,
         mediation=mediation,

@@ -18,7 +18,7 @@ from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.entries import MasterRegistrations
-from appliance.master.reconcile.liveness import Liveness, Watchlist
+from appliance.master.reconcile.liveness import Liveness
 from appliance.master.rosmaster import RosMaster, limits_of_answers
 from appliance.rpc.server import Handler
 from appliance.specifications.allocation import Allocation
@@ -53,9 +53,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         named_as=lambda host: core.policy().named_as(host),
         relays=settings.relays,
     )
-    watchlist = Watchlist()
     nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
-    delivery = Delivery(nodes, troubled=watchlist.could_not_tell, quota_class=base.quota_class)
+    delivery = Delivery(nodes, troubled=core.watchlist.could_not_tell, quota_class=base.quota_class)
     recordings = RecordingOrders(
         settings.recorder,
         base.trail,
@@ -72,7 +71,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         allocation=allocation,
         policy=core.policy,
         monitors=core.monitors,
-        broken=watchlist.look_at,
+        broken=core.watchlist.look_at,
         own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
         own_call=recordings.called,
     )
@@ -121,7 +120,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             core.graph,
             core.revocation,
             enactor,
-            watchlist,
+            core.watchlist,
             nodes=nodes,
             settings=settings.liveness,
             quota_class=base.quota_class,

@@ -130,8 +130,7 @@ async def make_foundation(
     blocks = BlockTable.of(store, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
-    declared = DeclaredHosts(settings.hosts, store.settings().get(BUNDLED_HOSTS, ""))
-    table = HostTable(store, settings.ipsec.pool, declared)
+    table = make_host_table(settings, store)
     host_authority = make_host_authority(
         settings, signing.link, store, table, pair=pair, replication=replication
     )
@@ -179,21 +178,31 @@ async def make_foundation(
     )
 
 
+def make_host_table(settings: Settings, store: StateStore) -> HostTable:
+    """Return the table of the hosts in the store, with those that hosts.yaml or a bundle declares."""
+    declared = DeclaredHosts(settings.hosts, store.settings().get(BUNDLED_HOSTS, ""))
+    return HostTable(store, settings.ipsec.pool, declared)
+
+
 def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:
-    """Return the listeners by name. Listeners that the supervisor did not keep are opened."""
     host, port = settings.listen_address
     sockets = lifeline.sockets
     for name, address in ((RVMASTER, (host, port)), (INNER, ("127.0.0.1", 0)), (OWN, ("127.0.0.1", 0))):
         if name not in sockets:
-            try:
-                sockets[name] = listen(*address)
-            except OSError as error:
-                raise OSError(
-                    f"{address[0]}:{address[1]} cannot be listened on: {error.strerror}; "
-                    "is a ROS master running there? Stop it, or choose another --listen"
-                ) from error
+            sockets[name] = open_listener(*address)
             lifeline.keep(name, sockets[name])
     return sockets
+
+
+def open_listener(host: str, port: int) -> socket.socket:
+    """Return a listening socket. Raises `OSError` with what to do."""
+    try:
+        return listen(host, port)
+    except OSError as error:
+        raise OSError(
+            f"{host}:{port} cannot be listened on: {error.strerror}; "
+            "is a ROS master running there? Stop it, or choose another --listen"
+        ) from error
 
 
 def _class_of(quota_class: Current[HostQuotaClass], host: str) -> QuotaClass:

@@ -38,6 +38,12 @@ class LeaseClient:
         self._present = True
         self.send(messages.ControlPresent())
 
+    def withdraw(self) -> None:
+        """Report that this process stands by, but could not serve."""
+        if self._present:
+            self._present = False
+            self.send(messages.ControlUnready())
+
     def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
         """Call `changed` with the last report, if there is one, and with each later report."""
         self._listeners.append(changed)

@@ -4,7 +4,6 @@ An unknown host (an address that no rule of the policy names, or that an operato
 its body is read first, to record the name of the call. While the ROS master is not hidden, every host is refused.
 """
 
-import asyncio
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -60,7 +59,7 @@ class ListenerLimits:
         )
         self.time = ProcessorTime(partial(class_of, policy, quota_class))
         self.first = NamedFirst(policy)
-        self._own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
+        self.own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail
         self._policy = policy
@@ -96,7 +95,7 @@ class ListenerLimits:
             handler,
             at_once=at_once,
             limits=self.http,
-            connection_table=self.connection_table if guarded else self._own_connection_table,
+            connection_table=self.connection_table if guarded else self.own_connection_table,
             turns=self.turns if guarded else self._own_turns,
             time=self.time,
             first=self.first if guarded else None,
@@ -104,10 +103,6 @@ class ListenerLimits:
             refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
         )
-
-    async def sweep(self) -> None:
-        """Close expired connections of all listeners; runs until cancelled."""
-        await asyncio.gather(self.connection_table.sweep(), self._own_connection_table.sweep())
 
     def close(self) -> None:
         """Stop serving."""

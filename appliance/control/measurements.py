@@ -68,7 +68,6 @@ def measures_of(
 
 
 def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:
-    """Return the number of events of this kind by resource."""
     sums = by_resource((resource, (count,)) for (what, resource), count in counts.items() if what == kind)
     return {resource: count for resource, (count,) in sums.items()}
 

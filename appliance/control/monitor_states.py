@@ -74,7 +74,6 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         changes=0 if row.shadow else row.changes,
         faults=row.faults,
         certificates=checked.certificates.get(name, []),
-        trial=monitors.switches.in_shadow(name),
         shadow=monitors.switches.in_shadow(name),
         off_until=monitors.returns.until(name),
         would_drop=row.drops if row.shadow else 0,

@@ -94,7 +94,6 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
 
 
 def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
-    """Return the connections by topic or service."""
     found: dict[str, list[Connection]] = {}
     for connection in relay.carried.connections.values():
         if connection.kind == kind and connection.key in names:

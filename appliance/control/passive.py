@@ -6,12 +6,16 @@ gives all other orders to the active appliance.
 
 import asyncio
 import socket
+import ssl
 import time
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import structlog
 
+from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
 from appliance.channel.channel import Channel
@@ -23,6 +27,8 @@ from appliance.control.replication import Pair, host_endpoint, state_of
 from appliance.control.standby_orders import StandbyAdministration
 from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.control.supervisor_link import ControlLifeline
+from appliance.control.takeover_check import TakeoverCheck
+from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership, load_membership
 from appliance.standby.replica import Replica
@@ -48,6 +54,7 @@ class PassiveControl:
         membership: Membership,
         lifeline: ControlLifeline,
         lease: LeaseClient,
+        compiler: SpecificationCompiler,
     ) -> None:
         """Open the replica. Raises `StoreError`."""
         self._settings = settings
@@ -64,8 +71,14 @@ class PassiveControl:
         self.tunnels = StandbyTunnels()
         endpoint = host_endpoint(settings, membership)
         self._replica_sync = ReplicaSync(self._replica, self._folder)
+        self._check = TakeoverCheck(settings, membership, compiler.check)
+        self._complete = False  # whether no acknowledged change is missing
         self._receiver = ReplicationReceiver(
-            self._replica, self._accepts, lambda: self.tunnels.introduction(endpoint, self._rest.pin)
+            self._replica,
+            self._accepts,
+            lambda: self.tunnels.introduction(endpoint, self._rest.pin),
+            lambda: self._check.obstacle or "",
+            self._check.news.set,
         )
         self._epoch = 0
         self._connected = False
@@ -79,15 +92,25 @@ class PassiveControl:
     async def run(self, until: asyncio.Event) -> None:
         """Stand by until the event is set. Then the state file is closed and consistent."""
         loop = asyncio.get_running_loop()
-        tasks = [loop.create_task(self._follow()), loop.create_task(self._prepare_tunnels())]
+
+        def begin(what: str, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
+            return loop.create_task(run_always(what, work))
+
+        tasks = [
+            begin("the link to the active appliance", self._follow),
+            begin("the preparation of tunnels", self._prepare_tunnels),
+        ]
         server = await AdminServer(StandbyAdministration(self, orders=True)).start(
             self._lifeline.sockets[_ADMIN].dup()
         )
-        stating = loop.create_task(self._rest.run())
+        stating = begin("the tokens of REST", self._rest.run)
         self._lifeline.hear(self._heard)
         active = self._lifeline.hear_tunnels(self.tunnels.answered)
         self._lifeline.say(messages.Ready({"stands_by": True}))
-        tasks.append(loop.create_task(self._sync()))
+        tasks += [
+            begin("the copy of the state", self._sync),
+            begin("the check of a takeover", partial(self._check.run, self._state_presence)),
+        ]
         try:
             await until.wait()
         finally:
@@ -102,13 +125,25 @@ class PassiveControl:
             await asyncio.to_thread(self._replica.close)
 
     async def _sync(self) -> None:
-        """Keep the replica on the disk, and let the lease claim once it is complete."""
+        """Keep the replica on the disk, and note when it is complete."""
+
+        def complete() -> None:
+            self._complete = True
+            self._state_presence()
+
         while True:
             try:
-                await self._replica_sync.run(lambda: self._receiver.followed, self._lease.present)
+                await self._replica_sync.run(lambda: self._receiver.followed, complete)
             except (StoreError, OSError) as error:
                 _log.error("the copy of the state is not on the disk", reason=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
+
+    def _state_presence(self) -> None:
+        """Let the lease claim only while this appliance has all data and could serve."""
+        if self._complete and self._check.obstacle == "":
+            self._lease.present()
+        else:
+            self._lease.withdraw()
 
     def state(self) -> StandbyState:
         """Return the state of both appliances, as this one sees it."""
@@ -125,10 +160,20 @@ class PassiveControl:
             trouble_seconds=None if self._connected else round(time.monotonic() - self._away_since, 3),
         )
         wait = self._settings.availability.wait
-        return state_of(self._membership, lease, role="standby", since=self._since, wait=wait, other=other)
+        return state_of(
+            self._membership,
+            lease,
+            role="standby",
+            since=self._since,
+            wait=wait,
+            other=other,
+            obstacle=self._check.obstacle or "",
+        )
 
     async def hand_over(self) -> None:
-        """Ask the active appliance to hand over. Raises `HandOverError` if it is not connected."""
+        """Ask the active appliance to hand over. Raises `HandOverError` if that is not possible now."""
+        if self._check.obstacle:
+            raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
         try:
             await self._receiver.want_switchover()
         except ReplicationError as error:
@@ -147,13 +192,14 @@ class PassiveControl:
             self._lifeline.queue(message, descriptors)
 
     async def _follow(self) -> None:
-        context = replication_context(self._membership, self._folder, server=False)
+        context: ssl.SSLContext | None = None
         while True:
             try:
+                context = context or replication_context(self._membership, self._folder, server=False)
                 await follow_at(
                     self._membership.other_address, self._membership.port, context, self._receiver
                 )
-            except (ReplicationError, StoreError) as error:
+            except (ReplicationError, StoreError, OSError) as error:
                 if self._reason != str(error):
                     self._reason = str(error)
                     _log.info("the active appliance is not followed", reason=self._reason)
@@ -182,7 +228,13 @@ class PassiveControl:
 
 
 async def until_activated(
-    link: Path, settings: Settings, lifeline: ControlLifeline, lease: LeaseClient, stopping: asyncio.Event
+    link: Path,
+    settings: Settings,
+    lifeline: ControlLifeline,
+    lease: LeaseClient,
+    compiler: SpecificationCompiler,
+    *,
+    stopping: asyncio.Event,
 ) -> Pair | None:
     """Stand by until this appliance is activated or stopped. Return None if it is stopped, or not one of two.
 
@@ -193,7 +245,7 @@ async def until_activated(
         return None
     taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
     if taken_over and not stopping.is_set():
-        passive = PassiveControl(settings, membership, lifeline, lease)
+        passive = PassiveControl(settings, membership, lifeline, lease, compiler)
         ended, loop = asyncio.Event(), asyncio.get_running_loop()
         waits = [loop.create_task(event.wait()) for event in (lifeline.activated, stopping)]
         for wait in waits:

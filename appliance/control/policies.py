@@ -122,7 +122,7 @@ class Policies(Revisions[RevisionRow]):
     def differs_from_file(self) -> bool:
         """Whether the policy in force differs from the file."""
         try:
-            return self._read() != (self.current.text, self.in_force.signature)
+            return _read(self.file) != (self.current.text, self.in_force.signature)
         except PolicyRefusedError:
             return True
 
@@ -133,19 +133,13 @@ class Policies(Revisions[RevisionRow]):
         is the file. Exception: if an operator's own revision (from a rollback or REST) was in force when the appliance
         stopped, this revision is used.
         """
-        if self._find_last(restarted=restarted):
-            last = self.in_force
-            try:
-                policy = self._judged(last.text, last.signature, last.file, self.known)
-            except PolicyRefusedError as error:
-                raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
-        else:
-            text, signature = self._read()
-            policy = self._judged(text, signature, str(self.file), self.known)
-            if not self.revision or (self.in_force.text, self.in_force.signature) != (text, signature):
-                self._end_limit()
-                self._keep(policy, signature, who=DISK, note="read at start")
-                return
+        last = self.in_force if self._find_last(restarted=restarted) else None
+        policy, signature = policy_at_start(last, self.file, self.known)
+        kept = self.in_force
+        if last is None and (not kept.revision or (kept.text, kept.signature) != (policy.text, signature)):
+            self._end_limit()
+            self._keep(policy, signature, who=DISK, note="read at start")
+            return
         self._enforce(policy)
         self._resume()
 
@@ -165,7 +159,7 @@ class Policies(Revisions[RevisionRow]):
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self._changing(request.expected):
-            policy, signature = await self._prepared(self._read, str(self.file), who)
+            policy, signature = await self._prepared(lambda: _read(self.file), str(self.file), who)
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
@@ -194,7 +188,7 @@ class Policies(Revisions[RevisionRow]):
     def hosts_changed(self) -> int:
         """Compile the policy in force again, because hosts changed. Return the number of revocations."""
         try:
-            policy = self._judged(self.current.text, self.in_force.signature, self.current.file, self.known)
+            policy = _judged(self.current.text, self.in_force.signature, self.current.file, self.known)
         except PolicyRefusedError as error:  # a defect: the same text was valid before
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
@@ -215,7 +209,7 @@ class Policies(Revisions[RevisionRow]):
         Raises `PolicyRefusedError`. Raises `RevisionChangedError` if another revision came into force in the meantime.
         """
         row = await self._wanted(revision)
-        policy = self._judged(row.text, row.signature, row.file, self.known)
+        policy = _judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
@@ -305,15 +299,6 @@ class Policies(Revisions[RevisionRow]):
             who=who,
         )
 
-    def _read(self) -> tuple[str, str]:
-        """Return the file's text and signature. Raises `PolicyRefusedError`."""
-        try:
-            return read_given_text(self.file), read_signature(self.file)
-        except (OSError, UnicodeDecodeError) as error:
-            raise PolicyRefusedError(
-                [f"{self.file}: the policy cannot be read: {_error_text(error)}"]
-            ) from error
-
     def _tested(
         self,
         read: Callable[[], tuple[str, str]],
@@ -327,13 +312,7 @@ class Policies(Revisions[RevisionRow]):
             if cases is None
             else replace(known, cases_file=cases.file, cases=cases.text)
         )
-        return self._judged(text, signature, file, tested), signature
-
-    def _judged(self, text: str, signature: str, file: str, known: PolicyContext) -> Policy:
-        try:
-            return judge(text, file, known, signature).accepted()
-        except PolicyError as error:
-            raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
+        return _judged(text, signature, file, tested), signature
 
     def _keep(
         self,
@@ -373,3 +352,32 @@ class Policies(Revisions[RevisionRow]):
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
+
+
+def policy_at_start(last: RevisionRow | None, file: Path, known: PolicyContext) -> tuple[Policy, str]:
+    """Return the policy that a start brings into force, and its signature.
+
+    It is that of the stored revision `last`, or of the file (None). Raises `PolicyRefusedError`.
+    """
+    if last is None:
+        text, signature = _read(file)
+        return _judged(text, signature, str(file), known), signature
+    try:
+        return _judged(last.text, last.signature, last.file, known), last.signature
+    except PolicyRefusedError as error:
+        raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
+
+
+def _read(file: Path) -> tuple[str, str]:
+    """Return the file's text and signature. Raises `PolicyRefusedError`."""
+    try:
+        return read_given_text(file), read_signature(file)
+    except (OSError, UnicodeDecodeError) as error:
+        raise PolicyRefusedError([f"{file}: the policy cannot be read: {_error_text(error)}"]) from error
+
+
+def _judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
+    try:
+        return judge(text, file, known, signature).accepted()
+    except PolicyError as error:
+        raise PolicyRefusedError([str(finding) for finding in error.findings]) from error

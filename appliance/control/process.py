@@ -15,13 +15,14 @@ The order of the start:
 import asyncio
 import gc
 import sys
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import structlog
 import uvloop
 
+from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
@@ -30,22 +31,20 @@ from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundati
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
-from appliance.control.policies import PolicyRefusedError
 from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
-from appliance.control.spare_memory import SpareMemory
+from appliance.control.spare_memory import return_spare_memory
 from appliance.control.standby_orders import begin_epoch, standby_source
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
+from appliance.control.takeover_check import STATE_ERRORS
 from appliance.control.takeover_record import TakeoverRecorder
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
 from appliance.master.reconcile.enactor import restore
 from appliance.specifications.compiler_link import SpecificationCompiler
-from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.standby.membership import LINK_FILE, MembershipError
-from appliance.store.writer_thread import StoreError
 from roswire.uris import node_uri
 
 _log = structlog.get_logger()
@@ -68,7 +67,6 @@ def main(lifeline_fd: int, config_path: Path) -> None:
 
 
 async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
-    """Serve until stopped; report a failed start to the supervisor."""
     stopping, tunnels, lease = asyncio.Event(), Current[Tunnels](), LeaseClient()
     compiler = SpecificationCompiler(lambda: lifeline.say(messages.CompilerWanted()))
     lifeline = ControlLifeline(
@@ -81,13 +79,12 @@ async def _run(settings: Settings, lifeline_fd: int, config: Path) -> None:
     lifeline.attach()
     try:
         await lifeline.restored.wait()
-        pair = await until_activated(config.with_name(LINK_FILE), settings, lifeline, lease, stopping)
+        link = config.with_name(LINK_FILE)
+        pair = await until_activated(link, settings, lifeline, lease, compiler, stopping=stopping)
         if stopping.is_set():
             return
         control = await _start(settings, lifeline, compiler, tunnels, pair)
-    except (
-        PolicyRefusedError, SpecificationsRefusedError, StoreError, NoPortError, MembershipError, OSError
-    ) as error:  # fmt: skip
+    except (*STATE_ERRORS, NoPortError, MembershipError) as error:
         lifeline.say(messages.Failed(str(error)))
         await stopping.wait()
         return
@@ -134,7 +131,6 @@ class _Control:
         self._admin: object = None
 
     async def serve(self) -> None:
-        """Serve all listeners, handle the supervisor's messages, and start the background tasks."""
         base, parts, operators = self._base, self._parts, self._operators
         listener_limits, sockets, inner = base.listener_limits, base.sockets, parts.endpoints.inner
         calls = answered_when_stored(base.replication, parts.pipeline.handler(parts.table))
@@ -153,24 +149,29 @@ class _Control:
             operators.rest.attach(base.pair.api)
             operators.certification.served_by(base.pair.tunnels.pin)  # the api has stated it already
         base.lifeline.hear(self._messages.heard)
-        work: list[Coroutine[Any, Any, None]] = [
-            parts.reconciler.run(),
-            parts.endpoints.liveness.run(),
-            listener_limits.sweep(),
-            SpareMemory().watch(),
-            operators.clock.watch(),
-            operators.switched_off.watch(),
-            operators.blocks.watch(),
-            operators.bundles.run(),
-            self._save_parameters(),
-            base.tunnels.run(operators.certification.each_hour),
-            parts.publisher.run(parts.reconciler.ready),
-        ]
+        work: dict[str, Callable[[], Awaitable[None]]] = {
+            "the reconciliation with the ROS master": parts.reconciler.run,
+            "the checks of nodes": parts.endpoints.liveness.run,
+            "the ends of connections": listener_limits.connection_table.sweep,
+            "the ends of own connections": listener_limits.own_connection_table.sweep,
+            "the return of memory": return_spare_memory,
+            "the check of the clock": operators.clock.watch,
+            "the check of protection that is off": operators.switched_off.watch,
+            "the blocks of hosts": operators.blocks.watch,
+            "the bundles": operators.bundles.run,
+            "the storage of parameters": self._save_parameters,
+            "the tunnels": partial(base.tunnels.run, operators.certification.each_hour),
+            "the publications of monitors": partial(parts.publisher.run, parts.reconciler.ready),
+        }
         if base.replication is not None:
-            work += [base.replication.run(), operators.standby.obey(base.replication.switchover_wanted)]
+            work["the replication"] = base.replication.run
+            work["the orders of the standby"] = partial(
+                operators.standby.obey, base.replication.switchover_wanted
+            )
         if self._recorder is not None:
-            work.append(self._recorder.follow())
-        self._tasks += map(asyncio.get_running_loop().create_task, work)
+            work["the replication of checkpoints"] = self._recorder.follow
+        loop = asyncio.get_running_loop()
+        self._tasks += [loop.create_task(run_always(what, one)) for what, one in work.items()]
 
     async def announce(self, *, restarted: bool) -> None:
         """Send `Ready`. Include the first access token if it was not shown to an operator yet."""
@@ -196,13 +197,14 @@ class _Control:
         base.lifeline.say(messages.Ready(detail))
 
     async def end(self) -> None:
-        """Stop serving, and save the state."""
         base, parts, ends = self._base, self._parts, self._parts.endpoints
         base.listener_limits.close()
         ends.faces.close_all()
         parts.reminders.close()
         ends.enactor.delivery.close()
         ends.rosmaster.close()
+        if base.replication is not None:
+            base.replication.close()
         await _end_others(_TASKS_SECONDS)  # requests may still write state while they end
         base.trail.happened("appliance stopped", "control ended in an orderly way")
         base.store.save_parameters(parts.core.parameters.tree)
@@ -221,7 +223,6 @@ class _Control:
 
 
 async def _end_others(seconds: float) -> None:
-    """Cancel all other tasks, and wait at most `seconds` for their end."""
     others = asyncio.all_tasks() - {asyncio.current_task()}
     for task in others:
         task.cancel()

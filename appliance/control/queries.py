@@ -60,9 +60,8 @@ class Queries:
 
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
     recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
-    that is switched off. `blocks()` and `bundles()` return the states of the blocks and the
-    bundles. `standby()` returns the state of the two
-    appliances, or None if this one is not one of two.
+    that is switched off. `blocks()` and `bundles()` return the states of the blocks and the bundles. `standby()`
+    returns the state of the two appliances, or None if this one is not one of two.
     """
 
     parts: Parts
@@ -98,7 +97,6 @@ class Queries:
             esp=self.hosts.status().esp,
             sandbox=sandbox,
             lacks=sorted({lack for process in around.processes for lack in process.lacks}),
-            walls=sandbox,
         )
         return msgspec.structs.replace(found, in_use=used)
 

@@ -9,6 +9,7 @@
 
 import asyncio
 import contextlib
+import os
 import socket
 import time
 from collections.abc import Callable, Coroutine
@@ -17,6 +18,7 @@ from typing import Any, Literal, NamedTuple
 
 import structlog
 
+from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.channel.channel import Channel
@@ -38,6 +40,7 @@ _SYNC_SECONDS = 0.1
 _BACKLOG = 8
 _SETTLE_SECONDS = 2.0
 _ANSWER_SECONDS = 5.0
+_PORT_SECONDS = 1.0  # until the port of the replication is tried again
 
 _log = structlog.get_logger()
 
@@ -95,6 +98,7 @@ def state_of(
     since: float,
     wait: Literal["standby", "none"],
     other: OtherAppliance,
+    obstacle: str,
 ) -> StandbyState:
     """Return the state of this appliance for operators."""
     now = boot_time()
@@ -116,6 +120,7 @@ def state_of(
             holder=lease.holder if lease is not None else "",
             refusal=lease.refusal if lease is not None else "the process `lease` has not reported yet",
         ),
+        obstacle=obstacle,
     )
 
 
@@ -157,6 +162,7 @@ class Replication:
             self.sender, replication_context(membership, folder, server=True)
         )
         self._permission = 0
+        self._unserved = ""  # why no standby can connect
         self._trouble_since: float | None = None
         self._absent = taken_over and wait == "standby"
         self._tasks: set[asyncio.Task[None]] = set()
@@ -175,17 +181,38 @@ class Replication:
         self.sender.on_introduction(start)
 
     async def run(self) -> None:
-        """Serve the standby until cancelled. Raises `OSError` if the port is in use."""
+        """Serve the standby until cancelled. While the port is in use, try again."""
         self._lease.present()
-        with socket.create_server(("", self._membership.port), backlog=_BACKLOG) as listening:
-            loop = asyncio.get_running_loop()
-            tasks = [loop.create_task(self._report_always()), loop.create_task(self._sync_always())]
-            try:
+        loop = asyncio.get_running_loop()
+        tasks = [
+            loop.create_task(run_always("the report of the replication", self._report_always)),
+            loop.create_task(run_always("the copy on this disk", self._sync_always)),
+        ]
+        try:
+            with await self._listening() as listening:
                 await self._listener.run(listening)
-            finally:
-                for task in tasks:
-                    task.cancel()
-                self.sender.close()
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    def close(self) -> None:
+        """Keep no further changes for the standby; a change that is not answered yet gets no answer."""
+        self.sender.close()
+
+    async def _listening(self) -> socket.socket:
+        address = ("", self._membership.port)
+        while True:
+            try:
+                made = socket.create_server(address, backlog=_BACKLOG)
+            except OSError as error:
+                if not self._unserved:
+                    reason = os.strerror(error.errno or 0)
+                    self._unserved = f"the standby cannot connect to port {address[1]}: {reason}"
+                    _log.error("the replication is not served", reason=self._unserved)
+                await asyncio.sleep(_PORT_SECONDS)
+            else:
+                self._unserved = ""
+                return made
 
     async def stored(self) -> None:
         """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
@@ -210,11 +237,17 @@ class Replication:
             behind_changes=lag.changes,
             behind_bytes=lag.bytes,
             waiting_seconds=None if waiting is None else round(now - waiting, 3),
-            reason="" if self._connected() else lag.reason or "it does not answer",
+            reason="" if self._connected() else self._unserved or lag.reason or "it does not answer",
             trouble_seconds=None if trouble is None else round(now - trouble, 3),
         )
         return state_of(
-            self._membership, lease, role="active", since=self._since, wait=self._wait, other=other
+            self._membership,
+            lease,
+            role="active",
+            since=self._since,
+            wait=self._wait,
+            other=other,
+            obstacle=lag.obstacle,
         )
 
     def _connected(self) -> bool:
@@ -230,6 +263,9 @@ class Replication:
                 f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
                 " in sync"
             )
+        obstacle = self.sender.lag().obstacle
+        if obstacle:
+            raise HandOverError(f"{self._membership.other} cannot take over: {obstacle}")
 
     async def hand_over(self) -> None:
         """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""
@@ -262,7 +298,6 @@ class Replication:
             await asyncio.sleep(_REPORT_SECONDS)
 
     async def _sync_always(self) -> None:
-        """Bring changes to this appliance's disk soon after their answers."""
         synced = 0
         while True:
             number = self._database.number

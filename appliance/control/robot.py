@@ -40,7 +40,6 @@ def master_address(settings: Settings) -> str:
 
 
 def _towards(peer: Address) -> str:
-    """Return the source address of packets to a peer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.connect((str(peer), 9))  # connecting a datagram socket only selects a route
         return str(sock.getsockname()[0])
@@ -51,8 +50,6 @@ def _default_gateway() -> Address | None:
 
 
 def _routes() -> list[tuple[ipaddress.IPv4Address, ipaddress.IPv4Address]]:
-    """Return the network and gateway of each IPv4 route of the kernel."""
-
     def address(field: str) -> ipaddress.IPv4Address:
         return ipaddress.IPv4Address(struct.pack("<I", int(field, 16)))
 

@@ -8,7 +8,6 @@ allocates the pages again for each copy. So control returns the memory a little 
 import asyncio
 import ctypes
 import resource
-from collections.abc import Callable
 from pathlib import Path
 
 _LOOK_SECONDS = 3.0
@@ -20,35 +19,15 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def give_back() -> None:
-    """Return the allocator's free memory to the system. Other Python threads run in the meantime."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only; other C libraries keep less memory
-    if trim is not None:
-        trim(0)
-
-
-class SpareMemory:
-    """Return free memory while the process has over `MUCH` bytes more than its minimum.
+async def return_spare_memory(seconds: float = _LOOK_SECONDS) -> None:
+    """Return free memory while the process has over `MUCH` bytes more than its minimum; runs until cancelled.
 
     This repeats even if the memory is in use, because the allocator keeps memory that is freed later.
     """
-
-    def __init__(
-        self, *, size: Callable[[], int] = resident, give_back: Callable[[], None] = give_back
-    ) -> None:
-        self._size = size
-        self._give_back = give_back
-        self._least = size()
-
-    async def watch(self) -> None:
-        """Check every few seconds; runs until cancelled."""
-        while True:
-            await asyncio.sleep(_LOOK_SECONDS)
-            await self.look()
-
-    async def look(self) -> None:
-        """Return free memory if there may be more than `MUCH` bytes of free memory."""
-        size = self._size()
-        self._least = min(self._least, size)
-        if size > self._least + MUCH:
-            await asyncio.to_thread(self._give_back)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only; other C libraries keep less memory
+    least = resident()
+    while True:
+        await asyncio.sleep(seconds)
+        least = min(least, size := resident())
+        if trim is not None and size > least + MUCH:
+            await asyncio.to_thread(trim, 0)

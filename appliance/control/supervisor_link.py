@@ -200,7 +200,6 @@ class ControlLifeline:
     def _answered(
         self, message: messages.TunnelsEnclosed | messages.EndpointFound | messages.RouteFound
     ) -> None:
-        """Pass an answer to the calls that wait for it."""
         match message:
             case messages.TunnelsEnclosed():
                 self._enclosed(message)

@@ -60,7 +60,6 @@ class SupervisorMessages:
                 )
 
     def _note_failing(self, processes: list[ProcessInfo]) -> None:
-        """Record each process that ends soon after every start."""
         failing = {process.role: process for process in processes if process.failing}
         for role in failing.keys() - self._failing:
             process = failing[role]
@@ -112,7 +111,6 @@ class SupervisorMessages:
         self._parts.reminders.begin()
 
     async def _reload(self) -> None:
-        """Read the policy and hosts.yaml again from the disk."""
         async with self._one_reload:
             try:
                 await self._reload_policy()

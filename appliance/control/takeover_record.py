@@ -119,7 +119,6 @@ class TakeoverRecorder:
             self._store.save_setting(_CHECKPOINT + self._name, checkpoint.as_json())
 
     def _last_recorded(self) -> EpochOf | None:
-        """Return the last takeover in this appliance's own log, or None."""
         try:
             found = search(self._audit.path, Filter(event=TOOK_OVER), None, 1).entries
         except LogUnreadableError:
@@ -147,7 +146,6 @@ class TakeoverRecorder:
         )
 
     def _own_key(self) -> str:
-        """Return the key of this appliance's log; empty before the first signature."""
         pin = pinned_key_path(self._audit.path)
         try:
             return read_public_key(pin).hex() if pin.exists() else ""
@@ -163,5 +161,5 @@ def _decoded(text: str, kind: type[_T]) -> _T | None:
     """Return a value that the other appliance may have written; None if it is not of this kind."""
     try:
         return msgspec.json.decode(text, type=kind)
-    except (msgspec.MsgspecError, ValueError, RecursionError):
+    except (ValueError, RecursionError):
         return None

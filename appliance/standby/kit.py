@@ -1,7 +1,7 @@
 """Make the memberships of two appliances, and the kits for the robot's computers. No I/O.
 
-Each call makes new keys and a new lease file. So the lease of an earlier kit stays what it was: after a new kit, the
-standby is in sync only when it has all data, and an old kit that is installed again grants nothing to an appliance with
+Each call makes new keys and a new lease file. So a new kit never changes the lease of an earlier kit. After a new kit,
+the standby is in sync only when it has all data. An old kit that is installed again grants nothing to an appliance with
 new keys.
 """
 

@@ -6,8 +6,8 @@ This module reads no clock and no socket. Its owner passes the time with each me
 
 1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
    promise that was given. The witness and the other appliance count a whole expiry from a later time.
-2. A passive appliance becomes active only by the witness. A grant that arrives while it has promised not to claim waits
-   until the promise ends: the other appliance may rely on it.
+2. A passive appliance becomes active only by a grant of the witness. A grant that arrives while it has promised not to
+   claim waits until the promise ends: the other appliance may rely on it.
 3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
    off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
@@ -31,7 +31,7 @@ Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
 
 
 class LeaseError(Exception):
-    """An order that is not possible now; the text says what to do."""
+    """An order that is not possible now; the message has the remedy."""
 
 
 @dataclass(frozen=True)

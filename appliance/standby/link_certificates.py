@@ -70,6 +70,12 @@ def link_context(own: LinkCertificate, peer: str, folder: Path, *, server: bool)
 
 
 def replication_context(membership: Membership, folder: Path, *, server: bool) -> ssl.SSLContext:
-    """Return the TLS context of the replication; see `link_context`."""
+    """Return the TLS context of the replication. Raises `OSError` with what to do."""
     own = LinkCertificate(membership.certificate, membership.key)
-    return link_context(own, membership.other_certificate, folder, server=server)
+    try:
+        return link_context(own, membership.other_certificate, folder, server=server)
+    except ssl.SSLError as error:
+        raise OSError(
+            f"the certificates of the two appliances cannot be used ({error}); on the active appliance, run"
+            " `rosrv standby join … --again`, and use the new kit"
+        ) from error

@@ -14,7 +14,7 @@ LEASE_FILE, LINK_FILE = "lease.json", "link.json"
 """The parts of it that the supervisor writes for the process `lease` and for control."""
 
 LEFT_FILE = "left.json"
-"""The membership that this appliance left last, without its secrets."""
+"""The last membership that this appliance left, without its secrets."""
 
 PORT = 7412
 """The default port of both appliances: promises (UDP) and replication (TCP)."""
@@ -90,7 +90,7 @@ def load_membership(path: Path) -> Membership | None:
         return msgspec.json.decode(path.read_bytes(), type=Membership)
     except FileNotFoundError:
         return None
-    except (msgspec.MsgspecError, ValueError) as error:
+    except ValueError as error:
         raise MembershipError(
             f"{path} cannot be used: {error}; run `rosrv standby join` again, or `rosrv standby leave`"
         ) from error

@@ -1,8 +1,9 @@
 """The datagrams between two appliances: requests for a promise, promises, and the order to take over.
 
 Each datagram is authenticated with a key that both appliances share. A promise repeats the nonce and the number of its
-request, so no earlier promise is valid. An active appliance uses one nonce in an epoch, because a restarted one needs a
-new epoch. So a request is new only if its epoch is greater, or its nonce is the same and its number greater.
+request, so no earlier promise is valid. An active appliance uses one nonce in an epoch, because a restarted appliance
+needs a new epoch. So a request is new only if its epoch is greater, or if its nonce is the same and its number is
+greater.
 """
 
 import msgspec

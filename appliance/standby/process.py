@@ -1,10 +1,11 @@
 """Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
 
 The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
-the supervisor, which ends the processes that serve the robot when no further one arrives: so the appliance becomes
-passive also if this process hangs or dies. The greatest epoch is on the disk before it is used.
+the supervisor. If no further extension arrives, the supervisor ends the processes that serve the robot. So the
+appliance also becomes passive if this process hangs or dies. The greatest epoch is on the disk before it is used.
 
 This appliance claims only while its control is present. If control is away for long, the other appliance takes over.
+The control of a standby also withdraws its presence while it could not serve (`control/takeover_check.py`).
 """
 
 import asyncio
@@ -205,11 +206,14 @@ class LeaseProcess:
 
     def control_linked(self) -> None:
         """A new control waits for the standby until it gets a new permission."""
-        if self._present:
-            self._present, self._absent_since = False, boot_time()
+        self._withdraw()
         self._report = messages.ReplicationReported(self._permission, False, None)
         self._told = None
         self._wake.set()
+
+    def _withdraw(self) -> None:
+        if self._present:
+            self._present, self._absent_since = False, boot_time()
 
     def control_said(self, message: Any) -> None:
         """Take a message of control."""
@@ -220,6 +224,8 @@ class LeaseProcess:
                 self._lease.follow(epoch)
             case messages.ControlPresent():
                 self._present = True
+            case messages.ControlUnready():
+                self._withdraw()
             case messages.HandOverWanted():
                 self._hand_over()
             case _:

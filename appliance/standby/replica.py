@@ -1,6 +1,6 @@
 """The state file of a standby: it takes changes and snapshots from the active appliance, each in one transaction.
 
-The active appliance is authenticated, but not believed. It can put and delete rows of the known tables, with values of
+The active appliance is authenticated, but not trusted. It can put and delete rows of the known tables, with values of
 the right types; it cannot send SQL, a database file, a trigger, or rows of another table. The file cannot grow beyond
 `LARGEST_STATE`. Changes must follow each other without a gap, and none is accepted from a smaller epoch.
 

@@ -1,8 +1,8 @@
 """Keep the replica of a standby on the disk, and notice that a power cut may have taken its last changes.
 
 A change is acknowledged before it is on the disk. While the machine runs, it cannot be lost. After a reboot the last
-changes may be missing, so this appliance takes over only once it has followed the active one again. If none appears
-within `WAIT_SECONDS`, both appliances were cut off together, and each has all but the last changes.
+changes may be missing, so this appliance takes over only once it has followed the active one again. If no active
+appliance appears within `WAIT_SECONDS`, both lost their power together, and each has all but the last changes.
 """
 
 import asyncio

@@ -1,8 +1,9 @@
 """The messages between an active appliance and its standby, and the frames that carry them.
 
 A frame is a length (4 bytes) and one message as MessagePack. The standby sends `Stored`: first its position, then one
-for each message that it received; between them, it sends an `Introduction` every hour. The active appliance sends
-`Changes` after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
+for each message that it received; between them, it sends an `Introduction` every hour, and an
+`ObstacleFound` when its obstacle to a takeover changes; at first it has none. The active appliance sends `Changes`
+after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
 """
 
 import asyncio
@@ -55,6 +56,12 @@ class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introducti
     pin: Annotated[str, msgspec.Meta(pattern=r"^(sha256//[A-Za-z0-9+/]{43}=)?\Z")]
 
 
+class ObstacleFound(msgspec.Struct, frozen=True, array_like=True, tag="obstacle"):
+    """The standby could not serve after a takeover, for this reason; empty: it could again."""
+
+    reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
+
+
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag="refused"):
     """The sender of this message ends the link, for this reason."""
 
@@ -100,12 +107,17 @@ class SnapshotEnd(msgspec.Struct, frozen=True, array_like=True, tag="end"):
 
 
 FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused
-FromStandby = Stored | Introduction | Refused | SwitchoverWanted
+FromStandby = Stored | Introduction | ObstacleFound | Refused | SwitchoverWanted
 
 
 def reason_of(error: Exception) -> Refused:
-    """Return the message that tells the other side why the link ends."""
+    """Return the message with the reason why this side ends the link."""
     return Refused(str(error)[:_LONGEST_REASON])
+
+
+def obstacle_of(reason: str) -> ObstacleFound:
+    """Return the message with the reason why the standby could not serve."""
+    return ObstacleFound(reason[:_LONGEST_REASON])
 
 
 class ReplicationLink(Generic[M]):
@@ -158,7 +170,7 @@ class ReplicationLink(Generic[M]):
             raise ReplicationError(f"the link was lost: {error}") from error
         try:
             return self._decoder.decode(body)
-        except (msgspec.MsgspecError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise ReplicationError(f"a message is malformed: {error}") from error
 
     async def close(self) -> None:

@@ -14,9 +14,11 @@ from appliance.standby.replication_frames import (
     SnapshotBegin,
     SnapshotEnd,
     SwitchoverWanted,
+    obstacle_of,
     reason_of,
 )
 from appliance.store.changes import Put
+from appliance.store.state_file import REVISION_TABLES
 from appliance.store.writer_thread import StoreError
 
 _INTRODUCED_SECONDS = 3600.0
@@ -28,7 +30,9 @@ _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 class ReplicationReceiver:
     """The standby's end; `accepts` decides whether an appliance of this epoch may be the active one.
 
-    `introduction()` returns this appliance's introduction, or None while it has none.
+    `introduction()` returns this appliance's introduction, or None while it has none. `obstacle()` returns why this
+    appliance could not serve after a takeover; empty: it could. `revised()` is called after a change of the policy or
+    the specifications.
     """
 
     def __init__(
@@ -36,6 +40,8 @@ class ReplicationReceiver:
         replica: Replica,
         accepts: Callable[[int], bool],
         introduction: Callable[[], Introduction | None] = lambda: None,
+        obstacle: Callable[[], str] = lambda: "",
+        revised: Callable[[], None] = lambda: None,
     ) -> None:
         self._replica = replica
         self._accepts = accepts
@@ -44,6 +50,9 @@ class ReplicationReceiver:
         """Whether the active appliance has sent what was missing since this object was made."""
         self._introduction = introduction
         self._introduced = 0.0  # when, by the clock of the event loop
+        self._obstacle = obstacle
+        self._reported = ""  # the obstacle that the active appliance knows
+        self._revised = revised
 
     async def want_switchover(self) -> None:
         """Ask the active appliance to hand over. Raises `ReplicationError` if it is not connected."""
@@ -54,12 +63,13 @@ class ReplicationReceiver:
     async def follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Take changes until the link ends. Raises `ReplicationError`, and `StoreError` if the disk is full."""
         link: ReplicationLink[FromActive] = ReplicationLink(reader, writer, FromActive)
-        self._introduced = -_INTRODUCED_SECONDS
+        self._introduced, self._reported = -_INTRODUCED_SECONDS, ""
         try:
             await link.send(self._replica.position)
             self._link = link
             while True:
                 await self._introduce(link)
+                await self._report_obstacle(link)
                 message = await link.receive(_SILENCE_SECONDS)
                 if isinstance(message, Refused):
                     raise ReplicationError(f"the active appliance refuses: {message.reason}")
@@ -67,6 +77,8 @@ class ReplicationReceiver:
                     self._require_accepted(message)
                     await self._take(message)
                     self.followed = self.followed or isinstance(message, Changes | SnapshotEnd)
+                    if _has_revisions(message):
+                        self._revised()
                 except (ReplicationError, StoreError) as error:
                     await link.send(reason_of(error))
                     raise
@@ -82,6 +94,13 @@ class ReplicationReceiver:
             self._introduced = now
             await link.send(introduction)
 
+    async def _report_obstacle(self, link: ReplicationLink[FromActive]) -> None:
+        """Report an obstacle that has changed. An earlier version does not know this message, and ends the link."""
+        obstacle = self._obstacle()
+        if obstacle != self._reported:
+            self._reported = obstacle
+            await link.send(obstacle_of(obstacle))
+
     async def _take(self, message: FromActive) -> None:
         """Store a message. A few small changes take less time than a thread, and an answer waits for them."""
         if isinstance(message, Changes) and _is_small(message):
@@ -92,6 +111,12 @@ class ReplicationReceiver:
     def _require_accepted(self, message: FromActive) -> None:
         if isinstance(message, Changes | SnapshotBegin) and not self._accepts(message.epoch):
             raise ReplicationError(f"an appliance of epoch {message.epoch} is not accepted as the active one")
+
+
+def _has_revisions(message: FromActive) -> bool:
+    return isinstance(message, SnapshotEnd) or (
+        isinstance(message, Changes) and any(change.table in REVISION_TABLES for change in message.changes)
+    )
 
 
 def _is_small(message: Changes) -> bool:

@@ -1,12 +1,12 @@
 """Send the changes of the active appliance's state to its standby, and wait until the standby has them.
 
-The standby connects, and says which change it has. It gets the changes after that one, if they are of this process and
-still in memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy. Rows
+The standby connects, and reports its last change. It gets the later changes, if this process made them and still has
+them in memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy. Rows
 are sent rather than the database file, because the standby must not have to trust a file.
 
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
-2. While the standby is away, at most `room` bytes of changes are kept. Making changes never waits for the standby:
-   whether an answer does is the caller's decision (`acknowledged`).
+2. While the standby is away, at most `room` bytes of changes are kept. Changes never wait for the standby; the caller
+   decides whether an answer waits (`acknowledged`).
 3. While the appliance answers alone (`answer_alone`), `acknowledged` does not wait. This ends once the standby has all
    changes.
 4. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
@@ -26,6 +26,7 @@ from appliance.standby.replication_frames import (
     EncodedChanges,
     FromStandby,
     Introduction,
+    ObstacleFound,
     Refused,
     ReplicationError,
     ReplicationLink,
@@ -57,7 +58,8 @@ _log = structlog.get_logger()
 class ReplicationLag(NamedTuple):
     """How far the standby is behind, and why its last link ended.
 
-    `waiting_since` (time of the loop) is set while `acknowledged` has waiters.
+    `waiting_since` (time of the loop) is set while `acknowledged` has waiters. `obstacle` is why the connected standby
+    could not serve after a takeover; empty: it could, or it is not connected.
     """
 
     connected: bool
@@ -65,6 +67,7 @@ class ReplicationLag(NamedTuple):
     bytes: int
     waiting_since: float | None
     reason: str
+    obstacle: str = ""
 
     @property
     def caught_up(self) -> bool:
@@ -97,7 +100,7 @@ class ReplicationSender:
         self._sent = self._most_sent = 0  # on this link, on all links
         self._unanswered = 0
         self._answered = asyncio.Event()
-        self._reason = ""
+        self._reason = self._obstacle = ""
         self.link: asyncio.Task[None] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
         self.alone = False
@@ -138,6 +141,7 @@ class ReplicationSender:
             self._feed.size,
             min((since for _number, since in self._waiting.values()), default=None),
             self._reason,
+            self._obstacle if self.link is not None else "",
         )
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -202,6 +206,7 @@ class ReplicationSender:
                 stored=begin.number,
             )
         self._acknowledged = self._sent = self._unanswered = 0
+        self._obstacle = ""
         if position is not None:
             self._sent = position
             self.take(begin)
@@ -228,6 +233,9 @@ class ReplicationSender:
                 continue
             if isinstance(message, Introduction):
                 self._introduced(message)
+                continue
+            if isinstance(message, ObstacleFound):
+                self._obstacle = message.reason
                 continue
             self._unanswered -= 1
             self._answered.set()

@@ -68,7 +68,7 @@ _FREEBIND, _SO_MARK = (
     15,
     36,
 )  # socket options that Python 3.5 does not name; FREEBIND: the network may be down
-_PROGRAM_SECONDS = 2.0
+_PROGRAM_SECONDS = 20.0  # at a boot, the first rule loads kernel modules from a slow disk
 _CHECK_SECONDS = 1.0
 _RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
 _BATCH = 256  # datagrams between two checks of the time
@@ -86,7 +86,7 @@ Program = Callable[[List[str], str], str]
 
 
 class WitnessError(Exception):
-    """A request, a setting or the system that prevents an operation; the text says how to go on."""
+    """A request, a setting or the system that prevents an operation; the message has the remedy."""
 
 
 LeaseRecord = NamedTuple(
@@ -955,6 +955,15 @@ class LeaseEnforcement:
         return True
 
 
+def _shut(settings: WitnessSettings, backend: str) -> None:
+    """Shut out both appliances. At a boot there is no connection to reset."""
+    LeaseFirewall(settings, backend).admit("")
+    idle = IdleConnections(settings)
+    idle.reset("")
+    while idle.go_on():
+        select.select([], [], [], _RESET_SECONDS)
+
+
 def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
     """Answer the appliances until the process ends."""
     log = BoundedLog(_write_error, time.monotonic)
@@ -1123,7 +1132,7 @@ def main(arguments: List[str]) -> int:
         settings = read_settings(chosen.settings)
         lease = LeaseFile(settings.state, tuple(sorted(settings.appliances)))
         if chosen.command == "shut":
-            LeaseFirewall(settings, backend).admit("")
+            _shut(settings, backend)
             return 0
         _require_place(settings, chosen.command)
         with lease:

@@ -17,7 +17,7 @@ from appliance.standby.lease import PromiseRequest
 from appliance.standby.membership import Membership
 from appliance.standby.peer_link import PeerChannel
 from appliance.standby.process import LeaseProcess, boot_time
-from appliance.standby.witness import AppliancePeer, LeaseRecord, Witness, WitnessGate
+from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_root
 from tests.support.waiting import eventually
@@ -210,3 +210,15 @@ def test_a_smaller_epoch_of_the_witness_grants_nothing(site: Site) -> None:
         site.serve()
     site.read()
     assert not site.held() and site.record.epoch == 1
+
+
+def test_it_claims_only_while_control_is_ready(site: Site) -> None:
+    """A control that could not serve withdraws its presence; once it could, the lease is claimed."""
+    site.start()
+    site.control.send(messages.ControlUnready())
+    later = boot_time() + 3 * EXPIRY
+    site.until(lambda: boot_time() > later)
+    assert not site.held() and site.record.epoch == 1
+    site.control.send(messages.ControlPresent())
+    site.until(site.held)
+    assert site.record.epoch == 2

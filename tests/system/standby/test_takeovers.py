@@ -15,7 +15,9 @@ from typing import Any
 import pytest
 
 from appliance.channel import admin
+from appliance.standby.membership import PORT
 from appliance.standby.witness import EXPIRY
+from examples.landshark.lab import Host
 from tests.support.standby_robot import StandbyRobot
 from tests.support.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
 from tests.support.waiting import eventually
@@ -132,6 +134,21 @@ def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, rob
     with site.without_link(ADDRESSES[active], ROBOT):
         site.until_taken_over(passive)
         robot.lost_nothing()
+
+
+def test_a_port_of_the_replication_that_is_in_use(site: StandbySite, robot: StandbyRobot) -> None:
+    """The new active appliance reports it, serves the robot alone, and takes the other back when the port is free."""
+    active, passive = site.pair()
+    host = site.appliances[passive].host
+    assert isinstance(host, Host)
+    with host.run(lambda: socket.create_server(("", PORT))):
+        site.cut(active)
+        site.until_taken_over(passive)
+        site.restore(active)
+        robot.lost_nothing()
+        found = site.appliances[passive].ask(admin.StandbyWanted())
+        assert found.other.reason == f"the standby cannot connect to port {PORT}: Address already in use"
+        assert site.in_sync() == {passive}
 
 
 def test_the_death_of_the_witness(site: StandbySite, robot: StandbyRobot) -> None:

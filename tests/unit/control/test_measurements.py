@@ -48,7 +48,7 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
     for number in range(4):
         uri = f"http://10.0.0.5:400{number}/"
         registry.add(Incarnation(f"k{number}", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2))
-    counted = RelayTraffic(cast(Any, None), registry, 1)
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
     for number in range(4):
         rows = [
             TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
@@ -73,7 +73,7 @@ def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None
     node = Incarnation("k", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
     registry.add(node)
     registry.register(node, Kind.PUBLICATION, "/a", "std_msgs/String")
-    counted = RelayTraffic(cast(Any, None), registry, 1)
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
     assert published_now(registry, counted.traffic) == {"/a": {"/node": LiveType("std_msgs/String")}}
     for md5sum in ("992c", ""):
         counted.reported([TopicTraffic("k", "/a", 1, 1, 0, 1, md5sum=md5sum)])

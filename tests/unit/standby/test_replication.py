@@ -524,6 +524,48 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
     found.close()
 
 
+async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_path: Path) -> None:
+    """The standby learns of each new policy, and the active appliance of an obstacle, its change and its end."""
+    (tmp_path / "active").mkdir()
+    (tmp_path / "standby").mkdir()
+    store = StateStore(tmp_path / "active", failed=pytest.fail)
+    sender = ReplicationSender(store.database, lambda: 1)
+    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
+    revisions: list[int] = []
+    obstacles: list[str] = [""]
+    ends, others = await pair_of_streams()
+    receiver = ReplicationReceiver(
+        replica,
+        lambda _epoch: True,
+        obstacle=lambda: obstacles[-1],
+        revised=lambda: revisions.append(replica.position.number),
+    )
+    tasks = [asyncio.create_task(sender.serve(*ends)), asyncio.create_task(receiver.follow(*others))]
+    async with asyncio.timeout(SECONDS):
+        await sender.acknowledged(store.database.number)
+        await until(lambda: len(revisions) == 1)  # the snapshot
+        store.save_setting("name", "value")
+        store.save_revision(RevisionRow(1, "text", "p.ini", 1.0, "disk", "note"))
+        await sender.acknowledged(store.database.number)
+        await until(lambda: len(revisions) > 1 and revisions[-1] == store.database.number)
+        for obstacle in ("other keys", "x" * 600, ""):
+            obstacles.append(obstacle)
+            store.save_setting("name", obstacle)
+            await until(lambda expected=obstacle[:500]: sender.lag().obstacle == expected)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+        before = len(revisions)
+        obstacles.append("a port")
+        store.save_setting("name", "")
+        await until(lambda: sender.lag().obstacle == "a port")
+        assert len(revisions) == before
+        tasks[1].cancel()
+        await until(lambda: not sender.lag().connected)
+        assert sender.lag().obstacle == ""
+    sender.close()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    replica.close()
+    await asyncio.to_thread(store.close)
+
+
 @pytest.mark.parametrize(
     ("data", "reason"),
     [

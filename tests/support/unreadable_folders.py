@@ -1,0 +1,23 @@
+"""Folders that may not be read, also for root, whom permissions do not stop."""
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+
+def make_unreadable(folder: Path, patch: pytest.MonkeyPatch) -> None:
+    """Have this process refuse to list a folder, as the kernel refuses it to a user without the right."""
+
+    def refusing(listed: Any) -> Any:
+        def list_folder(path: Any = ".") -> Any:
+            if Path(os.fsdecode(path)) == folder:
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return listed(path)
+
+        return list_folder
+
+    patch.setattr(os, "scandir", refusing(os.scandir))
+    patch.setattr(os, "listdir", refusing(os.listdir))

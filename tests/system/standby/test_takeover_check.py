@@ -1,0 +1,146 @@
+"""A standby that could not serve: both appliances report it, it does not claim, and recovers automatically.
+
+The standby `b` has keys of the site, which `a` does not know. All tests of the file use the same appliances.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.channel import admin
+from examples.landshark.lab import Lab
+from tests.support.appliance import OPEN_POLICY
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_program, need_root, needs
+from tests.support.site_key import LINE, signed
+from tests.support.standby_site import StandbySite
+from tests.support.waiting import eventually
+from tests.system.standby.conftest import RULE
+
+NO_SIGNATURE = "it has no signature of the site"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
+    """Run both appliances, `a` active with an unsigned policy."""
+    need_root()
+    need_program("nft", "nftables")
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    home: Path = tmp_path_factory.mktemp("unready")
+    with Lab("rosrv-unready") as lab, StandbySite(lab, home, monitors={}) as made:
+        standby = made.appliances["b"]
+        config = standby.directory / "appliance.yaml"
+        file = standby.policy_file  # checked at the start, although a takeover uses the replicated policy
+        file.with_name(f"{file.name}.sig").write_text(signed(file.read_text()))
+        config.write_text(f"site_keys:\n  - {LINE}\n")
+        standby.options = ("--config", str(config), *standby.options)
+        made.start_witness()
+        made.start("a")
+        made.until_active("a")
+        made.start("b")
+        made.until_both_in_sync()
+        yield made
+
+
+def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
+    """Wait until these appliances report why `b` cannot take over; no words: that it can."""
+
+    def reported(name: str) -> bool:
+        done = site.appliances[name].rosrv("standby", "status", "--json", check=False)
+        if not done.stdout:  # control starts
+            return False
+        state = json.loads(done.stdout)
+        obstacle, troubles = state["obstacle"], state["troubles"]
+        if not words:
+            return obstacle == "" and troubles == [] and done.returncode == 0
+        text = f"the standby b (10.79.0.3) cannot take over: {obstacle}"
+        return words in obstacle and text in troubles[0] and done.returncode == 1
+
+    for name in names:
+        eventually(lambda name=name: reported(name), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
+
+
+def load(site: StandbySite, text: str, signature: str) -> None:
+    """Bring a policy into force on the active appliance."""
+    site.appliances[site.holder()].ask(admin.PolicyLoad(text, signature=signature))
+
+
+def test_other_site_keys(site: StandbySite) -> None:
+    """Both appliances give the reason, a switchover is refused with it, and a power cut of the active one waits for it.
+
+    The first signed policy makes the standby ready.
+    """
+    until_obstacle(site, NO_SIGNATURE, "a", "b")
+    for name in ("a", "b"):
+        done = site.appliances[name].rosrv("standby", "promote", check=False)
+        assert (done.returncode, NO_SIGNATURE in done.stderr) == (1, True), done
+    assert site.holder() == "a"
+    claims = site.lease.read().epoch
+    site.cut("a")
+    until_obstacle_without_active(site)
+    assert (site.holder(), site.lease.read().epoch) == ("a", claims)
+    site.restore("a")
+    site.until_active("a")
+    until_obstacle(site, NO_SIGNATURE, "a", "b")
+    load(site, OPEN_POLICY, signed(OPEN_POLICY))
+    until_obstacle(site, "", "a", "b")
+
+
+def until_obstacle_without_active(site: StandbySite) -> None:
+    """Wait until the standby has seen the lease expire for several seconds."""
+
+    def waits() -> bool:
+        state = site.appliances["b"].ask(admin.StandbyWanted())
+        return state.role == "standby" and (state.other.trouble_seconds or 0) > 5 and bool(state.obstacle)
+
+    eventually(waits, site.story)
+
+
+def test_a_policy_that_it_cannot_load(site: StandbySite) -> None:
+    """The standby notices it when it is replicated, and also its replacement."""
+    text = f"{OPEN_POLICY}[Options]\ntakeover = granted\n"
+    load(site, text, "")
+    until_obstacle(site, NO_SIGNATURE, "a", "b")
+    load(site, text, signed(text))
+    until_obstacle(site, "", "a", "b")
+
+
+def test_an_unreadable_folder(site: StandbySite) -> None:
+    """The active appliance has no specifications, so a takeover would read the folder of the standby.
+
+    The active appliance loses its power in the meantime: the standby takes over when its folder is readable again.
+    """
+    folder = site.appliances["b"].directory / "monitors"
+    folder.chmod(0)
+    until_obstacle(site, f"{folder}: the specifications cannot be read: Permission denied", "a", "b")
+    site.cut("a")
+    until_obstacle_without_active(site)
+    folder.chmod(0o755)
+    site.until_taken_over("b")
+    site.until_active("b")
+    site.restore("a")
+    site.until_both_in_sync()
+    site.appliances["b"].rosrv("standby", "promote")
+    site.until_taken_over("a")
+    site.until_active("a")
+    site.until_both_in_sync()
+    until_obstacle(site, "", "a", "b")
+
+
+def test_a_specification_that_it_cannot_load(site: StandbySite) -> None:
+    """The compiler of the standby compiles it, and its signature is missing; a signed one ends the alarm."""
+    one = site.appliances[site.holder()]
+    one.ask(admin.MonitorLoad({"seen.rv": RULE}))
+    until_obstacle(site, NO_SIGNATURE, "a", "b")
+    one.ask(admin.MonitorLoad({"seen.rv": RULE}, signatures={"seen.rv": signed(RULE)}))
+    until_obstacle(site, "", "a", "b")
+    site.cut("a")
+    site.until_taken_over("b")
+
+    def lists_it() -> bool:
+        done = site.appliances["b"].rosrv("monitor", "list", "--json", check=False)
+        return not done.returncode and json.loads(done.stdout)["name"] == "seen"
+
+    eventually(lists_it, site.story)
