@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 import msgspec
 import structlog
 
-from appliance.bundles.collector_connection import CollectorConnection, CollectorError
 from appliance.bundles.verified_bundles import (
     BundleFolderError,
     BundleRejectedError,
@@ -25,6 +24,7 @@ from appliance.bundles.verified_bundles import (
     VerifiedBundles,
 )
 from appliance.channel.messages import BundleOffered, BundlePollReported, BundleStated
+from appliance.collector.connection import CollectorConnection, CollectorError
 
 REPORT = "v1/bundles/report"
 """The path of the collector for reports."""
@@ -128,7 +128,8 @@ class Poller:
         if now < (self._retry_at if pressing else self.report_due):
             return
         try:
-            self.connection.put(REPORT, msgspec.json.encode(report))
+            body = msgspec.json.encode(report)
+            self.connection.put(REPORT, iter([body]), len(body), [("Content-Type", "application/json")])
         except CollectorError as error:
             self._retry_at = self.report_due = now + _jittered(_REPORT_AGAIN_SECONDS)
             if not self.progress.trouble:

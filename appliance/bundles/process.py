@@ -6,10 +6,8 @@ reads no state of the appliance. It runs as a separate user, and the firewall le
 
 import asyncio
 import contextvars
-import logging
 import random
 import socket
-import ssl
 import threading
 import time
 from collections.abc import Callable
@@ -18,12 +16,12 @@ from pathlib import Path
 import structlog
 
 from appliance.base.input_files import read_given
-from appliance.bundles.collector_connection import CollectorConnection, CollectorError, robot_context
 from appliance.bundles.poller import Poller
 from appliance.bundles.verified_bundles import VerifiedBundles
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
+from appliance.collector.connection import CollectorConnection, CollectorError, robot_connection
 from appliance.configuration.settings import Fleet, load_resolved
 
 EVENTS = "v1/bundles/events"
@@ -42,7 +40,6 @@ _LONGEST_ROOT = 1 << 18
 
 def main(lifeline_fd: int, config: Path) -> None:
     """Poll for bundles until the supervisor ends the process."""
-    logging.getLogger("httpx").setLevel(logging.WARNING)  # it would log every request
     asyncio.run(_Process(load_resolved(config).fleet, lifeline_fd).run())
 
 
@@ -111,15 +108,11 @@ class _Process:
         self._stated: messages.BundleStated | None = None
         self._told: messages.BundlePollReported | None = None
         self._event_loop: asyncio.AbstractEventLoop | None = None
-        context = context_of(fleet)
-        self._poller = make_poller(
-            fleet, Path.cwd(), connection_of(fleet, context), lambda: self._stated, self._offer
-        )
+        self._poller = make_poller(fleet, Path.cwd(), lambda: self._stated, self._offer)
         place = f"{fleet.bundles.site}/{fleet.bundles.group}"
-        self._loop = PollLoop(self._poller, connection_of(fleet, context), f"{EVENTS}/{place}")
+        self._loop = PollLoop(self._poller, robot_connection(*fleet.connection), f"{EVENTS}/{place}")
 
     async def run(self) -> None:
-        """Poll until the supervisor stops the process."""
         self._event_loop = asyncio.get_running_loop()
         self._loop.start()
         self._child.attach(messages.Ready())
@@ -179,27 +172,16 @@ def listen(
         failures += 1
 
 
-def context_of(fleet: Fleet) -> ssl.SSLContext:
-    """Return the TLS context of these settings. Raises `OSError`."""
-    assert fleet.ca and fleet.certificate and fleet.key  # noqa: S101  the settings require them
-    return robot_context(fleet.ca, fleet.certificate, fleet.key)
-
-
-def connection_of(fleet: Fleet, context: ssl.SSLContext) -> CollectorConnection:
-    """Return a connection to the configured collector."""
-    return CollectorConnection(fleet.collector or "", context, fleet.name)
-
-
 def make_poller(
     fleet: Fleet,
     folder: Path,
-    connection: CollectorConnection,
     stated: Callable[[], messages.BundleStated | None],
     offer: Callable[[messages.BundleOffered], object],
 ) -> Poller:
     """Return the poller for these settings; they must configure bundles. Raises `OSError`."""
     wanted = fleet.bundles
     assert wanted.root is not None  # noqa: S101  the role runs only with it
+    connection = robot_connection(*fleet.connection)
     bundles = VerifiedBundles(
         folder,
         read_given(wanted.root, _LONGEST_ROOT),

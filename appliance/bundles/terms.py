@@ -62,7 +62,7 @@ def role_of(site: str, group: str) -> str:
 
 
 class Ring(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """A ring: robots by name, or up to a percentage of all; they may take the bundle `after` seconds."""
+    """A ring: robots by name, or up to a percentage of all; `after` is in seconds after the signature."""
 
     name: str
     robots: list[str] = []

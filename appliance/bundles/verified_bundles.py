@@ -29,9 +29,9 @@ from tuf.api.metadata import TargetFile
 from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
 from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, unpack
-from appliance.bundles.collector_connection import CollectorConnection, CollectorError
 from appliance.bundles.terms import BundlePath, TermsError, terms_of
 from appliance.channel.messages import BundleContents
+from appliance.collector.connection import CollectorConnection, CollectorError
 
 METADATA, TARGETS, SELECTION = "v1/bundles/metadata", "v1/bundles/targets", "v1/bundles/selection"
 """The paths of the collector."""
@@ -84,15 +84,15 @@ class _Fetcher(FetcherInterface):
 
     def __init__(self, connection: CollectorConnection) -> None:
         self._connection = connection
-        self._timestamp = f"{METADATA}/timestamp.json"
 
     def _fetch(self, url: str) -> Iterator[bytes]:
         try:
-            if url == f"{self._connection.url}/{self._timestamp}":
-                yield self._connection.get_changed(self._timestamp, _LONGEST_TIMESTAMP)
+            path = url.removeprefix(f"{self._connection.url}/")
+            if path == f"{METADATA}/timestamp.json":
+                yield self._connection.get_changed(path, _LONGEST_TIMESTAMP)
             else:
                 # TUF cuts each file at the length in the metadata; one more byte shows that it is longer.
-                yield from self._connection.chunks(url, LONGEST + 1)
+                yield from self._connection.chunks(path, LONGEST + 1)
         except CollectorError as error:
             if error.status is not None:
                 raise DownloadHTTPError(str(error), error.status) from error

@@ -118,7 +118,6 @@ class _Deferred(TyperCommand):
         self._verb = verb
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Import the verb and delegate to it."""
         command = loaded(self._verb, str(self.name))
         try:
             return command.make_context(info_name, args, parent, **extra)

@@ -142,6 +142,10 @@ VERBS: dict[str, Verb | Group] = {
             "promote": Verb("standby.live_verbs:promote"),
         },
     ),
+    "fleet": Group(
+        "Push the audit log to a collector of many robots.",
+        {"join": Verb("fleet_verbs:join"), "leave": Verb("fleet_verbs:leave")},
+    ),
     "backup": Verb("backup:backup"),
     "restore": Verb("backup:restore"),
     "purge": Verb("backup:purge"),

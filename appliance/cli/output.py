@@ -5,6 +5,7 @@ Text from the network (names, log entries) is printed without control characters
 
 import datetime
 from collections.abc import Iterable, Mapping
+from mmap import mmap
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +44,7 @@ def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
     return typer.Exit(2)
 
 
-def write_told(path: Path, data: bytes) -> None:
+def write_told(path: Path, data: bytes | mmap) -> None:
     """Write to a path that the user chose; warn if the data may not survive a power cut. Raises `OSError`."""
     try:
         write_where_told(path, data)

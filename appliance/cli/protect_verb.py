@@ -150,7 +150,6 @@ class _CheckTarget:
     seconds: float
 
     def wanted(self) -> list[int]:
-        """Return the TCP ports that should be closed."""
         stay_open = {
             port
             for service in self.services

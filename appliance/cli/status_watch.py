@@ -45,7 +45,6 @@ class _Looks:
         self.exit_status = _INTERRUPTED
 
     def next(self) -> StatusView:
-        """Return the next view. Raises `AccessDeniedError`."""
         try:
             view = self._look()
         except AccessDeniedError as error:

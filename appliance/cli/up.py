@@ -130,7 +130,6 @@ def _membership_in(state: Path) -> Membership | None:
 
 
 def _announce_standby(membership: Membership, *, as_json: bool) -> None:
-    """Print that this appliance could take over."""
     event = {"event": "standby", "name": membership.name, "other": membership.other}
     text = (
         f"This appliance ({membership.name}) is ready to be active, or to take over from {membership.other}"

@@ -1,6 +1,6 @@
 """Read `Settings` from file, environment and flags; later sources override earlier ones.
 
-    1. defaults
+    1. defaults; for the section `fleet` those of `rosrv fleet join`, unless a source names a collector
     2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory, if any)
     3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
     4. flags
@@ -26,12 +26,14 @@ from pydantic import TypeAdapter, ValidationError
 from appliance.base.input_files import read_given_text
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import must_be, not_yaml
+from appliance.configuration.fleet_membership import FOLDER, SETTINGS, joined_settings
 from appliance.configuration.settings import Settings
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 DEFAULT_FILE = Path("appliance.yaml")
+_DEFAULT_STATE = Settings.state
 _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
 # Variables that Kubernetes and container links set for a service named `rosrv`.
@@ -171,7 +173,27 @@ class _Gathered:
             if value is not None:
                 self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
 
+    def add_joined(self) -> None:
+        """Add the section `fleet` that `rosrv fleet join` left in the state directory; each given key overrides it."""
+        state, fleet = self._values.get("state", _DEFAULT_STATE), self._values.get("fleet", {})
+        if not isinstance(state, str | Path) or not isinstance(fleet, dict) or fleet.get("collector"):
+            return
+        file = Path(state) / FOLDER / SETTINGS
+        try:
+            joined = joined_settings(Path(state))
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            self._mistakes.append(Mistake(str(file), f"cannot be used: {reason}"))
+            return
+        if joined:
+            section, bundles = joined | fleet, fleet.get("bundles", {})
+            if "bundles" in joined and isinstance(bundles, dict):
+                section["bundles"] = joined["bundles"] | bundles
+            self._values["fleet"] = section
+            self._places.setdefault(("fleet",), str(file))
+
     def settings(self) -> Settings:
+        self.add_joined()
         try:
             settings = read(self._values)
         except ValidationError as error:
@@ -264,7 +286,6 @@ def _unknown_key(path: KeyPath) -> str:
 
 
 def _with_absolute_paths(section: _Section) -> _Section:
-    """Return the section with all paths absolute, also in its subsections."""
     changes: dict[str, Any] = {}
     for key in (field.name for field in dataclasses.fields(section)):
         value = getattr(section, key)
@@ -280,7 +301,6 @@ def _with_absolute_paths(section: _Section) -> _Section:
 
 
 def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
-    """Prefix the string at a key with `folder`, if the key has one."""
     *sections, key = path
     for section in sections:
         below = values.get(section)

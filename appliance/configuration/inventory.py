@@ -73,7 +73,6 @@ def _python() -> Iterator[Part]:
 
 
 def _debian() -> Iterator[Part]:
-    """Yield the Debian packages that the program uses; yield nothing on a system without dpkg."""
     try:
         status = (DPKG / "status").read_text(errors="replace")
     except FileNotFoundError:

@@ -460,7 +460,10 @@ class Bundles:
 
 @_section
 class Fleet:
-    """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default."""
+    """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default.
+
+    `rosrv fleet join` gives `collector`, `robot` and the files; keys here override them.
+    """
 
     collector: Annotated[str, AfterValidator(_checked_collector)] | None = key(
         default=None, description="https://ADDRESS:PORT: an address, so that no name server is needed"
@@ -496,7 +499,10 @@ class Fleet:
         if self.collector is None:
             files = (self.ca, self.certificate, self.key, self.receipt_key)
             if any((self.name, *files, self.robot, self.retention_waits, self.bundles != Bundles())):
-                raise ValueError("the section has no effect without collector")
+                raise ValueError(
+                    "the section has no effect without a collector: remove it, name a `collector`,"
+                    " or run 'rosrv fleet join'"
+                )
             return
         needed: dict[str, Path | str | None] = {
             "ca": self.ca,
@@ -519,6 +525,12 @@ class Fleet:
     def destination(self) -> tuple[str, int]:
         """`collector` as address and port; only where it is given."""
         return split_collector(self.collector or "")
+
+    @property
+    def connection(self) -> tuple[str, Path, Path, Path, str | None]:
+        """The collector's URL, its authority, this robot's certificate and key, and the collector's name."""
+        assert self.collector and self.ca and self.certificate and self.key  # noqa: S101  checked above
+        return self.collector, self.ca, self.certificate, self.key, self.name
 
 
 @_section

@@ -225,10 +225,7 @@ class Verifier:
     ) -> None:
         self.names, self.open, self.foreign = opened(place)
         self.key, self.copies = folder / "key", copies
-        with regular(key) if key else self.open("audit.pub") as file:
-            self.key.write_bytes(file.read(MOST))
-        order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
-        self.raw_key = subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
+        self.raw_key = self.read_key(key)
         self.findings: list[str] = []
         self.notes: list[str] = []
         self.manifest: dict[str, Any] = {}
@@ -236,6 +233,13 @@ class Verifier:
         self.loads: dict[str, Any] = {}  # the hash in the log of each loaded file or folder
         self.revisions: set[int | None] = set()  # revisions of the policies that decided
         self.checkpoints = self.agreeing = 0
+
+    def read_key(self, key: Path | None) -> str:
+        """Store the key, by default the bundle's own, for `openssl`. Return the raw key."""
+        with regular(key) if key else self.open("audit.pub") as file:
+            self.key.write_bytes(file.read(MOST))
+        order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
+        return subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
 
     def run(self) -> None:
         """Check everything; a member that cannot be read is also a finding."""
@@ -407,13 +411,18 @@ class Verifier:
         """Whether the key signed a checkpoint."""
         fields = [f"{field} {checkpoint[field]}\n" for field in SEALED if checkpoint.get(field) is not None]
         version = 1 if checkpoint.get("removed") is None else 2
+        text = f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode()
+        right = self.has_signed(text, unhexed(checkpoint["signature"]))
+        return right and checkpoint["key"] == self.raw_key
+
+    def has_signed(self, data: bytes, signed: bytes) -> bool:
+        """Whether the key made this signature."""
         text, signature = (self.key.with_name(name) for name in ("text", "signature"))
-        text.write_bytes(f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode())
-        signature.write_bytes(unhexed(checkpoint["signature"]))
+        text.write_bytes(data)
+        signature.write_bytes(signed)
         order = ["openssl", "pkeyutl", "-verify", "-rawin", "-pubin", "-inkey"]
         files = [str(self.key), "-in", str(text), "-sigfile", str(signature)]
-        right = subprocess.run([*order, *files], capture_output=True).returncode == 0
-        return right and checkpoint["key"] == self.raw_key
+        return subprocess.run([*order, *files], capture_output=True).returncode == 0
 
 
 def kept_copies(path: Path) -> dict[int, dict[str, Any]]:

@@ -17,7 +17,7 @@ from appliance.evidence.bundle import stored_line
 from appliance.evidence.bundle_verifier import Verifier
 
 _LONGEST_LINE = 16 << 20
-_NOT_A_RECORD = (msgspec.MsgspecError, ValueError, KeyError, TypeError, RecursionError)
+_NOT_A_RECORD = (ValueError, KeyError, TypeError, RecursionError)
 
 
 class ExportUnreadableError(Exception):

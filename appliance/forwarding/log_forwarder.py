@@ -57,7 +57,7 @@ def load_position(path: Path) -> ForwardingPosition | None:
         return msgspec.json.decode(path.read_bytes(), type=ForwardingPosition)
     except FileNotFoundError:
         return None
-    except msgspec.DecodeError as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}; remove it to have the whole log forwarded again") from error
 
 
@@ -113,7 +113,6 @@ class LogForwarder:
         return self._position
 
     def _forward(self, position: ForwardingPosition) -> bool:
-        """Forward a batch; return whether more records are waiting."""
         _first, head, log_id = _extent(self.log)
         if log_id != position.log or head < position.sequence:
             self._position = None
@@ -152,7 +151,6 @@ class LogForwarder:
         )
 
     def _look(self, behind: int, entries: list[LogEntry]) -> None:
-        """Report the number and age of waiting records while they are being sent."""
         seconds = self._waited(entries)
         self.progress = msgspec.structs.replace(self.progress, behind=behind, seconds=seconds)
 
@@ -177,7 +175,6 @@ class LogForwarder:
 
 
 def _extent(path: Path) -> tuple[int, int, str]:
-    """Return the log's first and last sequence and its id. Raises `LogUnreadableError`."""
     with reading(path, advice="") as connection:
         query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
         first, last = connection.execute(query).fetchone()

@@ -4,8 +4,8 @@ import asyncio
 from pathlib import Path
 
 from appliance.audit.signatures import read_public_key
+from appliance.collector.connection import robot_connection
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.forwarding.collector_connection import https_collector
 from appliance.forwarding.process import ForwardingProcess
 from appliance.forwarding.segment_pusher import SegmentPusher
 
@@ -19,11 +19,10 @@ def main(lifeline_fd: int, config: Path) -> None:
 def make_pusher(settings: Settings, folder: Path) -> SegmentPusher:
     """Return the pusher for these settings, which must configure a collector. Raises `KeyUnreadableError`."""
     fleet = settings.fleet
-    if fleet.ca is None or fleet.certificate is None or fleet.key is None or fleet.receipt_key is None:
-        raise ValueError("fleet: ca, certificate, key and receipt_key must be given")
+    assert fleet.receipt_key is not None  # noqa: S101  the role runs only with it
     return SegmentPusher(
         settings.state / "control" / "audit.db",
         folder,
-        https_collector(fleet.destination, fleet.ca, fleet.certificate, fleet.key, fleet.name),
+        robot_connection(*fleet.connection),
         read_public_key(fleet.receipt_key),
     )

@@ -5,7 +5,8 @@ Invariants:
 1. The database is only read, so pushing never delays the log or loses its records.
 2. Memory is bounded: one record. The segment at work is a compressed file in this process's folder.
 3. A segment counts only with a receipt that the collector's key signed, and that is on this disk.
-4. After each failure the collector reports what it has; repeating a segment is harmless.
+4. On each new connection the collector reports what it has: it may have been restored from a backup. Repeating a
+   segment is harmless.
 5. Records that retention removed before they had a receipt are counted and reported (`missed`).
 6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
 """
@@ -16,7 +17,9 @@ import random
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import structlog
@@ -26,7 +29,7 @@ from appliance.audit.log_database import LogUnreadableError, reading
 from appliance.audit.segments import SegmentSummary, next_segment, write_segment
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
-from appliance.forwarding.collector_connection import CollectorLink, CollectorRefusedError
+from appliance.collector.connection import CollectorConnection, CollectorError
 from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 
@@ -36,6 +39,7 @@ _LONGEST_PAUSE = 60.0
 _LONGEST_ASKED = 3600.0
 _RECEIPTS_BYTES = 16 << 20
 _LARGEST_SEGMENT = 1 << 30
+_PART = 65_536
 _log = structlog.get_logger()
 
 
@@ -47,13 +51,22 @@ class PushPosition(msgspec.Struct, frozen=True):
     sequence: int = 0
 
 
+class StoredHead(msgspec.Struct, frozen=True):
+    """The collector's newest checkpoint of a log: its number (0: none), and the hashes of those with this number."""
+
+    robot: str
+    log: str
+    number: Annotated[int, msgspec.Meta(ge=0, lt=10**18)]
+    hashes: list[str]
+
+
 @dataclass(slots=True)
 class SegmentPusher:
     """A pusher of the database `log`; it keeps its files in `folder`, and trusts receipts of `receipt_key` (raw)."""
 
     log: Path
     folder: Path
-    collector: CollectorLink
+    collector: CollectorConnection
     receipt_key: bytes
     jitter: Callable[[], float] = random.random
     clock: Callable[[], int] = time.time_ns
@@ -66,7 +79,7 @@ class SegmentPusher:
         try:
             position = self._position or self._begin()
             more = self._push_next(position)
-        except (LogUnreadableError, OSError, ValueError) as error:
+        except (CollectorError, LogUnreadableError, OSError, ValueError) as error:
             return self._failed(error)
         if self._failures:
             _log.warning("segments are pushed to the collector again")
@@ -83,13 +96,18 @@ class SegmentPusher:
         lowest = next_segment(self.log, 0) or 1
         position, step = PushPosition(log), 1
         while upto > 0:
-            head = self.collector.head(log, upto)
+            head = msgspec.json.decode(self.collector.get(f"v1/logs/{log}?upto={upto}"), type=StoredHead)
+            if head.number > upto:
+                raise ValueError(f"the collector answers with checkpoint {head.number}, asked up to {upto}")
             if head.number < lowest:  # the log has no such checkpoint (any more)
                 position = PushPosition(log, head.number, self._kept_sequence(log, head.number))
                 break
             sequence = _sequence_of(self.log, head.number, head.hashes)
-            if sequence is not None:
+            if sequence is not None and sequence == self._kept_sequence(log, head.number):
                 position = PushPosition(log, head.number, sequence)
+                break
+            if sequence is not None:  # its receipt is not on this disk: the answer to the same segment has it
+                position = PushPosition(log, head.number - 1)
                 break
             upto, step = head.number - step, 2 * step
         self._position = position
@@ -100,19 +118,21 @@ class SegmentPusher:
         """Return the last sequence of segment `number` if it had the last receipt; 0: not known."""
         try:
             kept = msgspec.json.decode((self.folder / "position.json").read_bytes(), type=PushPosition)
-        except (FileNotFoundError, msgspec.DecodeError):
+        except (FileNotFoundError, ValueError):
             return 0
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
     def _push_next(self, position: PushPosition) -> bool:
-        """Push the segment after `position`; return whether there was one."""
         log, _newest = _newest_signed(self.log)
         if log != position.log:
             self._position = None
+            self.progress = msgspec.structs.replace(self.progress, sequence=0, checkpoint=0)
             raise LogUnreadableError(f"{self.log}: another log than before; the collector is asked for it")
         number = next_segment(self.log, position.number)
+        if number is not None and not self.collector.is_open:
+            position = self._begin()
+            number = next_segment(self.log, position.number)
         if number is None:
-            self.collector.close()  # the next segment comes in a minute: the collector would close it
             self._look(position)
             return False
         file = self.folder / "segment.gz"
@@ -120,12 +140,14 @@ class SegmentPusher:
         if summary is None:
             self._look(position)
             return False
+        path = f"v1/logs/{log}/segments/{number}/{summary.name}"
         try:
             with file.open("rb") as body:
-                size = file.stat().st_size
-                receipt = self.collector.push(log, number, summary.name, body, size)
+                parts = iter(partial(body.read, _PART), b"")
+                answer = self.collector.put(path, parts, file.stat().st_size, [("Content-Encoding", "gzip")])
         finally:
             file.unlink()
+        receipt = msgspec.json.decode(answer, type=SegmentReceipt)
         self._check(receipt, log, number, summary)
         self._keep(receipt)
         self._advance(position, summary)
@@ -167,7 +189,10 @@ class SegmentPusher:
     def _keep(self, receipt: SegmentReceipt) -> None:
         """Append the receipt; the last 16 to 32 MiB are kept."""
         file = self.folder / "receipts.ndjson"
-        with file.open("ab") as kept:
+        with file.open("a+b") as kept:
+            if kept.tell():  # a kill or a full disk may have left a part of a line
+                kept.seek(-1, os.SEEK_END)
+                kept.write(b"" if kept.read(1) == b"\n" else b"\n")
             kept.write(msgspec.json.encode(receipt) + b"\n")
             kept.flush()
             os.fsync(kept.fileno())
@@ -187,7 +212,6 @@ class SegmentPusher:
         self._look(self._position)
 
     def _look(self, position: PushPosition) -> None:
-        """Report how many sealed records wait, and since when the oldest."""
         sealed, oldest = _waiting(self.log, position.sequence)
         self.progress = msgspec.structs.replace(
             self.progress,
@@ -206,7 +230,7 @@ class SegmentPusher:
         if not self._failures:
             _log.error("segments are not pushed to the collector; it is tried again and again", reason=reason)
         pause = min(_LONGEST_PAUSE, _FIRST_PAUSE * 2.0 ** min(self._failures, 10))
-        if isinstance(error, CollectorRefusedError):
+        if isinstance(error, CollectorError):
             pause = max(pause, min(error.wait, _LONGEST_ASKED))
         self._failures += 1
         self.progress = msgspec.structs.replace(self.progress, trouble=reason)
@@ -214,7 +238,6 @@ class SegmentPusher:
 
 
 def _newest_signed(log: Path) -> tuple[str, int]:
-    """Return the log's id, and the number of its newest signed checkpoint. Raises `LogUnreadableError`."""
     with reading(log, advice="") as connection:
         (log_id,) = connection.execute("SELECT id FROM log").fetchone()
         query = "SELECT coalesce(max(number), 0) FROM checkpoint WHERE signature IS NOT NULL"

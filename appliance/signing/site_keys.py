@@ -118,7 +118,6 @@ def _public(line: str) -> bytes:
 
 
 def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
-    """Return the public key, namespace, hash name and raw signature in a signature file. Raises `ValueError`."""
     found = _ARMOUR.fullmatch(signature.replace("\r\n", "\n"))
     try:
         blob = base64.b64decode(found[1].replace("\n", ""), validate=True) if found else b""
@@ -138,7 +137,6 @@ def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
 
 
 def _message(text: str, hashed: bytes) -> bytes:
-    """Return the text that is signed."""
     digest = hashlib.new(hashed.decode(), text.encode("utf-8", "surrogateescape")).digest()
     return _MAGIC + _wire(_NAMESPACE, b"", hashed, digest)
 

@@ -287,7 +287,6 @@ def _print_lines(entries: list[LogEntry], as_json_lines: bool) -> None:
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[TextIO]:
-    """Open a new file; remove it again if writing fails."""
     file = path.open("x", encoding="ascii")
     try:
         with file:

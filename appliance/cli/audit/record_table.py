@@ -188,7 +188,6 @@ def _below(rows: list[tuple[Text, ...]]) -> Table:
 
 
 def _cells(row: EqualRecords) -> tuple[Text, ...]:
-    """Return decision, event, who, what and why."""
     record = row.first.record
     alarming = record.severity is Severity.ALARM
     return (
@@ -201,7 +200,6 @@ def _cells(row: EqualRecords) -> tuple[Text, ...]:
 
 
 def _times(row: EqualRecords) -> str:
-    """Return the time of a record, or the first and the last time of several."""
     first, last = (rfc3339(entry.record.time).replace("T", " ") for entry in (row.first, row.last))
     if row.records == 1:
         return first[:_MILLISECONDS]

@@ -73,7 +73,7 @@ class AdminSocket:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
         try:
             return decode(answer, request)
-        except msgspec.MsgspecError as error:
+        except ValueError as error:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
 
     def _read(self, sock: socket.socket) -> bytes:
@@ -99,7 +99,6 @@ def encoded(request: AdminRequest[Any]) -> bytes:
 
 
 def _read_line(sock: socket.socket, line: bytearray) -> None:
-    """Append to `line` until it is complete."""
     while not line.endswith(b"\n"):
         piece = sock.recv(65536)
         if not piece:

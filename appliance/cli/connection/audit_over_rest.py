@@ -153,7 +153,7 @@ class RestLog:
             if problem.status == 422:
                 raise FilterError("; ".join(problem.lines)) from None
             raise NotRunningError(f"{self._client.url}: {problem}") from None
-        except (msgspec.ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, FilterError):
                 raise
             raise NotRunningError(

@@ -180,7 +180,6 @@ class RestClient:
 
 
 def _unknown(method: str) -> str:
-    """Return the hint for an order without an answer."""
     return "" if method == "GET" else f"; {UNKNOWN}"
 
 

@@ -82,15 +82,12 @@ def enable(
         bool,
         typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
     ] = False,
-    trial: Annotated[bool, typer.Option("--trial", hidden=True, help="The former name of --shadow.")] = False,
 ) -> None:
     """Enable monitors. With --shadow they only record what they would have done.
 
     Example: rosrv monitor enable safeTrigger --shadow
     """
-    if trial:
-        typer.echo("rosrv: --trial is deprecated: use --shadow", err=True)
-    if shadow or trial:
+    if shadow:
         _switch(appliance, admin.MonitorShadow(names, True), _SHADOW)
     else:
         _switch(appliance, admin.MonitorSwitch(names, True), "enabled")
@@ -233,14 +230,7 @@ def rv_state(appliance: Appliance) -> None:
 def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str) -> None:
     body = appliance.ask_or_exit(order)
     if appliance.as_json:
-        say_json(
-            {
-                **in_full(body),
-                "enabled": word == "enabled",
-                "trial": word == _SHADOW,
-                "shadow": word == _SHADOW,
-            }
-        )
+        say_json({**in_full(body), "enabled": word == "enabled", "shadow": word == _SHADOW})
         return
     end = "" if body.until is None else f", until {moment(body.until)}"
     say(f"{word}: {', '.join(body.names) or 'no change'}{end}")

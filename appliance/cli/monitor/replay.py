@@ -19,7 +19,7 @@ from rosmop.tool.monitor_output import BILLION
 from rosmop.tool.options import BagSets, Folders, On, ReportFile, Resume, ShowProgress, Workers
 from rosmop.tool.replay_report import ReplayReport
 from rosmop.tool.run_command import run_batch, run_spans
-from rosmop.tool.specification_input import read_definition_files, read_specifications, topics_of
+from rosmop.tool.specification_input import read_for_recordings, topics_of
 from rosmop.tool.terminal import refused, say
 
 
@@ -108,7 +108,6 @@ def replay_monitor(
 
 
 def _cover(pieces: Sequence[Piece], span: Span, *, as_json: bool) -> None:
-    """Print the gaps between the pieces, and which pieces are incomplete."""
     # Without --since, the time before the first piece is not a gap.
     began = span.since or pieces[0].span.since
     for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
@@ -127,8 +126,7 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
     """Return the specifications of a file, or those of the appliance with a chosen monitor."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
-        texts = read_specifications(MONITOR, [path])
-        return Specifications(texts, read_definition_files(MONITOR, [path], folders))
+        return read_for_recordings(MONITOR, [path], folders)
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     names = [row.name for row in loaded.monitors]
     if what not in names:

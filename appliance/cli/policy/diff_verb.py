@@ -120,7 +120,6 @@ def _revision(appliance: Appliance, number: int, note: str = "") -> _Source:
 
 
 def _say_texts(appliance: Appliance, old: _Source, new: _Source) -> bool:
-    """Print the difference of the texts; return whether there is one."""
     was, now = old.text.splitlines(), new.text.splitlines()
     lines = list(difflib.unified_diff(was, now, old.name, new.name, lineterm=""))
     if appliance.as_json:
@@ -151,7 +150,6 @@ def _compiled(source: _Source, known: PolicyContext) -> Policy:
 
 
 def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Path | None) -> bool:
-    """Print the requests that are decided differently; return whether there are any."""
     differences = diff(old, new, _requests(requests, appliance))
     for difference in differences:
         if appliance.as_json:

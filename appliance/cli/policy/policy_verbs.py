@@ -75,7 +75,6 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
 
 
 def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
-    """Print an error or a warning."""
     if as_json:
         say_json(asdict(finding))
     else:
@@ -103,7 +102,6 @@ def _impact(
 
 
 def _allowing(policy: Policy, request: Request) -> Iterator[str]:
-    """Yield the smallest change of the policy that would allow the request."""
     known = PolicyContext(policy.enrolled, policy.robot, blocks=policy.blocks)
     try:
         found = grant_of(policy.text, policy.file, known, DecidedRequest(request, rights_of(request)))

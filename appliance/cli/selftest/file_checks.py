@@ -140,7 +140,6 @@ def _state(state: Path) -> Iterator[SelftestFinding]:
 
 
 def _secrets(state: Path) -> Iterator[SelftestFinding]:
-    """Find keys and tokens that other users could read."""
     open_to_others = []
     for path in (
         *state.glob("signer/*.key"),

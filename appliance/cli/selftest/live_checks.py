@@ -157,7 +157,6 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
 
 
 def _message(master: str) -> Iterator[SelftestFinding]:
-    """Send a message through the relay, from a publisher to a subscriber in this process."""
     began = time.monotonic()
     try:
         message = message_through_the_relay(master)

@@ -141,7 +141,6 @@ class _Node:
                 connection.recv(1)  # wait until the appliance has the message and disconnects
 
     def close(self) -> None:
-        """Close the API port and the TCPROS port."""
         self._api.shutdown()
         self._api.server_close()
         self._messages.close()

@@ -14,9 +14,7 @@ from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile, Snapshot, TargetFile, Targets, Timestamp
 
-from appliance.bundles import collector_connection
 from appliance.bundles.bundle_archive import pack
-from appliance.bundles.collector_connection import CollectorError
 from appliance.bundles.terms import BundlePath, Ring, custom_of
 from appliance.bundles.verified_bundles import (
     BundleRejectedError,
@@ -24,6 +22,8 @@ from appliance.bundles.verified_bundles import (
     VerifiedBundle,
     VerifiedBundles,
 )
+from appliance.collector import connection
+from appliance.collector.connection import CollectorError
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files, everywhere, give
 
 METADATA = "/v1/bundles/metadata"
@@ -195,7 +195,7 @@ def test_endless_data_is_cut(field: Field) -> None:
 
 def test_slow_retrieval_is_cut(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     """A collector that sends a byte now and then is given up at the deadline of the exchange."""
-    monkeypatch.setattr(collector_connection, "_EXCHANGE_SECONDS", 0.3)
+    monkeypatch.setattr(connection, "_EXCHANGE_SECONDS", 0.3)
 
     def slow(handler: http.server.BaseHTTPRequestHandler) -> None:
         handler.send_response(200)

@@ -153,7 +153,7 @@ def test_a_collector() -> None:
             {name: value for name, value in _FLEET.items() if name != "receipt_key"},
             "collector needs receipt_key, to push segments, or bundles.root",
         ),
-        ({"ca": "x.pem"}, "no effect without collector"),
+        ({"ca": "x.pem"}, "no effect without a collector: remove it"),
         (_FLEET | {"bundles": {"root": "r", "site": "s", "group": "g"}}, "robot must be given"),
         (_FLEET | {"bundles": {"root": "r", "site": "s"}}, "root needs site and group"),
         (_FLEET | {"retention_waits": True}, "no effect without audit.retention_days"),

@@ -1,0 +1,1 @@
+"""The connection to a fleet's collector, for the processes that push segments and poll for bundles."""

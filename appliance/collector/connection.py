@@ -1,0 +1,289 @@
+"""Connect to the collector over HTTPS with the robot's certificate. The collector and the network are not trusted.
+
+Invariants:
+1. Only the configured collector is asked. httpcore follows no redirect, uses no proxy and expands nothing.
+2. An exchange has one deadline: connecting, the handshake, the request, the head and the body of the answer together. A
+   collector that sends or accepts a byte now and then does not extend it.
+3. An answer beyond its size limit is discarded. Compressed answers are not requested, and rejected.
+4. After a failure the connection is closed. Each connection reads the certificate files, so replaced ones apply.
+"""
+
+import ssl
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpcore
+
+_EXCHANGE_SECONDS = 60.0  # a collector answers late when a thousand robots ask at once
+_SILENT_SECONDS = 90.0  # the collector sends a comment on the event stream every 30 s
+_SLOWEST_UPLOAD = 16_384  # bytes per second
+_PART = 16_384  # of a write: the deadline is checked between the parts
+_LARGEST_ANSWER = 65_536
+_LONGEST_TAG = 200
+_LONGEST_REASON = 500
+_NOT_MODIFIED = 304
+_EXPECTED = (200, 201, 204)
+_FAILURES = (httpcore.TimeoutException, httpcore.NetworkError, httpcore.ProtocolError, OSError)
+
+
+class CollectorError(Exception):
+    """The collector is unreachable or gave no usable answer.
+
+    `status` is its HTTP status, or None. `wait` is the number of seconds that it asks for; 0: none.
+    """
+
+    def __init__(self, reason: str, status: int | None = None, wait: float = 0.0) -> None:
+        super().__init__(reason)
+        self.status = status
+        self.wait = wait
+
+
+class ConditionalAnswer(NamedTuple):
+    """An answer that is asked for again with its entity tag."""
+
+    tag: bytes
+    body: bytes
+
+
+class CollectorConnection:
+    """A connection to one collector, made when it is needed. Not thread-safe."""
+
+    def __init__(self, url: str, context: Callable[[], ssl.SSLContext], name: str | None = None) -> None:
+        """`url` is `https://ADDRESS:PORT`. `context` makes the TLS context of each connection; it may raise `OSError`.
+
+        `name` is the name in the collector's certificate (None: the address).
+        """
+        self.url = url
+        self._context = context
+        self._known: dict[str, ConditionalAnswer] = {}
+        self._extensions = {} if name is None else {"sni_hostname": name}
+        self._headers = [("Host", url.partition("//")[2]), ("Accept-Encoding", "identity")]
+        self._deadline = _Deadline()
+        self._connection: httpcore.HTTPConnection | None = None
+
+    def get(self, path: str, longest: int = _LARGEST_ANSWER) -> bytes:
+        """Return the body at a path. Raises `CollectorError`."""
+        return b"".join(self.chunks(path, longest))
+
+    def get_changed(self, path: str, longest: int) -> bytes:
+        """Return the body at a path; ask with its entity tag if it is known. Raises `CollectorError`."""
+        known = self._known.get(path)
+        headers = [] if known is None else [("If-None-Match", known.tag)]
+        with self._exchange("GET", path, headers) as answer:
+            if known is not None and answer.status == _NOT_MODIFIED:
+                return known.body
+            body = b"".join(_bounded(path, answer, longest))
+            tag = _header(answer, b"etag")
+            if tag and len(tag) < _LONGEST_TAG:
+                self._known[path] = ConditionalAnswer(tag, body)
+            return body
+
+    def chunks(self, path: str, longest: int) -> Iterator[bytes]:
+        """Yield the body at a path in parts. Raises `CollectorError`."""
+        with self._exchange("GET", path) as answer:
+            yield from _bounded(path, answer, longest)
+
+    def put(
+        self, path: str, content: Iterator[bytes], size: int, headers: Iterable[tuple[str, str]] = ()
+    ) -> bytes:
+        """Send `size` bytes in parts; return the answer. Raises `CollectorError`, and what `content` raises."""
+        sent = [("Content-Length", str(size)), *headers]
+        with self._exchange("PUT", path, sent, content, size) as answer:
+            return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
+
+    def post(self, path: str, body: bytes) -> bytes:
+        """Send a body; return the answer. Raises `CollectorError`."""
+        sent = [("Content-Length", str(len(body)))]
+        with self._exchange("POST", path, sent, iter((body,)), len(body)) as answer:
+            return b"".join(_bounded(path, answer, _LARGEST_ANSWER))
+
+    def events(self, path: str) -> Iterator[bytes]:
+        """Yield parts of an event stream until it ends. Raises `CollectorError`, also if it is silent."""
+        with self._exchange("GET", path, [("Accept", "text/event-stream")]) as answer:
+            self._deadline.begin(_SILENT_SECONDS)
+            for part in _checked(path, answer).iter_stream():
+                yield part
+                self._deadline.begin(_SILENT_SECONDS)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the next exchange continues on the connection of the last one."""
+        connection = self._connection
+        return connection is not None and connection.is_available() and not connection.has_expired()
+
+    def close(self) -> None:
+        """Close the connection, if there is one."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    @contextmanager
+    def _exchange(
+        self,
+        method: str,
+        path: str,
+        headers: Iterable[tuple[str, str | bytes]] = (),
+        content: Iterator[bytes] | None = None,
+        size: int = 0,
+    ) -> Iterator[httpcore.Response]:
+        """Send a request and yield the answer, of which only the head is read. Raises `CollectorError`."""
+        self._deadline.begin(_EXCHANGE_SECONDS + size / _SLOWEST_UPLOAD)
+        sent: Any = [*self._headers, *headers]  # httpcore takes text and bytes, but its types say one of them
+        url = f"{self.url}/{path}"
+        try:
+            with self._connected().stream(
+                method, url, headers=sent, content=content, extensions=self._extensions
+            ) as answer:
+                yield answer
+        except _FAILURES as error:
+            reason = str(error) or "the connection ended"
+            if isinstance(error, httpcore.TimeoutException):
+                reason = f"the collector takes more than {self._deadline.seconds:g} s"
+            raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
+
+    def _connected(self) -> httpcore.HTTPConnection:
+        """Return the idle connection, or a new one. Raises `OSError` for unusable certificate files."""
+        if self._connection is None or not self.is_open:
+            self.close()
+            self._connection = httpcore.HTTPConnection(
+                httpcore.URL(self.url).origin, self._context(), network_backend=_Network(self._deadline)
+            )
+        return self._connection
+
+
+class _Deadline:
+    """The deadline of the exchange at work; all waits on the connection share it."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._end = 0.0
+
+    def begin(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._end = time.monotonic() + seconds
+
+    def left(self) -> float:
+        left = self._end - time.monotonic()
+        if left <= 0:
+            raise httpcore.TimeoutException
+        return left
+
+
+class _Network(httpcore.NetworkBackend):
+    """The network of httpcore; every wait ends at the deadline."""
+
+    def __init__(self, deadline: _Deadline) -> None:
+        self._deadline = deadline
+
+    def connect_tcp(
+        self,
+        host: str,
+        port: int,
+        timeout: float | None = None,  # noqa: ARG002  the deadline counts
+        local_address: str | None = None,
+        socket_options: Iterable[httpcore.SOCKET_OPTION] | None = None,
+    ) -> httpcore.NetworkStream:
+        stream = httpcore.SyncBackend().connect_tcp(
+            host, port, self._deadline.left(), local_address, socket_options
+        )
+        return _Stream(stream, self._deadline)
+
+
+class _Stream(httpcore.NetworkStream):
+    """A connection of httpcore; every wait ends at the deadline."""
+
+    def __init__(self, stream: httpcore.NetworkStream, deadline: _Deadline) -> None:
+        self._stream = stream
+        self._deadline = deadline
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:  # noqa: ARG002  the deadline counts
+        return self._stream.read(max_bytes, self._deadline.left())
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:  # noqa: ARG002  the deadline counts
+        for start in range(0, len(buffer), _PART):
+            self._stream.write(buffer[start : start + _PART], self._deadline.left())
+
+    def close(self) -> None:
+        self._stream.close()
+
+    def start_tls(
+        self,
+        ssl_context: ssl.SSLContext,
+        server_hostname: str | None = None,
+        timeout: float | None = None,  # noqa: ARG002  the deadline counts
+    ) -> httpcore.NetworkStream:
+        try:
+            left = self._deadline.left()
+        except httpcore.TimeoutException:
+            self.close()  # as httpcore's own streams do when the handshake fails
+            raise
+        return _Stream(self._stream.start_tls(ssl_context, server_hostname, left), self._deadline)
+
+    def get_extra_info(self, info: str) -> Any:
+        return self._stream.get_extra_info(info)
+
+
+def _bounded(path: str, answer: httpcore.Response, longest: int) -> Iterator[bytes]:
+    """Yield the body of an expected answer. Raises `CollectorError`."""
+    size = 0
+    for part in _checked(path, answer).iter_stream():
+        size += len(part)
+        if size > longest:
+            raise CollectorError(f"{path}: the answer has more than {longest} bytes")
+        yield part
+
+
+def _checked(path: str, answer: httpcore.Response) -> httpcore.Response:
+    """Return an expected answer. Raises `CollectorError` with the collector's reason for any other."""
+    if _header(answer, b"content-encoding") not in (b"", b"identity"):
+        raise CollectorError(f"{path}: the collector compresses its answer")
+    if answer.status in _EXPECTED:
+        return answer
+    reason = b""
+    for part in answer.iter_stream():
+        reason += part
+        if len(reason) > _LONGEST_REASON:
+            break
+    text = ascii(reason[:_LONGEST_REASON].decode("utf-8", "replace"))[1:-1]  # terminals print it
+    wait = _header(answer, b"retry-after")
+    raise CollectorError(
+        f"the collector answers {answer.status}: {text}",
+        answer.status,
+        float(wait) if wait.isdigit() else 0.0,
+    )
+
+
+def _header(answer: httpcore.Response, name: bytes) -> bytes:
+    """Return a header by its name in lower case; empty without it."""
+    return next((value for key, value in answer.headers if key.lower() == name), b"")
+
+
+def trusting_context(ca: Path) -> ssl.SSLContext:
+    """Return a TLS context that trusts only `ca`. Raises `OSError`."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    try:
+        context.load_verify_locations(ca)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(ca)) from error
+    return context
+
+
+def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
+    """Return the TLS context of a robot: it trusts only `ca`, and presents `certificate`. Raises `OSError`."""
+    context = trusting_context(ca)
+    try:
+        context.load_cert_chain(certificate, key)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(certificate)) from error
+    return context
+
+
+def robot_connection(
+    url: str, ca: Path, certificate: Path, key: Path, name: str | None = None
+) -> CollectorConnection:
+    """Return the connection of a robot with these certificate files (`robot_context`)."""
+    return CollectorConnection(url, lambda: robot_context(ca, certificate, key), name)

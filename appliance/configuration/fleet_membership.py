@@ -1,0 +1,77 @@
+"""The membership of an appliance in a fleet: the collector's invitation, and the settings that a join keeps.
+
+`rosrv-fleet robot invite` writes the invitation, `rosrv fleet join` uses it. The folder `joined` of the state directory
+then has the settings (fleet.json) and the four files that they name. They apply unless `appliance.yaml` names a
+collector.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+FOLDER = "joined"
+SETTINGS = "fleet.json"
+AUTHORITY, CERTIFICATE, KEY, RECEIPT_KEY = "collector.pem", "robot.pem", "robot.key", "receipts.pub"
+JOIN_PATH = "/v1/join"
+"""The path of the collector that takes a `JoinRequest`."""
+
+_Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9._-]{0,62}\Z")]
+_Url = Annotated[str, msgspec.Meta(pattern=r"^https://[0-9a-fA-F.:\[\]]{3,60}\Z")]
+_Group = Annotated[str, msgspec.Meta(pattern=r"^([a-z0-9][a-z0-9-]{0,62}/[a-z0-9][a-z0-9-]{0,62})?\Z")]
+_Pem = Annotated[str, msgspec.Meta(max_length=16_384)]
+_Token = Annotated[str, msgspec.Meta(pattern=r"^rosrv-join_[A-Za-z0-9_-]{43}\Z")]
+
+
+class Invitation(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The means to join a collector: the robot's name, the collector, and a token for one use.
+
+    `authority` is the certificate that the robot trusts, `receipt_key` the public key of receipts (PEM). `group` is
+    SITE/GROUP, or empty. `expires` is in seconds since the epoch.
+    """
+
+    robot: _Name
+    group: _Group = ""
+    collector: _Url
+    authority: _Pem
+    receipt_key: _Pem
+    token: _Token
+    expires: float
+
+
+class JoinRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The request of a robot that joins: the token, the public key of its audit log and its certificate (PEM)."""
+
+    token: _Token
+    key: _Pem
+    certificate: _Pem
+
+
+def settings_of(invitation: Invitation) -> dict[str, Any]:
+    """Return the section `fleet` for an invitation; its files are in the folder of the membership."""
+    site, _, group = invitation.group.partition("/")
+    section: dict[str, Any] = {
+        "collector": invitation.collector, "robot": invitation.robot, "ca": AUTHORITY, "certificate": CERTIFICATE,
+        "key": KEY, "receipt_key": RECEIPT_KEY,
+    }  # fmt: skip
+    return section | ({"bundles": {"site": site, "group": group}} if group else {})
+
+
+def joined_settings(state: Path) -> dict[str, Any]:
+    """Return the section `fleet` that a join left in a state directory; empty without one.
+
+    Raises `OSError`, and `ValueError` for a file that is not JSON.
+    """
+    folder = (state / FOLDER).absolute()
+    try:
+        section: dict[str, Any] = msgspec.json.decode((folder / SETTINGS).read_bytes(), type=dict[str, Any])
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    except ValueError as error:
+        raise ValueError(f"{error}; join again: rosrv fleet join FILE") from error
+    files = {
+        name: str(folder / section[name])
+        for name in ("ca", "certificate", "key", "receipt_key")
+        if name in section
+    }
+    return section | files

@@ -1,0 +1,352 @@
+"""Collectors that misbehave: no client hangs, grows or follows, and each reports why."""
+
+import asyncio
+import json
+import re
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from appliance.bundles.poller import Poller
+from appliance.bundles.verified_bundles import VerifiedBundles
+from appliance.channel.messages import BundleOffered, BundleStated
+from appliance.collector import connection
+from appliance.collector.connection import CollectorConnection, CollectorError, robot_connection
+from appliance.configuration.fleet_membership import Invitation
+from appliance.forwarding.segment_pusher import SegmentPusher
+from tests.support.audit import decision
+from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
+from tests.support.command import rosrv
+from tests.support.fleet_certificates import FleetAuthority
+from tests.support.lying_collector import Lie, Visitor, lying_collector
+from tests.support.waiting import allowed, eventually
+from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
+
+__all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures and their types
+
+_SECONDS = 0.4
+Client = Callable[[str], str]
+"""A client: it gets the URL of a collector, makes one step, and returns the reported trouble."""
+
+
+def drips_the_handshake(visitor: Visitor) -> None:
+    """Begin a long handshake record, and send a byte now and then."""
+    visitor.stream.sendall(b"\x16\x03\x03\x40\x00")
+    visitor.repeat(b"\x02", 0.02)
+
+
+def closes(visitor: Visitor) -> None:
+    """Close the connection."""
+    visitor.stream.close()
+
+
+def drips_the_head(visitor: Visitor) -> None:
+    """Send a byte of a header now and then."""
+    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
+    visitor.repeat(b"x", 0.02)
+
+
+def sends_interim_answers(visitor: Visitor) -> None:
+    """Send interim answers, and never the real one."""
+    visitor.repeat(b"HTTP/1.1 100 Continue\r\n\r\n", 0.001)
+
+
+def sends_an_endless_head(visitor: Visitor) -> None:
+    """Send a header without an end."""
+    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nX: ")
+    visitor.repeat(b"x" * 65_536, 0)
+
+
+def drips_the_body(visitor: Visitor) -> None:
+    """Send a byte of the body now and then."""
+    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n")
+    visitor.repeat(b"x", 0.02)
+
+
+def sends_an_endless_body(visitor: Visitor) -> None:
+    """Send a body without an end."""
+    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+    visitor.repeat(bytes(1 << 16), 0)
+
+
+def closes_midway(visitor: Visitor) -> None:
+    """Send a part of the body, and close the connection."""
+    visitor.stream.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 500\r\n\r\n{")
+    visitor.stream.close()
+
+
+def redirects(visitor: Visitor) -> None:
+    """Send the client to another server."""
+    visitor.give(b"", "307 Temporary Redirect", "Location: https://127.0.0.1:1/")
+
+
+def compresses(visitor: Visitor) -> None:
+    """Answer with a compressed body."""
+    visitor.give(b"\x1f\x8b\x08", "200 OK", "Content-Encoding: gzip")
+
+
+def is_not_http(visitor: Visitor) -> None:
+    """Answer in another protocol."""
+    visitor.stream.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
+
+
+def demands_a_login(visitor: Visitor) -> None:
+    """Answer with a status that the protocol does not have, and text that would move a terminal's cursor."""
+    visitor.give(b"\x1b[2Jno", "401 Unauthorized", "Retry-After: 99999999999999999999")
+
+
+IN_HANDSHAKE = {
+    "drips the handshake": (drips_the_handshake, "takes more than"),
+    "is silent in the handshake": (Visitor.wait, "takes more than"),
+    "closes in the handshake": (closes, "EOF|reset|ended"),
+}
+IN_ANSWER = {
+    "is silent": (Visitor.wait, "takes more than"),
+    "closes": (closes, "disconnected|reset|EOF|ended"),
+    "drips the head": (drips_the_head, "takes more than"),
+    "sends interim answers": (sends_interim_answers, "takes more than"),
+    "sends an endless head": (sends_an_endless_head, "too long|exceed"),
+    "drips the body": (drips_the_body, "takes more than"),
+    "sends an endless body": (sends_an_endless_body, "more than .* bytes|exceed"),
+    "closes midway": (closes_midway, "closed connection|incomplete|EOF|violation"),
+    "redirects": (redirects, "307"),
+    "compresses": (compresses, "compresses"),
+    "is not HTTP": (is_not_http, "illegal|disconnected"),
+    "demands a login": (demands_a_login, r"401: \\x1b\[2Jno"),
+}
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> BundleSite:
+    """Return a fleet's repository and certificates."""
+    return BundleSite(tmp_path / "site")
+
+
+@pytest.fixture
+def authority(site: BundleSite) -> FleetAuthority:
+    """Return the fleet's authority."""
+    return site.authority
+
+
+@pytest.fixture
+def pusher(authority: FleetAuthority, make_log: MakeLog, path: Path, tmp_path: Path) -> Iterator[Client]:
+    """Return the client that pushes segments; its log has one sealed segment."""
+    log = make_log(checkpoint_every=10)
+    for number in range(10):
+        log.record(decision(log, number))
+    asyncio.run(asyncio.wait_for(log.wait_signed(), 60))
+
+    def step(url: str) -> str:
+        made = SegmentPusher(
+            path, tmp_path, robot_connection(url, authority.ca, *authority.issue(ROBOT)), b""
+        )
+        made.step()
+        assert (made.progress.sent, made.progress.sequence) == (0, 0)
+        made.close()
+        return made.progress.trouble
+
+    yield step
+
+
+@pytest.fixture
+def poller(site: BundleSite, tmp_path: Path) -> Client:
+    """Return the client that polls for bundles."""
+
+    def step(url: str) -> str:
+        authority = site.authority
+        collector = robot_connection(url, authority.ca, *authority.issue(ROBOT))
+        bundles = VerifiedBundles(
+            tmp_path / "robot", site.first_root, collector, site=SITE, group=GROUP, robot=ROBOT
+        )
+        offered: list[BundleOffered] = []
+        made = Poller(bundles, collector, (SITE, GROUP), 60.0, BundleStated, offered.append)
+        made.step()
+        collector.close()
+        assert not offered
+        return made.progress.trouble
+
+    return step
+
+
+@pytest.fixture
+def joiner(authority: FleetAuthority, tmp_path: Path) -> Client:
+    """Return the command that joins with an invitation."""
+    authority.server_context.verify_mode = ssl.CERT_OPTIONAL  # a robot that joins has no certificate yet
+    state, file = tmp_path / "joining", tmp_path / "arm1.json"
+    (state / "control").mkdir(parents=True)
+    (state / "control" / "audit.pub").write_text("the public key")
+
+    def step(url: str) -> str:
+        invitation = Invitation(
+            robot="arm1", collector=url, authority=authority.ca.read_text(), receipt_key="",
+            token=f"rosrv-join_{'a' * 43}", expires=0.0,
+        )  # fmt: skip
+        file.write_bytes(msgspec.json.encode(invitation))
+        done = rosrv("fleet", "join", str(file), "--state", str(state))
+        assert done.returncode == 1
+        assert not (state / "joined").exists()
+        return done.stderr
+
+    return step
+
+
+@pytest.fixture(params=["pusher", "poller", "joiner"])
+def client(request: pytest.FixtureRequest) -> Client:
+    """Return each client."""
+    found: Client = request.getfixturevalue(request.param)
+    return found
+
+
+@contextmanager
+def connected(authority: FleetAuthority, answer: Lie) -> Iterator[CollectorConnection]:
+    """Return a robot's connection to a collector that answers so."""
+    with lying_collector(authority.server_context, answer) as url:
+        made = robot_connection(url, authority.ca, *authority.issue(ROBOT))
+        yield made
+        made.close()
+
+
+def timely(client: Client, url: str, reason: str, patch: pytest.MonkeyPatch) -> None:
+    """Require that a step ends in time, and that its trouble is the expected one.
+
+    The deadline of an exchange is short if the collector would hold the client.
+    """
+    if "takes more than" in reason:
+        patch.setattr(connection, "_EXCHANGE_SECONDS", _SECONDS)
+    began = time.monotonic()
+    trouble = client(url)
+    assert time.monotonic() - began < 2 * _SECONDS + allowed(1)  # two exchanges
+    assert re.search(reason, trouble), trouble
+
+
+@pytest.mark.parametrize("name", IN_HANDSHAKE)
+def test_a_collector_that_misbehaves_in_the_handshake(
+    name: str, client: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No client waits longer than an exchange takes, and all report the reason."""
+    lie, reason = IN_HANDSHAKE[name]
+    with lying_collector(authority.server_context, Visitor.wait, lie) as url:
+        timely(client, url, reason, monkeypatch)
+
+
+@pytest.mark.parametrize("name", IN_ANSWER)
+def test_a_collector_that_misbehaves_in_its_answer(
+    name: str, client: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No client waits longer than an exchange takes, grows or follows, and all report the reason."""
+    lie, reason = IN_ANSWER[name]
+
+    def answer(visitor: Visitor) -> None:
+        visitor.body(visitor.request())
+        lie(visitor)
+
+    with lying_collector(authority.server_context, answer) as url:
+        timely(client, url, reason, monkeypatch)
+
+
+@pytest.mark.parametrize("name", IN_ANSWER)
+def test_a_collector_that_misbehaves_after_an_upload(
+    name: str, pusher: Client, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A segment without a usable answer does not count, and leaves no file."""
+    lie, reason = IN_ANSWER[name]
+    with lying_collector(authority.server_context, honest_until_the_upload(lie)) as url:
+        timely(pusher, url, reason, monkeypatch)
+
+
+def honest_until_the_upload(lie: Lie) -> Lie:
+    """Return a collector that has no segment yet, and lies after it got the first one."""
+
+    def answer(visitor: Visitor) -> None:
+        visitor.request()
+        visitor.give(json.dumps({"robot": ROBOT, "log": "", "number": 0, "hashes": []}).encode())
+        visitor.body(visitor.request())
+        lie(visitor)
+
+    return answer
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.02])
+def test_an_upload_that_the_collector_does_not_take(
+    pause: float, authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A collector that reads nothing of an upload, or a byte now and then, does not hold the client."""
+    monkeypatch.setattr(connection, "_EXCHANGE_SECONDS", _SECONDS)
+    monkeypatch.setattr(connection, "_SLOWEST_UPLOAD", 1 << 40)
+    size = 64 << 20
+
+    def answer(visitor: Visitor) -> None:
+        visitor.request()
+        while not visitor.ending.wait(pause or 0.1):
+            if pause:
+                visitor.stream.recv(1)
+
+    with connected(authority, answer) as collector:
+        began = time.monotonic()
+        with pytest.raises(CollectorError, match="takes more than"):
+            collector.put("x", iter([bytes(1 << 20)] * 64), size)
+        assert time.monotonic() - began < _SECONDS + allowed(1)
+
+
+def test_the_reason_of_an_early_refusal_arrives(authority: FleetAuthority) -> None:
+    """A collector that refuses an upload before its end gives its reason, its status and the time to wait."""
+
+    def answer(visitor: Visitor) -> None:
+        visitor.request()
+        visitor.give(b"the disk is full", "503 Service Unavailable", "Retry-After: 60")
+        visitor.wait()
+
+    refusal = pytest.raises(CollectorError, match="503: the disk is full")
+    with connected(authority, answer) as collector, refusal as refused:
+        collector.put("x", iter([b"x" * 1000]), 1000)
+    assert (refused.value.status, refused.value.wait) == (503, 60.0)
+
+
+def test_a_connection_is_used_again_and_replaced_files_apply_to_the_next(authority: FleetAuthority) -> None:
+    """Exchanges share a connection while it lasts; the next connection reads the certificate files again."""
+    visitors: list[Visitor] = []
+
+    def answer(visitor: Visitor) -> None:
+        visitors.append(visitor)
+        for _ in range(2):
+            visitor.request()
+            visitor.give(b"here")
+
+    with connected(authority, answer) as collector:
+        certificate = authority.folder / f"{ROBOT}.pem"
+        assert [collector.get("x"), collector.get("x")] == [b"here", b"here"]
+        assert len(visitors) == 1
+        eventually(lambda: not collector.is_open, "the collector closes the connection")
+        kept = certificate.read_bytes()
+        certificate.write_text("rubbish")
+        with pytest.raises(CollectorError, match=f"{ROBOT}.pem"):
+            collector.get("x")
+        certificate.write_bytes(kept)
+        assert collector.get("x") == b"here"
+        assert len(visitors) == 2
+
+
+def test_an_event_stream_ends_when_it_is_silent(
+    authority: FleetAuthority, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Events arrive as long as the collector sends something in time."""
+    monkeypatch.setattr(connection, "_SILENT_SECONDS", _SECONDS)
+
+    def answer(visitor: Visitor) -> None:
+        visitor.request()
+        visitor.stream.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+        for _ in range(10):
+            visitor.ending.wait(_SECONDS / 5)
+            visitor.stream.sendall(b": still here\n\n")
+        visitor.wait()
+
+    with connected(authority, answer) as collector:
+        heard: list[bytes] = []
+        with pytest.raises(CollectorError, match="takes more than"):
+            heard.extend(collector.events("x"))
+        assert b"".join(heard).count(b"still here") == 10

@@ -1,0 +1,211 @@
+"""A collector that lies about segments and receipts: nothing counts without its signature, nothing ends the pusher."""
+
+import asyncio
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.copies import signed_checkpoints
+from appliance.collector.connection import CollectorConnection, CollectorError
+from appliance.forwarding import segment_pusher
+from appliance.forwarding.segment_pusher import SegmentPusher
+from appliance.signing.receipts import SegmentReceipt
+from appliance.signing.signed_statements import checkpoint_hash
+from tests.support.audit import decision
+from tests.unit.forwarding.conftest import MakeLog
+
+
+class Collector(CollectorConnection):
+    """A collector without a network, which keeps the pushed numbers; the test replaces its answers."""
+
+    is_open = True
+
+    def __init__(self, log: Path) -> None:
+        self.log = log
+        self.key = Ed25519PrivateKey.generate()
+        self.pushed: list[int] = []
+        self.asked = 0
+        self.head: Callable[[int], dict[str, Any]] = self.honest_head
+        self.changes: dict[str, Any] = {}
+        self.refusal: CollectorError | None = None
+
+    def honest_head(self, upto: int) -> dict[str, Any]:
+        """Return the newest pushed checkpoint."""
+        number = max([one for one in self.pushed if one <= upto], default=0)
+        return {"number": number, "hashes": [self.hash_of(number)] if number else []}
+
+    def hash_of(self, number: int) -> str:
+        """Return the hash of the log's checkpoint."""
+        return checkpoint_hash(signed_checkpoints(self.log, number - 1, 1)[0].text())
+
+    def get(self, path: str, longest: int = 0) -> bytes:
+        """Answer with a head."""
+        self.asked += 1
+        if self.refusal:
+            raise self.refusal
+        return json.dumps({"robot": "arm1", "log": ""} | self.head(int(path.partition("=")[2]))).encode()
+
+    def put(self, path: str, content: Iterator[bytes], size: int, headers: Any = ()) -> bytes:
+        """Take a segment and answer with a receipt."""
+        assert sum(map(len, content)) == size
+        _v1, _logs, log, _segments, number, name = path.split("/")
+        end = signed_checkpoints(self.log, int(number) - 1, 1)[0].sequence
+        before = signed_checkpoints(self.log, int(number) - 2, 1)[0].sequence if number != "1" else 0
+        self.pushed.append(int(number))
+        fields: dict[str, Any] = {"robot": "arm1", "log": log, "number": int(number), "segment": name}
+        fields |= {"first": before + 1, "last": end, "time": 1}
+        return msgspec.json.encode(SegmentReceipt(**fields | self.changes).signed(self.key))
+
+    def close(self) -> None:
+        """Do nothing: no connection is open."""
+
+
+@pytest.fixture
+def collector(make_log: MakeLog, path: Path) -> Collector:
+    """Return a collector, and make a log with three sealed segments."""
+    log = make_log(checkpoint_every=10)
+    for _ in range(3):
+        for number in range(10):
+            log.record(decision(log, number))
+        asyncio.run(asyncio.wait_for(log.wait_signed(), 60))
+    return Collector(path)
+
+
+@pytest.fixture
+def make(collector: Collector, path: Path, tmp_path: Path) -> Callable[[], SegmentPusher]:
+    """Return a function that makes a pusher, as a process does at its start."""
+    (tmp_path / "state").mkdir()
+    key = collector.key.public_key().public_bytes_raw()
+    return lambda: SegmentPusher(path, tmp_path / "state", collector, key, jitter=lambda: 0.5)
+
+
+Make = Callable[[], SegmentPusher]
+
+
+@pytest.mark.parametrize(
+    "number", [10**18, 10**19, 10**400, 4000, -1], ids=["1e18", "1e19", "1e400", "4000", "-1"]
+)
+def test_a_head_beyond_the_question_is_refused(number: int, collector: Collector, make: Make) -> None:
+    """A number that was not asked for, however large, is a reported trouble, without further questions."""
+    collector.head = lambda _upto: {"number": number, "hashes": ["0" * 64]}
+    pusher = make()
+    assert pusher.step() > 0
+    assert pusher.progress.trouble
+    assert (collector.asked, collector.pushed, pusher.progress.sequence) == (1, [], 0)
+
+
+def test_a_head_with_wrong_hashes_ends_the_search(collector: Collector, make: Make) -> None:
+    """A collector that has another history for every number gets all segments, after a few questions."""
+    collector.head = lambda upto: {"number": upto, "hashes": ["0" * 64] * 900}
+    pusher = make()
+    while pusher.step() == 0:
+        assert len(collector.pushed) < 100
+    assert collector.pushed == sorted(set(collector.pushed))
+    assert collector.pushed[0] == 1
+    assert collector.asked <= 10
+
+
+def test_a_head_without_a_receipt_does_not_count(collector: Collector, make: Make) -> None:
+    """A collector that claims to have a segment must sign a receipt for it before retention may rely on it."""
+    newest = signed_checkpoints(collector.log, 0, 100)[-1]
+    collector.head = lambda _upto: {"number": newest.number, "hashes": [collector.hash_of(newest.number)]}
+    pusher = make()
+    collector.changes = {"segment": "0" * 64}
+    pusher.step()
+    assert (pusher.progress.sent, pusher.progress.sequence) == (0, 0)
+    collector.changes = {}
+    while pusher.step() == 0:
+        pass
+    assert set(collector.pushed) == {newest.number}
+    assert pusher.progress.sequence == newest.sequence
+
+
+@pytest.mark.parametrize(
+    "changes", [{"log": "f" * 32}, {"number": 2}, {"segment": "0" * 64}, {"first": 2}, {"last": 10**30}]
+)
+def test_a_receipt_for_another_segment_is_refused(
+    changes: dict[str, Any], collector: Collector, make: Make, tmp_path: Path
+) -> None:
+    """A receipt, however well signed, counts only for the segment that was pushed."""
+    collector.changes = changes
+    pusher = make()
+    pusher.step()
+    assert "receipt is not for segment 1" in pusher.progress.trouble
+    assert (pusher.progress.sent, pusher.progress.sequence) == (0, 0)
+    assert not list((tmp_path / "state").iterdir())
+
+
+def test_a_kill_between_receipt_and_position(
+    collector: Collector, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after the receipt and before the position is stored, the pusher repeats that segment, and misses none."""
+
+    class KilledError(BaseException):
+        """The end of the process."""
+
+    def killed(*_values: object) -> None:
+        raise KilledError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(segment_pusher, "write_whole", killed)
+        with pytest.raises(KilledError):
+            make().step()
+    receipts = tmp_path / "state" / "receipts.ndjson"
+    receipts.write_bytes(receipts.read_bytes()[:-40])  # and the disk kept a part of the line
+    pusher = make()
+    while pusher.step() == 0:
+        pass
+    assert collector.pushed[:3] == [1, 1, 2]
+    assert pusher.progress.missed == 0
+    torn, *lines = receipts.read_bytes().splitlines()
+    kept = [msgspec.json.decode(line, type=SegmentReceipt).number for line in lines]
+    assert kept == sorted(set(collector.pushed))
+    with pytest.raises(msgspec.DecodeError):
+        msgspec.json.decode(torn, type=SegmentReceipt)
+
+
+def test_a_full_disk_is_reported_and_passes(
+    collector: Collector, make: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """While the position cannot be stored, the pusher reports that; afterwards no record is missed."""
+
+    def full(path: Path, *_rest: object) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    pusher = make()
+    with monkeypatch.context() as patch:
+        patch.setattr(segment_pusher, "write_whole", full)
+        assert pusher.step() > 0
+    assert "No space left" in pusher.progress.trouble
+    assert not (tmp_path / "state" / "segment.gz").exists()
+    while pusher.step() == 0:
+        pass
+    assert pusher.progress.trouble == ""
+    assert (pusher.progress.missed, pusher.progress.behind) == (0, 0)
+
+
+def test_a_wait_of_a_year_is_an_hour(collector: Collector, make: Make) -> None:
+    """A collector cannot silence a robot for longer than about an hour with Retry-After."""
+    collector.refusal = CollectorError("later", 503, 365 * 86_400.0)
+    assert make().step() == 3600.0
+
+
+def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Make, path: Path) -> None:
+    """After another log took the place of the log, no receipt of the old one counts, even if the collector is gone."""
+    pusher = make()
+    while pusher.step() == 0:
+        pass
+    assert pusher.progress.sequence >= 30
+    collector.refusal = CollectorError("gone")
+    with closing(sqlite3.connect(path)) as log, log:
+        log.execute("UPDATE log SET id = ?", ("f" * 32,))
+    pusher.step()
+    assert "another log" in pusher.progress.trouble
+    assert pusher.progress.sequence == 0
