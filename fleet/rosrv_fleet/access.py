@@ -1,31 +1,36 @@
-"""Identify the caller of a request: a robot by its certificate, an operator by a token."""
+"""Identify the caller of a request: a robot by its certificate, an operator by a token.
 
-from collections.abc import Callable
+The functions are coroutines, because FastAPI would call others in a thread, which costs more than their work.
+"""
+
+from collections.abc import Awaitable, Callable
 
 from fastapi import HTTPException, Request
 
 from rosrv_fleet.robots import Robot, Robots
-from rosrv_fleet.tokens import FleetRole, OperatorToken, Tokens
+from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
 PEER_CERTIFICATE = "peer_certificate"
 """The key in the ASGI scope's `state` with the verified client certificate (DER)."""
 COOKIE = "__Host-rosrv-fleet"
-"""The console's cookie: only over TLS, for this host, for no script."""
+"""The console's cookie: sent only over TLS and to this host, and hidden from scripts."""
 
 
-def name_of(identify: Callable[[Request], Robot | OperatorToken]) -> Callable[[Request], str]:
+def name_of(
+    identify: Callable[[Request], Awaitable[Robot | OperatorToken]],
+) -> Callable[[Request], Awaitable[str]]:
     """Return the dependency that identifies the same caller, by name."""
 
-    def named(request: Request) -> str:
-        return identify(request).name
+    async def named(request: Request) -> str:
+        return (await identify(request)).name
 
     return named
 
 
-def robot_of(robots: Robots) -> Callable[[Request], Robot]:
+def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
     """Return the dependency that identifies a robot; it answers 403 for any other caller."""
 
-    def identify(request: Request) -> Robot:
+    async def identify(request: Request) -> Robot:
         certificate = request.scope.get("state", {}).get(PEER_CERTIFICATE)
         robot = None if certificate is None else robots.with_certificate(certificate)
         if robot is None:
@@ -37,10 +42,10 @@ def robot_of(robots: Robots) -> Callable[[Request], Robot]:
     return identify
 
 
-def holder_of(tokens: Tokens, role: FleetRole) -> Callable[[Request], OperatorToken]:
+def holder_of(tokens: OperatorTokens, role: FleetRole) -> Callable[[Request], Awaitable[OperatorToken]]:
     """Return the dependency that requires a token with this role; it answers 401 or 403 otherwise."""
 
-    def identify(request: Request) -> OperatorToken:
+    async def identify(request: Request) -> OperatorToken:
         scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
         text = bearer if scheme.lower() == "bearer" else request.cookies.get(COOKIE, "")
         holder = tokens.holder(text.strip()) if text else None

@@ -1,7 +1,7 @@
 """The command `rosrv-fleet`: run the collector, enrol robots, make tokens, search, verify, roll out bundles."""
 
+import errno
 import json
-import logging
 import os
 import ssl
 import sys
@@ -10,25 +10,31 @@ from typing import Annotated, Any
 
 import msgspec
 import psycopg
-import structlog
 import typer
 
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import printable
 from appliance.base.timestamps import TimestampError
+from appliance.configuration.fleet_membership import Invitation
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
-from rosrv_fleet.config import ConfigError, FleetConfig, load_config
+from rosrv_fleet.config import FleetConfigError, load_config
 from rosrv_fleet.database import migrate
+from rosrv_fleet.evidence.commands import evidence
+from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.filtering import searched
+from rosrv_fleet.indexer import NOT_INDEXABLE, index
+from rosrv_fleet.invitations import Invitations
+from rosrv_fleet.output import configure_log
 from rosrv_fleet.receipt_key import ReceiptKeyError, make_receipt_key
-from rosrv_fleet.robots import EnrolmentError, Robots, make_folder
+from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots, check_name, make_folder
 from rosrv_fleet.rollouts.commands import rollout
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
 from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.server import serve
-from rosrv_fleet.tokens import FleetRole, TokenError, Tokens
+from rosrv_fleet.server_certificate import ServerCertificateError, authority_of, make_certificate, url_of
+from rosrv_fleet.tokens import FleetRole, OperatorTokens, TokenError
 from rosrv_fleet.verification import LogProof, prove
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
@@ -38,22 +44,26 @@ app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
 app.add_typer(bundle, name="bundle")
 app.add_typer(rollout, name="rollout")
+app.add_typer(evidence, name="evidence")
 _ERRORS = (
-    ConfigError, EnrolmentError, TokenError, ReceiptKeyError, FilterError, TimestampError, SearchTooLongError,
-    IndexDownError, OSError, ssl.SSLError, psycopg.Error, msgspec.MsgspecError,
+    FleetConfigError, ServerCertificateError, EnrolmentError, TokenError, ReceiptKeyError, FilterError, TimestampError,
+    SearchTooLongError, IndexDownError, OSError, ssl.SSLError, psycopg.Error,
 )  # fmt: skip
 _MOST_WAITING = 1000
+_LONGEST_HOURS = 24.0 * 30
 Config = Annotated[
     Path, typer.Option("--config", envvar="ROSRV_FLEET_CONFIG", help="The collector's configuration file")
 ]
 _DEFAULT = Path("/etc/rosrv-fleet/fleet.yaml")
 Name = Annotated[str, typer.Argument(help="Name of the robot")]
+InGroup = Annotated[str, typer.Option("--group", metavar="SITE/GROUP", help="Its robot group, for bundles")]
 Certificate = Annotated[Path, typer.Option("--certificate", help="The robot's client certificate (PEM)")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
 
 
 def main() -> None:
     """Run the command. Errors are one line on standard error, with exit status 2."""
+    os.umask(0o077)
     try:
         app()
     except _ERRORS as error:
@@ -61,22 +71,26 @@ def main() -> None:
         sys.exit(2)
 
 
-def _loaded(config: Path) -> FleetConfig:
-    os.umask(0o077)
-    return load_config(config)
-
-
 @app.command()
-def init(config: Config = _DEFAULT) -> None:
-    """Prepare the data folder, the key of receipts and the database. Repeating it is harmless.
+def init(
+    address: Annotated[
+        str | None,
+        typer.Option("--address", help="IP address at which robots reach the collector, for its certificate"),
+    ] = None,
+    config: Config = _DEFAULT,
+) -> None:
+    """Prepare the data folder, the collector's certificate and keys, and the database. Repeating it is harmless.
 
-    Example: rosrv-fleet init --config fleet.yaml
+    A certificate that exists is kept.
+
+    Example: rosrv-fleet init --address 10.0.0.9
     """
-    found = _loaded(config)
+    found = load_config(config)
     make_folder(found.data)
     make_folder(found.data / "robots")
-    public = make_receipt_key(found.data)
-    typer.echo(f"copy to each robot, as fleet.receipt_key: {public}")
+    made = make_certificate(found, address)
+    typer.echo(f"certificate: {found.certificate} {'was made' if made else 'is kept'}")
+    typer.echo(f"public key of receipts: {make_receipt_key(found.data)}")
     with psycopg.connect(found.database) as connection:
         applied = migrate(connection)
     typer.echo(f"database: {len(applied)} migrations applied")
@@ -88,10 +102,45 @@ def serve_collector(config: Config = _DEFAULT) -> None:
 
     Example: rosrv-fleet serve --config fleet.yaml
     """
-    found = _loaded(config)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
+    found = load_config(config)
+    configure_log()
     serve(make_collector(found))
+
+
+@robot_app.command("invite")
+def invite_robots(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of the robots")],
+    group: InGroup = "",
+    hours: Annotated[
+        float,
+        typer.Option("--hours", min=0.01, max=_LONGEST_HOURS, help="Hours until the invitations expire"),
+    ] = 24.0,
+    config: Config = _DEFAULT,
+) -> None:
+    """Print an invitation for each robot, one a line. A robot uses it once: `rosrv fleet join FILE`.
+
+    A newer invitation replaces an earlier one. For an enrolled robot, a join replaces its certificate; without --group
+    it keeps its group.
+
+    Example: rosrv-fleet robot invite arm7 --group site-a/arms > arm7.json
+    """
+    found = load_config(config)
+    if group:
+        RobotGroup.parse(group)
+    for name in names:
+        check_name(name)
+    collector, authority = url_of(found), authority_of(found.certificate)
+    receipt_key = make_receipt_key(found.data).read_text(encoding="ascii")
+    invitations = Invitations(found.data / "invitations")
+    enrolled = Robots(found.data / "robots").all()
+    for name in names:
+        own = group or (enrolled[name].group if name in enrolled else "")
+        pending, token = invitations.add(name, group, hours * 3600.0)
+        invitation = Invitation(
+            robot=name, group=own, collector=collector, authority=authority, receipt_key=receipt_key, token=token,
+            expires=pending.expires,
+        )  # fmt: skip
+        typer.echo(msgspec.json.encode(invitation).decode())
 
 
 @robot_app.command("add")
@@ -99,74 +148,101 @@ def add_robot(
     name: Name,
     key: Annotated[Path, typer.Option("--key", help="The robot's control/audit.pub (PEM)")],
     certificate: Certificate,
+    group: InGroup = "",
     config: Config = _DEFAULT,
 ) -> None:
-    """Enrol a robot: pin the key of its audit log and its client certificate. A running collector notices.
+    """Enrol a robot: pin the key of its audit log, its client certificate and its group. No restart is needed.
 
-    Example: rosrv-fleet robot add arm7 --key arm7-audit.pub --certificate arm7.pem
+    A robot without a group gets no bundles.
+
+    Example: rosrv-fleet robot add arm7 --key arm7-audit.pub --certificate arm7.pem --group site-a/arms
     """
-    robot = _robots(config).add(name, key.read_bytes(), certificate.read_bytes())
+    robots, _invitations = _robots(config)
+    robot = robots.add(name, key.read_bytes(), certificate.read_bytes(), group)
     typer.echo(f"{robot.name} is enrolled: log key {robot.key}, certificate SHA-256 {robot.fingerprint}")
+
+
+@robot_app.command("group")
+def move_robot(
+    name: Name,
+    group: Annotated[str, typer.Argument(metavar="SITE/GROUP", help="Its robot group, for bundles")],
+    config: Config = _DEFAULT,
+) -> None:
+    """Move a robot to a group: the robot then gets the bundles, and counts in the rollouts, of this group only.
+
+    Example: rosrv-fleet robot group arm7 site-a/arms
+    """
+    robots, _invitations = _robots(config)
+    robot = robots.move(name, group)
+    typer.echo(f"{robot.name} is in {robot.group}")
 
 
 @robot_app.command("renew")
 def renew_robot(name: Name, certificate: Certificate, config: Config = _DEFAULT) -> None:
-    """Replace a robot's client certificate. The earlier one is refused at once.
+    """Replace a robot's client certificate. The earlier certificate and an invitation are rejected from now on.
 
     Example: rosrv-fleet robot renew arm7 --certificate arm7-2027.pem
     """
-    robot = _robots(config).renew(name, certificate.read_bytes())
+    robots, invitations = _robots(config)
+    robots.named(name)
+    invitations.withdraw(name)  # first: otherwise the robot could join in between
+    robot = robots.renew(name, certificate.read_bytes())
     typer.echo(f"{robot.name}: certificate SHA-256 {robot.fingerprint}")
 
 
 @robot_app.command("remove")
 def remove_robot(name: Name, config: Config = _DEFAULT) -> None:
-    """Refuse a robot from now on. Its segments stay and are still verified.
+    """Reject a robot and its invitation from now on. Its segments stay and are still verified.
 
     Example: rosrv-fleet robot remove arm7
     """
-    _robots(config).remove(name)
+    robots, invitations = _robots(config)
+    robots.named(name)
+    invitations.withdraw(name)  # first: otherwise the robot could join in between
+    robots.remove(name)
     typer.echo(f"{name} may connect no more; its segments stay")
 
 
 @robot_app.command("list")
 def list_robots(config: Config = _DEFAULT, *, as_json: Json = False) -> None:
-    """List the robots with their certificates.
+    """List the robots with their groups and certificates.
 
     Example: rosrv-fleet robot list
     """
-    for robot in _robots(config).all().values():
+    for robot in _robots(config)[0].all().values():
         state = "enrolled" if robot.removed is None else "removed"
-        fields = {"name": robot.name, "state": state, "key": robot.key, "certificate": robot.fingerprint}
-        typer.echo(json.dumps(fields) if as_json else "  ".join(fields.values()))
+        fields = {"name": robot.name, "state": state, "group": robot.group}
+        fields |= {"key": robot.key, "certificate": robot.fingerprint}
+        typer.echo(json.dumps(fields) if as_json else "  ".join(word or "-" for word in fields.values()))
 
 
-def _robots(config: Path) -> Robots:
-    return Robots(_loaded(config).data / "robots")
+def _robots(config: Path) -> tuple[Robots, Invitations]:
+    data = load_config(config).data
+    return Robots(data / "robots"), Invitations(data / "invitations")
 
 
 @token_app.command("add")
 def add_token(
     name: Annotated[str, typer.Argument(help="Name of the holder")],
-    role: Annotated[FleetRole, typer.Option("--role", help="What the holder may do")] = FleetRole.VIEWER,
+    role: Annotated[FleetRole, typer.Option("--role", help="The rights of the holder")] = FleetRole.VIEWER,
     config: Config = _DEFAULT,
 ) -> None:
     """Make a token and print it once.
 
     Example: rosrv-fleet token add alice --role viewer
     """
-    typer.echo(Tokens(_loaded(config).data / "tokens.json").add(name, role))
+    typer.echo(_tokens(config).add(name, role))
 
 
 @token_app.command("remove")
 def remove_token(
     name: Annotated[str, typer.Argument(help="Name of the holder")], config: Config = _DEFAULT
 ) -> None:
-    """Remove a token. It is refused at once.
+    """Remove a token. It is rejected immediately.
 
     Example: rosrv-fleet token remove alice
     """
-    Tokens(_loaded(config).data / "tokens.json").remove(name)
+    _tokens(config).remove(name)
 
 
 @token_app.command("list")
@@ -175,8 +251,29 @@ def list_tokens(config: Config = _DEFAULT) -> None:
 
     Example: rosrv-fleet token list
     """
-    for token in Tokens(_loaded(config).data / "tokens.json").all():
+    for token in _tokens(config).all():
         typer.echo(f"{token.name}  {token.role}")
+
+
+def _tokens(config: Path) -> OperatorTokens:
+    return OperatorTokens(load_config(config).data / "tokens.json")
+
+
+@evidence.command("remove")
+def remove_evidence(
+    evidence_id: Annotated[str, typer.Argument(metavar="ID", help="Its SHA-256, as in `evidence list`")],
+    config: Config = _DEFAULT,
+) -> None:
+    """Remove an evidence bundle from the collector, on the collector's machine.
+
+    Example: rosrv-fleet evidence remove 5d0f…
+    """
+    removed = EvidenceStore(load_config(config).data / "evidence").remove(evidence_id)
+    if removed is None:
+        raise FileNotFoundError(
+            errno.ENOENT, "no evidence bundle has this ID, see rosrv-fleet evidence list", evidence_id
+        )
+    typer.echo(f"{removed.id} is removed: evidence of {removed.robot}, {removed.bytes} bytes")
 
 
 @app.command()
@@ -196,13 +293,14 @@ def search(
 
     Example: rosrv-fleet search --deny --since 1h --topic '/cmd_*' --robot 'arm*'
     """
-    collector = make_collector(_loaded(config))
-    waiting = len(collector.store.marked("pending", _MOST_WAITING))
-    collector.database.open()
+    collector = make_collector(load_config(config))
+    waiting = collector.store.waiting(_MOST_WAITING)
+    database = collector.searches.database
+    database.open()
     try:
-        page = search_fleet(collector.database, FleetFilter(robot, wanted), cursor, limit, waiting)
+        page = search_fleet(database, FleetFilter(robot, wanted), cursor, limit, waiting)
     finally:
-        collector.database.close()
+        database.close()
     for record in page.records:
         typer.echo(json.dumps(record, separators=(",", ":")) if as_json else _line(record))
     if page.waiting:
@@ -229,11 +327,11 @@ def verify(
 ) -> None:
     """Prove from the stored segments that no record is missing. Exit status: 0 proven, 1 not, 2 wrong use.
 
-    It needs no database. Every segment is read again, so it takes about a second for ten thousand records.
+    The command needs no database. It reads every segment again: about a second for ten thousand records.
 
     Example: rosrv-fleet verify arm7
     """
-    found = _loaded(config)
+    found = load_config(config)
     robots = Robots(found.data / "robots")
     chosen = list(robots.all().values()) if robot is None else [robots.named(robot)]
     store = SegmentStore(found.data, found.limits.reserve_bytes)
@@ -257,6 +355,8 @@ def _print_proof(proof: LogProof, *, as_json: bool) -> None:
         f"{proof.robot}: log {proof.log}: {proof.records} records in {proof.segments} segments are proven{begins},"
         f" up to {proof.last}; {proof.missing} are missing"
     )
+    if proof.removal:
+        typer.echo(f"  {printable(proof.removal)}")
     for finding in proof.findings:
         typer.echo(f"  {printable(finding)}")
 
@@ -265,24 +365,34 @@ def _print_proof(proof: LogProof, *, as_json: bool) -> None:
 def reindex(config: Config = _DEFAULT) -> None:
     """Rebuild the index from the stored segments. The collector may run; searches are incomplete until the end.
 
+    Exit status 1 if a segment cannot be indexed; all others are.
+
     Example: rosrv-fleet reindex
     """
-    collector = make_collector(_loaded(config))
+    collector = make_collector(load_config(config))
     with psycopg.connect(collector.config.database) as connection:
         migrate(connection)
         connection.execute("TRUNCATE segment, record")
     collector.database.open()
     try:
-        _note(f"{_index_all(collector)} segments are indexed")
+        indexed, damaged = _index_all(collector)
     finally:
         collector.database.close()
+    _note(f"{indexed} segments are indexed")
+    raise typer.Exit(1 if damaged else 0)
 
 
-def _index_all(collector: Collector) -> int:
-    count = 0
-    for robot in collector.robots.all():
-        for log in collector.store.logs(robot):
-            for place in collector.store.segments(robot, log):
-                collector.indexer.index(place)
-                count += 1
-    return count
+def _index_all(collector: Collector) -> tuple[int, int]:
+    """Index all segments; return the number of indexed ones, and of those that the index cannot have."""
+    indexed = damaged = 0
+    for robot in collector.robots.all().values():
+        for log in collector.store.logs(robot.name):
+            for place in collector.store.segments(robot.name, log):
+                try:
+                    indexed += index(
+                        collector.database, collector.store, place, robot.public_key, collector.config
+                    )
+                except NOT_INDEXABLE as error:
+                    damaged += 1
+                    _note(f"{collector.store.path(place)} is not indexed: {printable(str(error).strip())}")
+    return indexed, damaged

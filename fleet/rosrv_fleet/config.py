@@ -3,17 +3,20 @@
 Each part of the collector has a section here. Relative paths are relative to the file.
 """
 
+import os
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import yaml
 
+_DATA = Path("/var/lib/rosrv-fleet")
 _Positive = Annotated[int, msgspec.Meta(gt=0)]
 _Seconds = Annotated[float, msgspec.Meta(gt=0, le=86_400)]
 
 
-class ConfigError(Exception):
+class FleetConfigError(Exception):
     """The configuration is missing or invalid; the message has the file, the key and the remedy."""
 
 
@@ -21,22 +24,65 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The limits of uploads and searches.
 
     `segment_bytes` is the largest uncompressed segment, `upload_bytes` the largest compressed one; `upload_seconds` is
-    the longest upload. `uploads` run at the same time, one for each robot. `robot_bytes_per_day` limits the compressed
-    bytes that one robot stores in 24 hours. `reserve_bytes` of the disk stay free. `search_seconds` is the longest
-    search, `searches` run at the same time. `header_seconds` is the longest wait for a request's headers,
-    `connections` the number of open connections.
+    the longest upload, `check_seconds` the longest processor time of a segment's verification. `uploads` run at the
+    same time, one for each robot. `robot_bytes_per_day` and `robot_unpacked_bytes_per_day` limit the compressed and the
+    uncompressed bytes that one robot sends in 24 hours, stored or refused. `reserve_bytes` of the disk stay free.
+    `search_seconds` is the longest search; `searches` run at the same time, half of them with the same token.
+    `header_seconds` is the longest wait for a TLS handshake and for a request's headers. `connections` is the number of
+    open connections, `robot_connections` of one robot, `address_connections` of one address without a robot's
+    certificate.
     """
 
     segment_bytes: _Positive = 512 << 20
     upload_bytes: _Positive = 128 << 20
     upload_seconds: _Seconds = 120.0
+    check_seconds: _Seconds = 60.0
     uploads: _Positive = 64
     robot_bytes_per_day: _Positive = 2 << 30
+    robot_unpacked_bytes_per_day: _Positive = 8 << 30
     reserve_bytes: _Positive = 256 << 20
     search_seconds: _Seconds = 10.0
     searches: _Positive = 4
     header_seconds: _Seconds = 15.0
     connections: _Positive = 4096
+    robot_connections: _Positive = 16
+    address_connections: _Positive = 256
+
+
+class EvidenceConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The limits of evidence bundles, which operators add.
+
+    `bundle_bytes` is the largest bundle; `robot_bytes` limits the stored bundles of one robot. `upload_seconds` is the
+    longest upload, `check_seconds` the longest processor time of a verification.
+    """
+
+    bundle_bytes: _Positive = 1 << 30
+    robot_bytes: _Positive = 10 << 30
+    upload_seconds: _Seconds = 3600.0
+    check_seconds: _Seconds = 600.0
+
+
+class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The days after arrival until records are removed from the index, and segments from the disk; None: never.
+
+    Records never stay in the index longer than their segments: `reindex` could not restore them.
+    """
+
+    index_days: _Positive | None = None
+    segment_days: _Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.segment_days is not None and not (self.index_days and self.index_days <= self.segment_days):
+            raise ValueError(f"segment_days: {self.segment_days} needs index_days, of at most as many days")
+
+    def oldest_day(self) -> date | None:
+        """Return the first day of arrival (UTC) that the index keeps; None: it keeps all."""
+        return None if self.index_days is None else datetime.now(UTC).date() - timedelta(self.index_days)
+
+    def keeps(self, day: date) -> bool:
+        """Whether the index keeps a day of arrival (UTC) now."""
+        oldest = self.oldest_day()
+        return oldest is None or day >= oldest
 
 
 class BundlesConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -53,17 +99,20 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """The configuration of a collector.
 
     `data` is the folder with robots, tokens, keys and segments. `listen` is HOST:PORT. `certificate` and `key` are the
-    server's (PEM). `database` is a libpq connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is
-    silent after `silent_seconds` without a segment. Without `bundles`, robots get none.
+    server's (PEM; by default server.pem and server.key in `data`, made by `rosrv-fleet init`). `database` is a libpq
+    connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent after `silent_seconds` without a
+    segment. Without `retention`, nothing is removed. Without `bundles`, robots get none.
     """
 
-    data: Path = Path("/var/lib/rosrv-fleet")
+    data: Path = _DATA
     listen: str = "0.0.0.0:8444"
     certificate: Path
     key: Path
     database: str = "dbname=rosrv_fleet"
     silent_seconds: _Seconds = 600.0
     limits: Limits = Limits()
+    evidence: EvidenceConfig = EvidenceConfig()
+    retention: RetentionConfig = RetentionConfig()
     bundles: BundlesConfig | None = None
 
     @property
@@ -74,16 +123,22 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def load_config(path: Path) -> FleetConfig:
-    """Return the configuration in a YAML file. Raises `ConfigError`."""
+    """Return the configuration in a YAML file. Raises `FleetConfigError`."""
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if isinstance(fields, dict) and not fields.keys() & {"certificate", "key"}:
+            data = str(fields.get("data", _DATA))
+            fields = {"certificate": f"{data}/server.pem", "key": f"{data}/server.key"} | fields
         found = msgspec.convert(fields, FleetConfig, dec_hook=_decoded)
         if not 0 <= found.address[1] <= 65_535:
             raise ValueError(f"listen: {found.listen} has no valid port")
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; name another file with --config") from error
-    except (yaml.YAMLError, msgspec.ValidationError, ValueError) as error:
-        raise ConfigError(f"{path}: {error}; see docs/fleet.md") from error
+        advice = "name another file with --config"
+        if isinstance(error, PermissionError):
+            advice = f"let user {os.geteuid()} read it, for example: chmod 644 {path.name}"
+        raise FleetConfigError(f"{path}: {error.strerror}; {advice}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise FleetConfigError(f"{path}: {error}; see docs/fleet.md") from error
     folder = path.absolute().parent
     bundles = found.bundles and BundlesConfig(
         folder=folder / found.bundles.folder, timestamp_key=folder / found.bundles.timestamp_key

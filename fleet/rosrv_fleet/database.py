@@ -21,7 +21,7 @@ _log = structlog.get_logger()
 Connection = psycopg.Connection[tuple[Any, ...]]
 
 
-class Database:
+class IndexDatabase:
     """A bounded pool of connections to the index. Thread-safe."""
 
     def __init__(self, conninfo: str, *, connections: int, statement_seconds: float) -> None:

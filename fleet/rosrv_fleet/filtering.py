@@ -1,4 +1,4 @@
-"""Give the search its words: those of `rosrv audit search`."""
+"""Give the search the options of `rosrv audit search`."""
 
 import functools
 import inspect

@@ -1,28 +1,31 @@
 """Report the state of robots and of the collector, from the store alone."""
 
 import time
-from collections import Counter
 
 import msgspec
 
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.robots import Robot
-from rosrv_fleet.segment_store import SegmentPlace, StoreFullError
+from rosrv_fleet.segment_store import StoreFullError
 
 _SECOND = 1e9
 _MOST = 10_000
+_MOST_MARKS = 1000
 
 
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
-    """A robot: its newest segment (log, number, seconds since it arrived; None: none yet), and what is wrong.
+    """A robot: its newest segment (log, number, seconds since it arrived; None: none yet), and its problems.
 
-    `gaps` is the number of places where segments are missing; `forks` the number of segments with equal numbers.
+    `certificate_seconds` pass until its certificate ends.
+    `gaps` is the number of places where segments are missing; `forks` the number of segments with equal numbers; both
+    are counted up to 1,000.
     """
 
     name: str
     log: str | None = None
     number: int | None = None
     age_seconds: float | None = None
+    certificate_seconds: float
     silent: bool
     gaps: int
     forks: int
@@ -32,7 +35,7 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
     """The state of the collector.
 
     `waiting` is the number of stored segments that the index does not have yet, at most 10,000; `trouble` and `disk`
-    say why indexing or storing is impossible, or are None.
+    are the reasons why indexing or storing is impossible, or None.
     """
 
     robots: list[RobotState]
@@ -42,12 +45,15 @@ class FleetHealth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def health_of(collector: Collector) -> FleetHealth:
-    """Return the present state. Raises `OSError` and `EnrolmentError`."""
+    """Return the present state. Raises `OSError`."""
     store = collector.store
-    marks = {kind: Counter(place.robot for place in store.marked(kind, _MOST)) for kind in ("gaps", "forks")}
+    marked = {
+        kind: {robot: len(store.marked(kind, robot, _MOST_MARKS)) for robot in store.robots_with(kind)}
+        for kind in ("gaps", "forks")
+    }
     robots = [
-        _state(collector, robot, marks["gaps"][robot.name], marks["forks"][robot.name])
-        for robot in collector.robots.all().values()
+        _state(collector, robot, marked["gaps"].get(robot.name, 0), marked["forks"].get(robot.name, 0))
+        for robot in collector.robots.known().values()
         if robot.removed is None
     ]
     try:
@@ -55,24 +61,26 @@ def health_of(collector: Collector) -> FleetHealth:
         disk = None
     except StoreFullError as error:
         disk = error.strerror
-    waiting = len(store.marked("pending", _MOST))
-    return FleetHealth(robots=robots, waiting=waiting, trouble=collector.indexer.trouble, disk=disk)
+    trouble = collector.indexer.trouble or collector.robots.trouble or collector.pruner.trouble
+    return FleetHealth(robots=robots, waiting=store.waiting(_MOST), trouble=trouble, disk=disk)
 
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:
-    newest = _newest(collector, robot.name)
+    newest = collector.store.newest(robot.name)
     now, silent_after = time.time_ns(), collector.config.silent_seconds
+    ends = robot.certificate_ends - now / _SECOND
     if newest is None:
         since_added = (now - robot.added) / _SECOND
-        return RobotState(name=robot.name, silent=since_added > silent_after, gaps=gaps, forks=forks)
+        return RobotState(
+            name=robot.name,
+            certificate_seconds=ends,
+            silent=since_added > silent_after,
+            gaps=gaps,
+            forks=forks,
+        )
     received, place = newest
     age = max(0.0, (now - received) / _SECOND)
     return RobotState(
-        name=robot.name, log=place.log, number=place.number, age_seconds=age, silent=age > silent_after, gaps=gaps,
-        forks=forks,
+        name=robot.name, log=place.log, number=place.number, age_seconds=age, certificate_seconds=ends,
+        silent=age > silent_after, gaps=gaps, forks=forks,
     )  # fmt: skip
-
-
-def _newest(collector: Collector, robot: str) -> tuple[int, SegmentPlace] | None:
-    heads = [collector.store.head(robot, log) for log in collector.store.logs(robot)]
-    return max(((collector.store.received(one), one) for one in heads if one is not None), default=None)

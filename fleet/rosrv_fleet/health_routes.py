@@ -11,6 +11,7 @@ from prometheus_client.registry import Collector as MetricSource
 from rosrv_fleet.access import holder_of
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.health import FleetHealth, health_of
+from rosrv_fleet.rollouts.metrics import RolloutMetrics
 from rosrv_fleet.tokens import FleetRole
 
 
@@ -20,8 +21,8 @@ def health_router(collector: Collector) -> APIRouter:
     viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
 
     @router.get("/healthz")
-    def alive() -> dict[str, bool]:
-        """Return that the collector answers; for load balancers, without a token."""
+    async def alive() -> dict[str, bool]:
+        """Answer 200 while the collector runs; load balancers need no token."""
         return {"ok": True}
 
     @router.get("/v1/health", dependencies=viewer)
@@ -34,6 +35,8 @@ def health_router(collector: Collector) -> APIRouter:
         """Return the same state as metrics."""
         registry = CollectorRegistry()
         registry.register(_Source(health_of(collector)))
+        if collector.bundles is not None:
+            registry.register(RolloutMetrics(collector.bundles))
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     return router
@@ -51,16 +54,18 @@ class _Source(MetricSource):
 
         health = self._health
         age = gauge("segment_age_seconds", "seconds since the robot's newest segment arrived")
+        ends = gauge("certificate_seconds", "seconds until the robot's certificate ends")
         silent = gauge("robot_silent", "1 while the robot sent nothing for silent_seconds")
         gaps = gauge("gaps", "places where segments of the robot are missing")
         forks = gauge("forks", "segments of the robot with a number that another one has")
         for robot in health.robots:
             if robot.age_seconds is not None:
                 age.add_metric([robot.name], robot.age_seconds)
+            ends.add_metric([robot.name], robot.certificate_seconds)
             silent.add_metric([robot.name], robot.silent)
             gaps.add_metric([robot.name], robot.gaps)
             forks.add_metric([robot.name], robot.forks)
-        yield from (age, silent, gaps, forks)
+        yield from (age, ends, silent, gaps, forks)
         yield GaugeMetricFamily(
             "rosrv_fleet_waiting", "stored segments that the index does not have", health.waiting
         )

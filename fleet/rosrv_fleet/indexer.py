@@ -1,14 +1,20 @@
 """Copy stored segments to the index. The store works without it; the index catches up later.
 
 A segment and its records are written in one transaction, once. Its marker in the store is removed afterwards.
+
+Robots take turns, with one segment each. Large segments have separate turns (`LANES`), so smaller segments do not wait
+for them. A segment that cannot be indexed is set aside and reported; it does not delay other segments, and is tried
+again every hour.
 """
 
-import contextlib
 import gzip
 import threading
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime, timedelta
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
+from datetime import UTC, date, datetime, timedelta
 from typing import Any
 
 import msgspec
@@ -18,94 +24,179 @@ from psycopg import sql
 
 from appliance.audit.chain import StoredColumns
 from appliance.audit.segments import SegmentError, SegmentReader
-from rosrv_fleet.database import Connection, Database, migrate
-from rosrv_fleet.robots import EnrolmentError, Robots
+from rosrv_fleet.config import FleetConfig
+from rosrv_fleet.database import IndexDatabase, migrate
+from rosrv_fleet.failures import failure_of
+from rosrv_fleet.robots import Robot, Robots
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.workers import Workers
 
-_BATCH = 256
+LANES = ("pending", "large")
+"""The markers of waiting segments; segments with different markers are indexed in parallel."""
 _IDLE_SECONDS = 1.0
 _PAUSE_SECONDS = 5.0
 _SECOND = 1_000_000_000
 _COLUMNS = ("day", "robot", "log", *StoredColumns._fields, "who")
-_UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, EnrolmentError, msgspec.MsgspecError)
+_LONGEST_ID, _LONGEST_NAME = 64, 512  # characters: a row of an index of PostgreSQL has at most 2,704 bytes
+_WHOLE = {"reason", "detail"}  # not in such an index
+_UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, ValueError)
+_UNSTORABLE = (psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded)
+NOT_INDEXABLE = (*_UNREADABLE, *_UNSTORABLE)
+"""The errors of a segment that the index cannot have; the store keeps it."""
+_MOST_KILLED = 3  # workers that one segment may cost
+_PARTITION_LOCK = (
+    0x726F7370  # of the transactions that make partitions: the second of two with one name would fail
+)
 _log = structlog.get_logger()
 
 
 class Indexer:
-    """The indexer of a store: `index` for one segment, `run` for all that wait, until `stop`."""
+    """The indexer of a store: `run` a lane until `stop`; `index` one segment."""
 
-    def __init__(self, store: SegmentStore, robots: Robots, database: Database, segment_bytes: int) -> None:
+    def __init__(self, store: SegmentStore, robots: Robots, workers: Workers, config: FleetConfig) -> None:
         self._store = store
         self._robots = robots
-        self._database = database
-        self._segment_bytes = segment_bytes
+        self._workers = workers
+        self._config = config
         self._ending = threading.Event()
-        self._wake = threading.Event()
-        self.trouble: str | None = "the index was not reached yet"
+        self._wake = {lane: threading.Event() for lane in LANES}
+        self._failures: dict[str, str | None] = dict.fromkeys(LANES, "the index was not reached yet")
+        self._damage = ""
+        self._killed = Counter[SegmentPlace]()
+
+    @property
+    def trouble(self) -> str | None:
+        """Return the reason why segments are not indexed; None: all are indexed, or will be soon."""
+        failures = [reason for reason in self._failures.values() if reason is not None]
+        if failures:
+            return failures[0]
+        return self._damage if self._damage and any(map(self._is_damaged, self._robots.known())) else None
+
+    def _is_damaged(self, robot: str) -> bool:
+        return bool(self._store.marked("damaged", robot, 1))
 
     def wake(self) -> None:
         """Note that a segment waits."""
-        self._wake.set()
+        for waking in self._wake.values():
+            waking.set()
 
     def stop(self) -> None:
         """End `run` after the present segment."""
         self._ending.set()
-        self._wake.set()
+        self.wake()
 
-    def run(self) -> None:
-        """Index what waits, until `stop`; a database that is down is tried again."""
+    def run(self, lane: str) -> None:
+        """Index what waits in a lane, until `stop`; a database that is down is tried again."""
         while not self._ending.is_set():
-            self._wake.clear()
+            self._wake[lane].clear()
             try:
-                if self.trouble is not None:
-                    with self._database.writing() as connection:
+                if self._failures[lane] is not None:
+                    with psycopg.connect(self._config.database, connect_timeout=5) as connection:
                         migrate(connection)
-                more = self.step()
-            except psycopg.Error as error:
-                self._failed(f"the database: {str(error).strip() or type(error).__name__}")
+                more = self.step(lane)
+            except Exception as error:  # noqa: BLE001  after any failure, segments are indexed later
+                if not self._ending.is_set():
+                    self._failed(lane, failure_of(error))
                 self._ending.wait(_PAUSE_SECONDS)
                 continue
             if not more:
-                self._wake.wait(_IDLE_SECONDS if self.trouble is None else _PAUSE_SECONDS)
+                self._wake[lane].wait(_IDLE_SECONDS)
 
-    def step(self) -> bool:
-        """Index a batch; return whether more may wait. Raises `psycopg.Error`."""
-        waiting = sorted(self._store.marked("pending", _BATCH))
-        damaged = None
-        for place in waiting:
-            if self._ending.is_set():
-                return False
-            try:
-                self.index(place)
-            except FileNotFoundError:
-                self._store.forget_absent(place)
-                continue
-            except _UNREADABLE as error:
-                damaged = f"{self._store.path(place)}: {error}; run 'rosrv-fleet verify {place.robot}'"
-                continue
-            self._store.indexed(place)
-        if damaged is not None:
-            self._failed(damaged)
-        elif self.trouble is not None:
-            _log.info("the index is complete again")
-            self.trouble = None
-        return len(waiting) == _BATCH and damaged is None
+    def step(self, lane: str) -> bool:
+        """Index one segment of each robot that has waiting ones; return whether there were any.
 
-    def _failed(self, reason: str) -> None:
-        if reason != self.trouble:
-            _log.error("segments are stored, but not indexed", reason=reason)
-        self.trouble = reason
-
-    def index(self, place: SegmentPlace) -> None:
-        """Write one segment and its records to the index, unless it has them.
-
-        Raises `psycopg.Error`; for an unreadable segment `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
+        The segments of a robot whose file is unreadable wait. Raises `psycopg.Error`, `BrokenProcessPool` if a worker
+        was killed, and `OSError` of the store or if no worker can be started.
         """
-        received = self._store.received(place)
-        day = datetime.fromtimestamp(received // _SECOND, UTC).date()
-        key = self._robots.named(place.robot).public_key
-        with gzip.open(self._store.path(place)) as file, self._database.writing() as connection:
-            reader = SegmentReader(file, key, self._segment_bytes)
+        found = False
+        killed: BrokenProcessPool | None = None
+        waiting = self._store.robots_with(lane)
+        robots = self._robots.known()  # after: a robot is enrolled before its first segment
+        for robot in waiting:
+            if robot not in robots and robot in self._robots.unreadable:
+                continue
+            for place in self._store.marked(lane, robot, 1):
+                if self._ending.is_set():
+                    return False
+                found = True
+                try:
+                    self._index_in_worker(place, robots.get(robot))
+                except BrokenProcessPool as error:  # perhaps by this segment: the next robot has its turn
+                    killed = error
+        if killed is not None:
+            raise killed
+        if self._failures[lane] is not None:
+            _log.info("segments are indexed again", lane=lane)
+            self._failures[lane] = None
+        return found
+
+    def _index_in_worker(self, place: SegmentPlace, robot: Robot | None) -> None:
+        if robot is None:
+            self._set_aside(place, "its robot is not enrolled")
+            return
+        work = self._workers.submit(_index_one, self._config, place, robot.public_key)
+        try:
+            work.result()
+        except FileNotFoundError:
+            self._store.forget_absent(place)
+        except NOT_INDEXABLE as error:
+            self._set_aside(place, str(error).strip().partition("\n")[0])
+        except BrokenProcessPool:
+            self._killed[place] += 1
+            if self._killed[place] < _MOST_KILLED:
+                raise
+            self._set_aside(place, f"{_MOST_KILLED} workers ended while they indexed it")
+        except (psycopg.Error, OSError, CancelledError):  # not the segment's fault
+            raise
+        except Exception as error:  # noqa: BLE001  a defect, or no memory, must not delay other segments
+            self._set_aside(place, failure_of(error))
+        else:
+            self._store.indexed(place)
+            self._killed.pop(place, None)
+
+    def _set_aside(self, place: SegmentPlace, reason: str) -> None:
+        self._damage = f"{self._store.path(place)}: {reason}; run 'rosrv-fleet verify {place.robot}'"
+        _log.error("a segment is stored, but cannot be indexed", reason=self._damage)
+        self._store.set_aside(place)
+        self._killed.pop(place, None)
+
+    def _failed(self, lane: str, reason: str) -> None:
+        if reason != self._failures[lane]:
+            _log.error("segments are stored, but not indexed", reason=reason)
+        self._failures[lane] = reason
+
+
+_database: IndexDatabase | None = None  # of this worker: a connection for all its segments
+
+
+def _index_one(config: FleetConfig, place: SegmentPlace, key: bytes) -> None:
+    """Index a segment, in a worker. Raises what `index` raises."""
+    global _database  # noqa: PLW0603  a worker has nothing else that lives as long
+    if _database is None:
+        _database = IndexDatabase(
+            config.database, connections=1, statement_seconds=config.limits.search_seconds
+        )
+        _database.open()
+    store = SegmentStore(config.data, config.limits.reserve_bytes)
+    index(_database, store, place, key, config)
+
+
+def index(
+    database: IndexDatabase, store: SegmentStore, place: SegmentPlace, key: bytes, config: FleetConfig
+) -> bool:
+    """Write one segment and its records to the index, unless they are there; return whether.
+
+    A segment of a day that the index does not keep is not written. Raises `psycopg.Error`; for an unreadable segment
+    `OSError`, `EOFError`, `zlib.error` and `SegmentError`.
+    """
+    received = store.received(place)
+    day = datetime.fromtimestamp(received // _SECOND, UTC).date()
+    if not config.retention.keeps(day):
+        return False
+    make_partition(database, day)
+    try:
+        with gzip.open(store.path(place)) as file, database.writing() as connection:
+            reader = SegmentReader(file, key, config.limits.segment_bytes)
             begin, end = reader.header.start[0], reader.header.end.sequence
             inserted = connection.execute(
                 "INSERT INTO segment (robot, log, number, hash, first, last, received, day)"
@@ -113,10 +204,7 @@ class Indexer:
                 (*place, begin + 1, end, received, day),
             ).fetchone()
             if inserted is None:
-                return
-            _make_partition(
-                connection, f"record_{day:%Y%m%d}", day.isoformat(), (day + timedelta(1)).isoformat()
-            )
+                return False
             statement = sql.SQL("COPY record ({}) FROM STDIN").format(
                 sql.SQL(", ").join(map(sql.Identifier, _COLUMNS))
             )
@@ -129,28 +217,49 @@ class Indexer:
                 " WHERE robot = %s AND log = %s AND number = %s AND hash = %s",
                 (summary.first_time, summary.last_time, *place),
             )
+            return True
+    except psycopg.errors.CheckViolation:
+        if config.retention.keeps(day):
+            raise
+        return False  # the day ended, and retention dropped its partition in between
 
 
-def _make_partition(connection: Connection, name: str, begin: str, end: str) -> None:
-    found = connection.execute("SELECT to_regclass(%s)", (name,)).fetchone()
-    if found is not None and found[0] is not None:
-        return
-    with contextlib.suppress(psycopg.errors.DuplicateTable), connection.transaction():
+def make_partition(database: IndexDatabase, day: date) -> None:
+    """Make the partition of a day unless it exists. Raises `psycopg.Error`.
+
+    It is attached after it was made, so neither it nor a search waits for the other.
+    """
+    name = f"record_{day:%Y%m%d}"
+    with database.writing() as connection:
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (_PARTITION_LOCK,))
+        found = connection.execute("SELECT to_regclass(%s)", (name,)).fetchone()
+        if found is not None and found[0] is not None:
+            return
+        table = sql.Identifier(name)
+        connection.execute(sql.SQL("CREATE TABLE {} (LIKE record INCLUDING CONSTRAINTS)").format(table))
         connection.execute(
-            sql.SQL("CREATE TABLE {} PARTITION OF record FOR VALUES FROM ({}) TO ({})").format(
-                sql.Identifier(name), sql.Literal(begin), sql.Literal(end)
+            sql.SQL("ALTER TABLE record ATTACH PARTITION {} FOR VALUES FROM ({}) TO ({})").format(
+                table, sql.Literal(day.isoformat()), sql.Literal((day + timedelta(1)).isoformat())
             )
         )
 
 
 def rows(records: Iterable[StoredColumns], day: str, place: SegmentPlace) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of records. PostgreSQL cannot store NUL: the index shows it as U+2400, the segment has it."""
+    """Yield the rows of records, as PostgreSQL can store them; the segment has the complete ones.
+
+    The index shows NUL as U+2400, and the beginning of names that are too long for it.
+    """
     for columns in records:
         detail = columns.detail.decode()
         who = msgspec.json.decode(columns.detail).get("who")
-        values = (*columns[:-1], detail, who if isinstance(who, str) else None)
-        yield (day, place.robot, place.log, *(_storable(value) for value in values))
+        values = columns._replace(detail=detail)._asdict() | {"who": who if isinstance(who, str) else None}  # type: ignore[arg-type]  # text here
+        yield (day, place.robot, place.log, *(_storable(name, value) for name, value in values.items()))
 
 
-def _storable(value: Any) -> Any:
-    return value.replace("\0", "\u2400") if isinstance(value, str) and "\0" in value else value
+def _storable(name: str, value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    longest = len(value) if name in _WHOLE else _LONGEST_ID if name == "id" else _LONGEST_NAME
+    if len(value) > longest:
+        value = value[: longest - 1] + "…"
+    return value.replace("\0", "\u2400") if "\0" in value else value

@@ -1,8 +1,11 @@
-"""Write lines to standard output."""
+"""Write lines to standard output, and the log to standard error."""
 
 import json
+import logging
+import sys
 from typing import Any
 
+import structlog
 import typer
 
 from appliance.audit.record_format import printable
@@ -16,3 +19,13 @@ def say(line: str) -> None:
 def say_json(fields: dict[str, Any]) -> None:
     """Write one object on one line."""
     typer.echo(json.dumps(fields))
+
+
+def configure_log() -> None:
+    """Log to standard error. Tracebacks never show local variables, because a key or a password might be among them."""
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    *processors, _renderer = structlog.get_config()["processors"]
+    renderer = structlog.dev.ConsoleRenderer(
+        colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+    )
+    structlog.configure([*processors, renderer], logger_factory=structlog.PrintLoggerFactory(sys.stderr))

@@ -1,11 +1,10 @@
 """Accept segments from robots: bounded, verified, stored, and only then answered with a signed receipt."""
 
 import asyncio
-import gzip
+import math
 import time
-import zlib
-from collections import deque
 from collections.abc import AsyncIterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import IO, Annotated
@@ -16,15 +15,17 @@ from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi import Path as PathParameter
 from starlette.requests import ClientDisconnect
 
-from appliance.audit.segments import SegmentError, SegmentReader
 from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from rosrv_fleet.access import robot_of
-from rosrv_fleet.collector import Collector
+from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector
+from rosrv_fleet.quotas import OverQuotaError
 from rosrv_fleet.robots import Robot
-from rosrv_fleet.segment_store import SegmentPlace, StoreFullError
+from rosrv_fleet.segment_check import SegmentVerdict, check_segment
+from rosrv_fleet.segment_store import NotStorableError, SegmentPlace, StoreFullError
 
-_DAY_SECONDS = 86_400.0
+_SHORT_SECONDS = 0.25
+_NOT_THE_ROBOT = (400, 503)  # the connection ended, or the collector failed: no reason for a pause
 _log = structlog.get_logger()
 LogId = Annotated[str, PathParameter(pattern="^[0-9a-f]{32}$")]
 SegmentNumber = Annotated[int, PathParameter(ge=1, lt=10**18)]
@@ -43,11 +44,12 @@ def push_router(collector: Collector) -> APIRouter:
     ) -> Response:
         """Return the newest stored checkpoint of the robot's log with a number up to `upto`; number 0: none.
 
-        `hashes` has more than one hash if the robot signed several checkpoints with this number.
+        `hashes` has more than one hash if the robot signed several checkpoints with this number, and none if the disk
+        has damaged the segment; then the robot sends it again.
         """
         found = collector.store.head(robot.name, log, upto)
         same = [] if found is None else collector.store.numbered(robot.name, log, found.number)
-        hashes = [checkpoint_hash(collector.store.header(one).end.text()) for one in same]
+        hashes = [checkpoint_hash(header.end.text()) for header in collector.store.headers(same)]
         fields = {"robot": robot.name, "log": log, "number": found.number if found else 0, "hashes": hashes}
         return Response(msgspec.json.encode(fields), media_type="application/json")
 
@@ -70,17 +72,30 @@ def push_router(collector: Collector) -> APIRouter:
 
 
 def _later(status: int, detail: str, seconds: float) -> HTTPException:
-    return HTTPException(status, detail, {"Retry-After": str(max(1, round(seconds)))})
+    return HTTPException(status, detail, {"Retry-After": str(max(1, math.ceil(seconds)))})
+
+
+class _Cost(msgspec.Struct):
+    """The cost of an upload: compressed and uncompressed bytes, and seconds of processor time."""
+
+    received: int = 0
+    unpacked: int = 0
+    seconds: float = 0.0
 
 
 class _Uploads:
-    """The uploads at work: one for each robot, a limited number together, and a day's bytes for each robot."""
+    """The running uploads: at most one for each robot, and a limited number in total.
+
+    Verification happens in workers. The first try of each segment is short, so robots with small segments do not wait
+    behind large ones. A segment that takes longer waits for its turn among the large segments.
+    """
 
     def __init__(self, collector: Collector) -> None:
         self._collector = collector
         self._limits = collector.config.limits
         self._busy: set[str] = set()
-        self._stored: dict[str, deque[tuple[float, int]]] = {}
+        self._short = asyncio.Semaphore(SHORT_CHECKS)
+        self._long = asyncio.Semaphore(LONG_CHECKS)
 
     async def accept(self, request: Request, robot: Robot, place: SegmentPlace) -> SegmentReceipt:
         """Return the receipt of a segment that is stored, now or before. Raises `HTTPException` and `OSError`."""
@@ -90,16 +105,26 @@ class _Uploads:
             self._collector.store.check_space()
             if request.headers.get("content-encoding") != "gzip":
                 raise HTTPException(415, "send the segment with Content-Encoding: gzip")
-            self._check_quota(robot)
+            quotas, cost = self._collector.quotas, _Cost()
+            try:
+                quotas.check(robot.name)
+            except OverQuotaError as error:
+                raise _later(429, str(error), error.seconds) from error
             file = self._collector.store.incoming()
             try:
                 with file:
-                    size = await self._receive(request, file)
-                receipt = await asyncio.to_thread(self._keep, Path(file.name), robot, place)
+                    await self._receive(request, file, cost)
+                receipt = await self._keep(Path(file.name), robot, place, cost)
+            except HTTPException as error:
+                if error.status_code not in _NOT_THE_ROBOT:
+                    quotas.refused(robot.name, cost.seconds)
+                raise
+            else:
+                quotas.stored(robot.name)
+                return receipt
             finally:
                 await asyncio.to_thread(Path(file.name).unlink)
-            self._stored.setdefault(robot.name, deque()).append((time.monotonic(), size))
-            return receipt
+                await asyncio.to_thread(quotas.charge, robot.name, cost.received, cost.unpacked)
 
     @asynccontextmanager
     async def _turn(self, robot: Robot) -> AsyncIterator[None]:
@@ -113,23 +138,13 @@ class _Uploads:
         finally:
             self._busy.discard(robot.name)
 
-    def _check_quota(self, robot: Robot) -> None:
-        stored = self._stored.get(robot.name, deque())
-        while stored and time.monotonic() - stored[0][0] > _DAY_SECONDS:
-            stored.popleft()
-        if sum(size for _time, size in stored) >= self._limits.robot_bytes_per_day:
-            raise _later(
-                429, "this robot stored its limit of bytes for a day (limits.robot_bytes_per_day)", 3600
-            )
-
-    async def _receive(self, request: Request, file: IO[bytes]) -> int:
-        """Copy the body to a file within the limits; return its size."""
-        size = 0
+    async def _receive(self, request: Request, file: IO[bytes], cost: _Cost) -> None:
+        """Copy the body to a file within the limits."""
         try:
             async with asyncio.timeout(self._limits.upload_seconds):
                 async for chunk in request.stream():
-                    size += len(chunk)
-                    if size > self._limits.upload_bytes:
+                    cost.received += len(chunk)
+                    if cost.received > self._limits.upload_bytes:
                         raise HTTPException(
                             413, f"a compressed segment has at most {self._limits.upload_bytes} bytes"
                         )
@@ -139,26 +154,52 @@ class _Uploads:
             raise HTTPException(408, f"an upload takes at most {self._limits.upload_seconds:g} s") from error
         except ClientDisconnect as error:
             raise HTTPException(400, "the robot closed the connection") from error
-        return size
 
     def _repeated(self, place: SegmentPlace) -> SegmentReceipt:
         header = self._collector.store.header(place)
         self._collector.store.settle(place, header)
         return self._receipt(place, header.start[0] + 1, header.end.sequence)
 
-    def _keep(self, upload: Path, robot: Robot, place: SegmentPlace) -> SegmentReceipt:
-        try:
-            with gzip.open(upload) as file:
-                summary = SegmentReader(file, robot.public_key, self._limits.segment_bytes).summary()
-        except (SegmentError, EOFError, zlib.error, gzip.BadGzipFile) as error:
-            _log.warning("a segment was refused", robot=robot.name, number=place.number, reason=str(error))
-            raise HTTPException(422, f"not a valid segment of {robot.name}: {error}") from error
+    async def _keep(self, upload: Path, robot: Robot, place: SegmentPlace, cost: _Cost) -> SegmentReceipt:
+        verdict = await self._check(upload, robot, cost)
+        summary = verdict.summary
+        if summary is None:
+            _log.warning(
+                "a segment was refused", robot=robot.name, number=place.number, reason=verdict.reason
+            )
+            raise HTTPException(422, f"not a valid segment of {robot.name}: {verdict.reason}")
         end = summary.header.end
         if (end.log, end.number, summary.name) != (place.log, place.number, place.name):
             raise HTTPException(422, f"its content is segment {end.number} {summary.name} of log {end.log}")
-        self._collector.store.keep(robot.name, upload, summary)
+        try:
+            await asyncio.to_thread(self._collector.store.keep, robot.name, upload, summary, verdict.size)
+        except NotStorableError as error:
+            _log.warning("a segment was refused", robot=robot.name, number=place.number, reason=str(error))
+            raise HTTPException(409, str(error)) from error
         self._collector.indexer.wake()
         return self._receipt(place, summary.first, summary.last)
+
+    async def _check(self, upload: Path, robot: Robot, cost: _Cost) -> SegmentVerdict:
+        longest = self._limits.check_seconds
+        verdict = await self._checked(self._short, upload, robot, min(_SHORT_SECONDS, longest), cost)
+        if verdict.late and longest > _SHORT_SECONDS:
+            verdict = await self._checked(self._long, upload, robot, longest, cost)
+        return verdict
+
+    async def _checked(
+        self, turn: asyncio.Semaphore, upload: Path, robot: Robot, seconds: float, cost: _Cost
+    ) -> SegmentVerdict:
+        async with turn:
+            work = self._collector.workers.submit(
+                check_segment, upload, robot.public_key, self._limits.segment_bytes, seconds
+            )
+            try:
+                verdict = await asyncio.wrap_future(work)
+            except BrokenProcessPool as error:
+                raise _later(503, "the check of the segment ended early: send it again", 5) from error
+        cost.unpacked += verdict.size
+        cost.seconds += verdict.seconds
+        return verdict
 
     def _receipt(self, place: SegmentPlace, first: int, last: int) -> SegmentReceipt:
         return SegmentReceipt(

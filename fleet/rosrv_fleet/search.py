@@ -1,5 +1,9 @@
 """Search the index of all robots."""
 
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import msgspec
@@ -10,7 +14,7 @@ from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
 from appliance.audit.query import FilterError
 from appliance.audit.record_format import LogEntry, as_object
-from rosrv_fleet.database import Database
+from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.search_sql import FleetFilter, SearchCursor, days_statement, parse_cursor, search_statement
 
 LARGEST_FLEET_PAGE = 1000
@@ -22,6 +26,39 @@ class SearchTooLongError(Exception):
 
 class IndexDownError(Exception):
     """The database cannot be reached, or all connections are in use."""
+
+
+class TooManySearchesError(Exception):
+    """Too many searches run at the same time, with this token or in total."""
+
+
+class Searches:
+    """The database of searches, and the limit of simultaneous searches: half of it with one token. Thread-safe."""
+
+    def __init__(self, database: IndexDatabase, most: int) -> None:
+        self.database = database
+        self._most = most
+        self._lock = threading.Lock()
+        self._running: Counter[str] = Counter()
+
+    @contextmanager
+    def turn(self, token: str) -> Iterator[IndexDatabase]:
+        """Count a search with a token during a block. Raises `TooManySearchesError`."""
+        with self._lock:
+            if self._running[token] >= max(1, self._most // 2):
+                raise TooManySearchesError(
+                    f"the token {token} has {self._running[token]} searches at work: wait for them"
+                )
+            if self._running.total() >= self._most:
+                raise TooManySearchesError(f"{self._most} searches are at work: try again")
+            self._running[token] += 1
+        try:
+            yield self.database
+        finally:
+            with self._lock:
+                self._running[token] -= 1
+                if not self._running[token]:
+                    del self._running[token]
 
 
 class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
@@ -36,7 +73,7 @@ class FleetPage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def search_fleet(
-    database: Database, wanted: FleetFilter, cursor: str | None, limit: int, waiting: int
+    database: IndexDatabase, wanted: FleetFilter, cursor: str | None, limit: int, waiting: int
 ) -> FleetPage:
     """Return a page of at most `limit` records.
 
@@ -62,7 +99,7 @@ def search_fleet(
 
 
 def _rows(
-    database: Database, wanted: FleetFilter, after: SearchCursor | None, limit: int
+    database: IndexDatabase, wanted: FleetFilter, after: SearchCursor | None, limit: int
 ) -> list[tuple[Any, ...]]:
     with database.reading() as connection:
         of_days, days = days_statement(wanted.record), None

@@ -1,4 +1,4 @@
-"""Search over REST: the parameters are the words of `rosrv audit search`, and `robot`."""
+"""Search over REST: the parameters are the options of `rosrv audit search`, and `robot`."""
 
 import functools
 from typing import Annotated, Any
@@ -11,9 +11,15 @@ from appliance.audit.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.access import holder_of
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
+from rosrv_fleet.search import (
+    LARGEST_FLEET_PAGE,
+    IndexDownError,
+    SearchTooLongError,
+    TooManySearchesError,
+    search_fleet,
+)
 from rosrv_fleet.search_sql import FleetFilter
-from rosrv_fleet.tokens import FleetRole
+from rosrv_fleet.tokens import FleetRole, OperatorToken
 
 MOST_WAITING = 1000
 
@@ -30,19 +36,23 @@ def filter_asked(**words: Any) -> Filter:
 def search_router(collector: Collector) -> APIRouter:
     """Return the route of searches."""
     router = APIRouter()
-    viewer = [Depends(holder_of(collector.tokens, FleetRole.VIEWER))]
+    Viewer = Annotated[OperatorToken, Depends(holder_of(collector.tokens, FleetRole.VIEWER))]  # noqa: N806  a type
 
-    @router.get("/v1/search", dependencies=viewer)
+    @router.get("/v1/search")
     def search(
+        viewer: Viewer,
         wanted: Annotated[Filter, Depends(filter_asked)],
         robot: Annotated[str | None, Query(description="name of the robot; a glob")] = None,
         cursor: Annotated[str | None, Query(max_length=1024)] = None,
         limit: Annotated[int, Query(ge=1, le=LARGEST_FLEET_PAGE)] = 100,
     ) -> Response:
         """Return the records of all robots that match, newest first."""
-        waiting = len(collector.store.marked("pending", MOST_WAITING))
         try:
-            page = search_fleet(collector.database, FleetFilter(robot, wanted), cursor, limit, waiting)
+            with collector.searches.turn(viewer.name) as database:
+                waiting = collector.store.waiting(MOST_WAITING)
+                page = search_fleet(database, FleetFilter(robot, wanted), cursor, limit, waiting)
+        except TooManySearchesError as error:
+            raise HTTPException(429, str(error), {"Retry-After": "2"}) from error
         except FilterError as error:
             raise HTTPException(422, str(error)) from error
         except SearchTooLongError as error:

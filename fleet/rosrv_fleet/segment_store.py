@@ -1,24 +1,37 @@
-"""Store segments as files, before anything else knows of them.
+"""Store segments as files, before any other part of the collector uses them.
 
     segments/ROBOT/LOG/BUCKET/NUMBER-NAME.ndjson.gz    a segment; a bucket has a thousand numbers
-    pending/ROBOT~LOG~NUMBER~NAME                      the same file (a link): the index does not have it yet
-    gaps/ROBOT~LOG~NUMBER~NAME                         the segment does not follow a stored one
-    forks/ROBOT~LOG~NUMBER~NAME                        another segment has the same number
+    newest/ROBOT                                       LOG~NUMBER~NAME: the robot's newest segment
+    removed/ROBOT/LOG.json                             the segments that retention removed (`RemovalNote`)
+    KIND/ROBOT/LOG~NUMBER~NAME                         a marker of a segment; the kinds:
+        pending, large     the index does not have it yet
+        damaged            the index could not have it; with `large`: it is tried again
+        gaps               it does not follow a stored one
+        forks              another segment has the same number
     incoming/                                          uploads that are not verified
 
 Invariants:
-1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes.
-2. A crash leaves a segment either stored or absent. What refers to it is written first, and repaired by `keep`.
+1. A stored segment was verified, and is on the disk with its folder before `keep` returns. It never changes; if the
+   disk has damaged it, its robot's next upload of the same segment replaces it.
+2. A crash leaves a segment either stored or absent. Everything that refers to the segment is written first, and
+   repaired by `keep`.
 3. The state that uploads need is in names: no database, and no memory that grows with the number of segments.
+4. Work for one robot does not grow with the data of others, and the names that a robot can choose are limited
+   (`_MOST_LOGS`, `_MOST_BUCKETS`, `_MOST_FORKS`): it can neither slow down nor hide others.
 """
 
+import contextlib
 import errno
 import gzip
+import itertools
 import os
 import re
 import shutil
+import sys
 import tempfile
 import threading
+import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -26,17 +39,50 @@ from typing import IO, NamedTuple
 import msgspec
 
 from appliance.audit.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
+from appliance.base.atomic_files import write_whole
 from rosrv_fleet.robots import make_folder
+from rosrv_fleet.stored_files import read_stored
 
 _BUCKET = 1000
 _DIGITS = 18
+_MOST_ATTEMPTS = 100  # to make a marker in a folder that another thread removes when it is empty
+_MOST_LOGS = 1000
+_MOST_BUCKETS = 10_000
+_MOST_FORKS = 16
+_LARGE_BYTES = 4 << 20
+_KINDS = ("pending", "large", "damaged", "gaps", "forks")
+_DAMAGED = (gzip.BadGzipFile, EOFError, zlib.error, ValueError)
 _LOG = re.compile("[0-9a-f]{32}")
 _FILE = re.compile(r"(\d{18})-([0-9a-f]{64})\.ndjson\.gz")
-_MARK = re.compile(r"([a-z0-9._-]+)~([0-9a-f]{32})~(\d{18})~([0-9a-f]{64})")
+_MARK = re.compile(r"([0-9a-f]{32})~(\d{18})~([0-9a-f]{64})")
 
 
 class StoreFullError(OSError):
     """The disk has too little free space for more segments."""
+
+
+class NotStorableError(ValueError):
+    """The store cannot keep a valid segment at its place; the message has the reason."""
+
+
+class RemovalNote(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The segments at the beginning of a log that retention removed.
+
+    `ends` are the headers of the last removed number, `time` is that of the last removal (nanoseconds since the epoch),
+    `by` the setting. `segments`, `gaps` and `forks` count what was removed since the log began.
+    """
+
+    ends: list[SegmentHeader]
+    time: int
+    by: str
+    segments: int
+    gaps: int
+    forks: int
+
+    @property
+    def number(self) -> int:
+        """Return the last removed number."""
+        return self.ends[0].end.number
 
 
 class SegmentPlace(NamedTuple):
@@ -49,20 +95,24 @@ class SegmentPlace(NamedTuple):
 
     @property
     def mark(self) -> str:
-        """Return the name of its markers."""
-        return f"{self.robot}~{self.log}~{self.number:0{_DIGITS}}~{self.name}"
+        """Return the name of its markers in the robot's folders."""
+        return f"{self.log}~{self.number:0{_DIGITS}}~{self.name}"
 
 
 class SegmentStore:
     """The segments of a collector, in a folder. Thread-safe; one process writes."""
 
     def __init__(self, folder: Path, reserve: int) -> None:
-        """Prepare the folders, and remove unfinished uploads. `reserve` bytes of the disk stay free."""
+        """Prepare the folders. `reserve` bytes of the disk stay free."""
         self._folder = folder
         self._reserve = reserve
-        self._lock = threading.Lock()
-        for name in ("segments", "pending", "gaps", "forks", "incoming"):
+        self._locks: dict[str, threading.Lock] = {}
+        for name in ("segments", "newest", "removed", "incoming", *_KINDS):
             make_folder(folder / name)
+
+    def _lock(self, robot: str) -> threading.Lock:
+        """Return the lock of a robot's files."""
+        return self._locks.setdefault(robot, threading.Lock())
 
     def remove_unfinished(self) -> None:
         """Remove the uploads that a killed collector left; no other may run."""
@@ -88,63 +138,141 @@ class SegmentStore:
         return self._folder / "segments" / place.robot / place.log / bucket / name
 
     def has(self, place: SegmentPlace) -> bool:
-        """Whether the segment is stored."""
-        return self.path(place).exists()
+        """Whether the segment is stored, and its header can be read. Raises `OSError`."""
+        return self.path(place).exists() and self._readable(place) is not None
 
     def header(self, place: SegmentPlace) -> SegmentHeader:
-        """Return the header of a stored segment. Raises `OSError`, `EOFError` and `msgspec.MsgspecError`."""
+        """Return the header of a stored segment. Raises `OSError`, `EOFError`, `zlib.error` and `ValueError`."""
         with gzip.open(self.path(place)) as file:
             return msgspec.json.decode(file.readline(LONGEST_LINE), type=SegmentHeader)
 
-    def keep(self, robot: str, upload: Path, summary: SegmentSummary) -> SegmentPlace:
-        """Store a verified upload; when this returns, the segment is on the disk. Raises `OSError`."""
+    def _readable(self, place: SegmentPlace) -> SegmentHeader | None:
+        """Return the header of a stored segment; None, and the indexer reports it, if the disk has damaged it."""
+        try:
+            return self.header(place)
+        except _DAMAGED:
+            self._touch("large", place)
+            return None
+
+    def headers(self, places: list[SegmentPlace]) -> list[SegmentHeader]:
+        """Return the readable headers of stored segments. Raises `OSError`."""
+        return [header for header in map(self._readable, places) if header is not None]
+
+    def keep(self, robot: str, upload: Path, summary: SegmentSummary, size: int) -> SegmentPlace:
+        """Store a verified upload of `size` uncompressed bytes; when this returns, the segment is on the disk.
+
+        Raises `NotStorableError` and `OSError`.
+        """
         header = summary.header
         place = SegmentPlace(robot, header.end.log, header.end.number, summary.name)
         path = self.path(place)
-        _sync(upload)
-        with self._lock:
-            if not path.exists():
+        sync(upload)
+        with self._lock(robot):
+            if not self.has(place):
+                path.unlink(missing_ok=True)  # damaged
+                self._check(place)
                 self._make_folders(path.parent)
-                self._mark(place, header)
+                self._mark(place, header, "large" if size > _LARGE_BYTES else "pending")
                 os.link(upload, path)
             self._settle(place, header)
+            self._note_newest(place)
         return place
+
+    def _check(self, place: SegmentPlace) -> None:
+        """Raise `NotStorableError` for a segment that was removed, or is one too many."""
+        note = self.removal(place.robot, place.log)
+        if note is not None and place.number <= note.number:
+            raise NotStorableError(
+                f"the segments up to {note.number} of this log were removed ({note.by}); if the robot was restored from"
+                " an older copy, begin a new log"
+            )
+        if len(self.numbered(place.robot, place.log, place.number)) >= _MOST_FORKS:
+            raise NotStorableError(f"{_MOST_FORKS} segments have the number {place.number}")
+        bucket = self.path(place).parent
+        for folder, most, what in ((bucket, _MOST_BUCKETS, "ranges"), (bucket.parent, _MOST_LOGS, "logs")):
+            if not folder.exists() and len(_folders(folder.parent)) >= most:
+                raise NotStorableError(f"{folder.parent} has {most} {what}: remove those that nobody needs")
+
+    def _note_newest(self, place: SegmentPlace) -> None:
+        newest = self.newest(place.robot)
+        file = self._folder / "newest" / place.robot
+        if newest is not None and newest[1].log == place.log and newest[1].number > place.number:
+            os.utime(file)
+            return
+        making = self._folder / "incoming" / f"{place.robot}.newest"
+        making.write_text(place.mark, encoding="ascii")
+        making.rename(file)
+
+    def newest(self, robot: str) -> tuple[int, SegmentPlace] | None:
+        """Return when a robot's last segment arrived (nanoseconds since the epoch), and its newest; None: none yet."""
+        try:
+            with (self._folder / "newest" / robot).open(encoding="ascii", errors="replace") as file:
+                found = _MARK.fullmatch(file.read())
+                arrived = os.fstat(file.fileno()).st_mtime_ns
+        except FileNotFoundError:
+            return None
+        return None if found is None else (arrived, _place(robot, found))
 
     def settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
         """Complete a stored segment that a killed collector may have left half done. Raises `OSError`."""
-        with self._lock:
+        with self._lock(place.robot):
             self._settle(place, header)
 
     def _settle(self, place: SegmentPlace, header: SegmentHeader) -> None:
-        _sync(self.path(place).parent)
+        sync(self.path(place).parent)
         for following in self.numbered(place.robot, place.log, place.number + 1):
-            if self.header(following).follows(header):
-                (self._folder / "gaps" / following.mark).unlink(missing_ok=True)
+            found = self._readable(following)
+            if found is not None and found.follows(header):
+                self._unmark("gaps", following)
 
     def _make_folders(self, bucket: Path) -> None:
         for folder in (bucket.parent.parent, bucket.parent, bucket):
             if not folder.exists():
                 make_folder(folder)
-                _sync(folder.parent)
+                sync(folder.parent)
 
-    def _mark(self, place: SegmentPlace, header: SegmentHeader) -> None:
+    def _mark(self, place: SegmentPlace, header: SegmentHeader, waiting: str) -> None:
         """Write the markers that the segment needs, on the disk."""
         if not self._follows_a_stored_one(place, header):
             self._touch("gaps", place)
-        for other in self.numbered(place.robot, place.log, place.number):
-            for one in (other, place):
-                self._touch("forks", one)
-        self._touch("pending", place)
+        others = self.numbered(place.robot, place.log, place.number)
+        for one in [*others, place] if others else []:
+            self._touch("forks", one)
+        self._touch(waiting, place)
 
     def _touch(self, kind: str, place: SegmentPlace) -> None:
-        (self._folder / kind / place.mark).touch(mode=0o600)
-        _sync(self._folder / kind)
+        folder = self._folder / kind / place.robot
+        for _attempt in range(_MOST_ATTEMPTS):
+            if not folder.exists():
+                make_folder(folder)
+                sync(folder.parent)
+            # `_unmark` may have just removed the empty folder.
+            with contextlib.suppress(FileNotFoundError):
+                (folder / place.mark).touch(mode=0o600)
+                sync(folder)
+                return
+        raise OSError(errno.EAGAIN, "another thread removed the folder each time", str(folder))
+
+    def _unmark(self, kind: str, place: SegmentPlace) -> bool:
+        """Remove a marker, and the robot's folder if it is empty; return whether there was a marker."""
+        marker = self._folder / kind / place.robot / place.mark
+        try:
+            marker.unlink()
+        except FileNotFoundError:
+            return False
+        with contextlib.suppress(OSError):  # other markers are in it
+            marker.parent.rmdir()
+        return True
 
     def _follows_a_stored_one(self, place: SegmentPlace, header: SegmentHeader) -> bool:
         if place.number == 1 or (header.begin is None and self.head(place.robot, place.log) is None):
             return True
+        note = self.removal(place.robot, place.log)
+        ends = note.ends if note is not None and note.number == place.number - 1 else []
         before = self.numbered(place.robot, place.log, place.number - 1)
-        return any(header.follows(self.header(one)) for one in before)
+        return any(map(header.follows, ends)) or any(
+            found is None or header.follows(found) for found in map(self._readable, before)
+        )
 
     def numbered(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
         """Return the stored segments with this number: one, unless the robot signed two histories."""
@@ -175,35 +303,133 @@ class SegmentStore:
         """Return when the segment arrived, in nanoseconds since the epoch. Raises `OSError`."""
         return self.path(place).stat().st_mtime_ns
 
-    def marked(self, kind: str, most: int) -> list[SegmentPlace]:
-        """Return at most `most` segments with markers of a kind (`pending`, `gaps`, `forks`), in any order."""
+    def marked(self, kind: str, robot: str, most: int) -> list[SegmentPlace]:
+        """Return at most `most` segments of a robot with markers of a kind, in any order."""
         found = []
-        with os.scandir(self._folder / kind) as entries:
+        with contextlib.suppress(FileNotFoundError), os.scandir(self._folder / kind / robot) as entries:
             for entry in entries:
                 match = _MARK.fullmatch(entry.name)
                 if match is not None:
-                    found.append(SegmentPlace(match[1], match[2], int(match[3]), match[4]))
+                    found.append(_place(robot, match))
                 if len(found) == most:
                     break
         return found
 
+    def robots_with(self, kind: str) -> list[str]:
+        """Return the robots with markers of a kind."""
+        return sorted(os.listdir(self._folder / kind))  # noqa: PTH208  names, not paths
+
+    def waiting(self, most: int) -> int:
+        """Return the number of segments that the index does not have, counted up to `most`."""
+        found = set[SegmentPlace]()  # those that are tried again have two markers
+        for kind in ("pending", "large", "damaged"):
+            for robot in self.robots_with(kind):
+                found.update(self.marked(kind, robot, most))
+                if len(found) >= most:
+                    return most
+        return len(found)
+
     def indexed(self, place: SegmentPlace) -> None:
-        """Note that the index has a segment."""
-        (self._folder / "pending" / place.mark).unlink(missing_ok=True)
+        """Note that the index has a segment, or does not need it."""
+        for kind in ("pending", "large", "damaged"):
+            self._unmark(kind, place)
+
+    def set_aside(self, place: SegmentPlace) -> None:
+        """Note that the index cannot have a segment. Raises `OSError`."""
+        self._touch("damaged", place)
+        for kind in ("pending", "large"):
+            self._unmark(kind, place)
+
+    def try_again(self) -> None:
+        """Let the segments wait for the index that it could not have before; they stay reported. Raises `OSError`."""
+        for robot in self.robots_with("damaged"):
+            for place in self.marked("damaged", robot, sys.maxsize):
+                self._touch("large", place)
 
     def forget_absent(self, place: SegmentPlace) -> None:
         """Remove the marker of a segment that a crash left unstored; the robot pushes it again."""
-        with self._lock:  # `keep` writes the marker before the segment
-            if not self.has(place):
+        with self._lock(place.robot):  # `keep` writes the marker before the segment
+            if not self.path(place).exists():
                 self.indexed(place)
 
-    def wait_for_index(self, place: SegmentPlace) -> None:
-        """Mark a stored segment for the index again. Raises `OSError`."""
-        self._touch("pending", place)
+    def removal(self, robot: str, log: str) -> RemovalNote | None:
+        """Return the note of the segments of a log that retention removed; None: none were.
+
+        Raises `OSError`.
+        """
+        try:
+            return read_stored(self._note(robot, log), RemovalNote)
+        except FileNotFoundError:
+            return None
+
+    def _note(self, robot: str, log: str) -> Path:
+        return self._folder / "removed" / robot / f"{log}.json"
+
+    def prune(self, robot: str, log: str, before: int, by: str) -> int:
+        """Remove the segments at the beginning of a log that arrived before a time (ns); return their number.
+
+        The last segment of a log stays. So does every segment that is not in the index yet, with all later ones. Raises
+        `OSError`, `EOFError`, `zlib.error` and `ValueError`.
+        """
+        with self._lock(robot):
+            note = self.removal(robot, log)
+            if note is not None:  # a crash may have left some of the noted segments
+                self._remove(self._up_to(robot, log, note.number))
+            old = self._old(robot, log, before)
+            if not old:
+                return 0
+            last = [one for one in old if one.number == old[-1].number]
+            gaps, forks = (
+                sum((self._folder / kind / robot / one.mark).exists() for one in old)
+                for kind in ("gaps", "forks")
+            )
+            made = RemovalNote(
+                ends=[self.header(one) for one in last], time=time.time_ns(), by=by,
+                segments=len(old) + (note.segments if note else 0), gaps=gaps + (note.gaps if note else 0),
+                forks=forks + (note.forks if note else 0),
+            )  # fmt: skip
+            file = self._note(robot, log)
+            make_folder(file.parent)
+            sync(file.parent.parent)
+            write_whole(file, msgspec.json.encode(made), 0o600)
+            self._remove(old)
+            return len(old)
+
+    def _old(self, robot: str, log: str, before: int) -> list[SegmentPlace]:
+        """Return the segments of a log, by number, up to the last number that can be removed."""
+        head = self.head(robot, log)
+        found: list[SegmentPlace] = []
+        for place in self.segments(robot, log):
+            waits = any((self._folder / kind / robot / place.mark).exists() for kind in ("pending", "large"))
+            if head is None or place.number >= head.number or waits or self.received(place) >= before:
+                return [one for one in found if one.number < place.number]
+            found.append(place)
+        return found
+
+    def _up_to(self, robot: str, log: str, number: int) -> list[SegmentPlace]:
+        return list(itertools.takewhile(lambda one: one.number <= number, self.segments(robot, log)))
+
+    def _remove(self, places: list[SegmentPlace]) -> None:
+        for place in places:
+            for kind in _KINDS:
+                self._unmark(kind, place)
+            self.path(place).unlink()
+        for bucket in {self.path(place).parent for place in places}:
+            with contextlib.suppress(OSError):  # it has others
+                bucket.rmdir()
+
+
+def _place(robot: str, mark: re.Match[str]) -> SegmentPlace:
+    return SegmentPlace(robot, mark[1], int(mark[2]), mark[3])
 
 
 def _folders(folder: Path) -> list[Path]:
-    return sorted(one for one in folder.iterdir() if one.is_dir()) if folder.is_dir() else []
+    """Return the folders in a folder, sorted; without a call for each, as there may be thousands."""
+    try:
+        with os.scandir(folder) as entries:
+            return [folder / name for name in sorted(one.name for one in entries if one.is_dir())]
+    except FileNotFoundError:
+        return []
 
 
 def _in_bucket(robot: str, log: str, bucket: Path) -> list[SegmentPlace]:
@@ -212,7 +438,8 @@ def _in_bucket(robot: str, log: str, bucket: Path) -> list[SegmentPlace]:
     return [SegmentPlace(robot, log, int(match[1]), match[2]) for match in found]
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Write a file, or the names in a folder, to the disk. Raises `OSError`."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

@@ -4,6 +4,8 @@ The trusted certificates are exactly those of the enrolled robots: no authority 
 """
 
 import asyncio
+import hashlib
+import socket
 import ssl
 from typing import Any
 
@@ -14,10 +16,13 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from rosrv_fleet.access import PEER_CERTIFICATE
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.robots import EnrolmentError, Robot, Robots
+from rosrv_fleet.connections import ClientConnections, listen
+from rosrv_fleet.failures import failure_of
+from rosrv_fleet.robots import Robot, Robots
 from rosrv_fleet.rollouts.service import BundleService
 
 _RELOAD_SECONDS = 1.0
+_CLOSE_SECONDS = 1.0
 _log = structlog.get_logger()
 
 
@@ -35,13 +40,20 @@ class ServerTls:
         )  # a robot's certificate is its own authority
         self._robots = robots
         self._trusted: set[str] = set()
+        self._fingerprints: set[str] = set()
 
     def reload(self) -> None:
         """Trust the robots that were enrolled since; a removed one is refused by each request."""
-        for robot in self._robots.all().values():
+        for robot in self._robots.known().values():
             if robot.removed is None and robot.certificate not in self._trusted:
                 self._trusted.add(robot.certificate)
+                self._fingerprints.add(robot.fingerprint)
                 self._trust(robot)
+
+    def owner(self, certificate: bytes | None) -> str | None:
+        """Return the fingerprint of a robot's certificate (DER); None for any other certificate."""
+        found = None if certificate is None else hashlib.sha256(certificate).hexdigest()
+        return found if found in self._fingerprints else None
 
     def _trust(self, robot: Robot) -> None:
         try:
@@ -50,16 +62,19 @@ class ServerTls:
             _log.error("a certificate cannot be trusted", robot=robot.name, reason=str(error))
 
 
-def _protocol(header_seconds: float) -> type[HttpToolsProtocol]:
+def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -> type[HttpToolsProtocol]:
     """Return the protocol that passes on the client's certificate, and ends connections without a request."""
 
-    class Connection(HttpToolsProtocol):
+    class _Connection(HttpToolsProtocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # asyncio's own type
             super().connection_made(transport)
-            tls = transport.get_extra_info("ssl_object")
-            certificate = None if tls is None else tls.getpeercert(binary_form=True)
+            secured = transport.get_extra_info("ssl_object")
+            certificate = None if secured is None else secured.getpeercert(binary_form=True)
             self.app_state = {**self.app_state, PEER_CERTIFICATE: certificate}
             self._wait_for_headers()
+            number = transport.get_extra_info("socket").fileno()
+            if number < 0 or not table.established(number, tls.owner(certificate)):
+                transport.abort()
 
         def _wait_for_headers(self) -> None:
             self._headers_due = self.loop.call_later(header_seconds, self.transport.close)
@@ -77,7 +92,7 @@ def _protocol(header_seconds: float) -> type[HttpToolsProtocol]:
             self._headers_due.cancel()
             super().connection_lost(exc)
 
-    return Connection
+    return _Connection
 
 
 class _Server(uvicorn.Server):
@@ -97,12 +112,28 @@ class _Server(uvicorn.Server):
             if self._bundles is not None:
                 self._bundles.end_streams()
 
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        ending = asyncio.create_task(self._end_idle())
+        try:
+            await super().shutdown(sockets)
+        finally:
+            ending.cancel()
+
+    async def _end_idle(self) -> None:
+        """End connections without a request: a client that only waits does not answer the end of TLS."""
+        while True:
+            await asyncio.sleep(_CLOSE_SECONDS)
+            for connection in list(self.server_state.connections):
+                assert isinstance(connection, HttpToolsProtocol)  # noqa: S101  for mypy: there are no others
+                if connection.cycle is None or connection.cycle.response_complete:
+                    connection.transport.abort()
+
     async def _watch(self) -> None:
         while True:
             try:
                 self._tls.reload()
-            except (EnrolmentError, OSError) as error:
-                _log.error("the robots cannot be read", reason=str(error))
+            except Exception as error:  # noqa: BLE001  after any failure, it reads them again
+                _log.error("new robots are not trusted yet", reason=failure_of(error))
             await asyncio.sleep(_RELOAD_SECONDS)
 
 
@@ -111,19 +142,18 @@ def serve(collector: Collector) -> None:
     config = collector.config
     tls = ServerTls(str(config.certificate), str(config.key), collector.robots)
     tls.reload()
-    host, port = config.address
+    table = ClientConnections(config.limits)
+    listener = listen(*config.address, table)
     options: dict[str, Any] = {"log_config": None, "access_log": False, "server_header": False}
     settings = uvicorn.Config(
         make_app(collector),
-        host=host,
-        port=port,
-        http=_protocol(config.limits.header_seconds),
+        loop="asyncio",  # the connections are counted by its sockets
+        http=_protocol(config.limits.header_seconds, table, tls),
         ws="none",
-        limit_concurrency=config.limits.connections,
-        timeout_keep_alive=30,
+        timeout_keep_alive=90,  # robots report every 30 s and push every minute: without new handshakes
         timeout_graceful_shutdown=20,
         h11_max_incomplete_event_size=65_536,
         ssl_context_factory=lambda _config, _default: tls.context,
         **options,
     )
-    _Server(settings, tls, collector.bundles).run()
+    _Server(settings, tls, collector.bundles).run([listener])

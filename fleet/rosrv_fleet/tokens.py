@@ -1,4 +1,7 @@
-"""Keep the tokens of operators: only their SHA-256, because a token is random and as long as a key."""
+"""Keep the tokens of operators: only their SHA-256, because a token is random and as long as a key.
+
+Each change is an act (`recorded`).
+"""
 
 import enum
 import hashlib
@@ -10,6 +13,9 @@ from pathlib import Path
 import msgspec
 
 from appliance.base.atomic_files import write_whole
+from rosrv_fleet.acts import recorded
+from rosrv_fleet.robots import changing
+from rosrv_fleet.stored_files import read_stored
 
 _NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
 
@@ -40,45 +46,52 @@ class TokenError(Exception):
     """A token cannot be made or removed; the message has the reason."""
 
 
-class Tokens:
-    """The tokens in a file; changes by another process are noticed at once."""
+class OperatorTokens:
+    """The tokens in a file of the data folder; changes by another process are noticed at once."""
 
     def __init__(self, file: Path) -> None:
         self._file = file
 
     def all(self) -> list[OperatorToken]:
-        """Return the tokens. Raises `OSError` and `msgspec.MsgspecError`."""
+        """Return the tokens. Raises `OSError`."""
         try:
-            return msgspec.json.decode(self._file.read_bytes(), type=list[OperatorToken])
+            return read_stored(self._file, list[OperatorToken])
         except FileNotFoundError:
             return []
 
     def holder(self, token: str) -> OperatorToken | None:
-        """Return the token with this text, or None."""
+        """Return the token with this text, or None. Raises `OSError`."""
         digest = hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()
         return next((one for one in self.all() if secrets.compare_digest(one.hash, digest)), None)
 
     def add(self, name: str, role: FleetRole) -> str:
         """Make a token and return its text, which is stored nowhere. Raises `TokenError` and `OSError`."""
-        tokens = self.all()
         if _NAME.fullmatch(name) is None:
             raise TokenError(
                 f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
             )
-        if any(one.name == name for one in tokens):
-            raise TokenError(f"{name} already has a token; remove it first: rosrv-fleet token remove {name}")
         text = secrets.token_urlsafe(32)
         digest = hashlib.sha256(text.encode()).hexdigest()
-        self._write([*tokens, OperatorToken(name=name, role=role, hash=digest, added=time.time_ns())])
+        made = OperatorToken(name=name, role=role, hash=digest, added=time.time_ns())
+        with changing(self._file.parent):
+            tokens = self.all()
+            if any(one.name == name for one in tokens):
+                raise TokenError(
+                    f"{name} already has a token; remove it first: rosrv-fleet token remove {name}"
+                )
+            with recorded(self._file.parent, "token add", name, role):
+                self._write([*tokens, made])
         return text
 
     def remove(self, name: str) -> None:
         """Remove a token. Raises `TokenError` and `OSError`."""
-        tokens = self.all()
-        left = [one for one in tokens if one.name != name]
-        if len(left) == len(tokens):
-            raise TokenError(f"{name!a} has no token; list them: rosrv-fleet token list")
-        self._write(left)
+        with changing(self._file.parent):
+            tokens = self.all()
+            left = [one for one in tokens if one.name != name]
+            if len(left) == len(tokens):
+                raise TokenError(f"{name!a} has no token; list them: rosrv-fleet token list")
+            with recorded(self._file.parent, "token remove", name):
+                self._write(left)
 
     def _write(self, tokens: list[OperatorToken]) -> None:
         write_whole(self._file, msgspec.json.encode(tokens), 0o600)

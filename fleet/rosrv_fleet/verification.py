@@ -2,18 +2,19 @@
 
 Each segment is read and verified again with the robot's key. A log is complete if its segments form one chain: each
 begins with the checkpoint that ends the one before. The first begins at the log's beginning, or after records whose
-removal by retention the signer signed.
+removal by retention the signer signed, or after the segments that the collector's own retention noted as removed.
 """
 
 import gzip
 import zlib
 from collections.abc import Callable
+from datetime import UTC, datetime
 
 import msgspec
 
 from appliance.audit.segments import SegmentError, SegmentHeader, SegmentReader
 from rosrv_fleet.robots import Robot
-from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
 
 _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 
@@ -21,8 +22,9 @@ _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 class LogProof(msgspec.Struct, kw_only=True):
     """The result for one log: `records` in `segments` are proven, up to sequence `last`.
 
-    `begins_after` is the last record that retention removed before the collector had it. `missing` is the number of
-    records that no segment has; `findings` are sentences about these, and about damaged and forked segments.
+    `begins_after` is the last record that retention removed before the collector had it, `removed` the last one that
+    the collector's own retention removed (`removal`: when, why and how much). `missing` is the number of records that
+    no segment has; `findings` are sentences about these, and about damaged and forked segments.
     """
 
     robot: str
@@ -30,6 +32,8 @@ class LogProof(msgspec.Struct, kw_only=True):
     segments: int = 0
     records: int = 0
     begins_after: int = 0
+    removed: int = 0
+    removal: str = ""
     last: int = 0
     missing: int = 0
     findings: list[str] = []
@@ -55,8 +59,18 @@ def _prove_log(
 ) -> LogProof:
     proof = LogProof(robot=robot.name, log=log)
     ends: dict[int, list[SegmentHeader]] = {}
-    removed = 0
+    removed, first = 0, 1
+    try:
+        note = store.removal(robot.name, log)
+    except OSError as error:
+        proof.findings.append(f"the note of removed segments is damaged: {error}")
+        note = None
+    if note is not None:
+        _begin_after(note, proof)
+        ends, first = {note.number: note.ends}, note.number + 1
     for place in store.segments(robot.name, log):
+        if place.number < first:  # retention removed it, but a crash left its file
+            continue
         header = _read(store, robot, place, segment_bytes, proof)
         if header is None:
             continue
@@ -82,6 +96,16 @@ def _prove_log(
             0, f"records 1 to {proof.begins_after} are missing: their removal is not signed"
         )
     return proof
+
+
+def _begin_after(note: RemovalNote, proof: LogProof) -> None:
+    """Begin the proof after the segments that the collector's retention removed."""
+    proof.removed = proof.last = max(header.end.sequence for header in note.ends)
+    day = datetime.fromtimestamp(note.time // 10**9, UTC).date().isoformat()
+    proof.removal = (
+        f"records up to {proof.removed} were removed by the collector ({note.by}), the last on {day}:"
+        f" {note.segments} segments with {note.gaps} gaps and {note.forks} forks"
+    )
 
 
 def _read(

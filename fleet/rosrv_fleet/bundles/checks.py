@@ -1,4 +1,4 @@
-"""Check a bundle's contents on the operator's machine, as robots will, as far as they can be known there."""
+"""Check a bundle's contents on the operator's machine, with those checks of robots that need no robot."""
 
 import ipaddress
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from appliance.base.atomic_files import write_whole
-from appliance.base.input_files import read_given
+from appliance.base.input_files import files_below, read_given
 from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, contents_of, is_bundle_file
 from appliance.bundles.terms import BundlePath, Ring, Terms, TermsError, terms_of
 from appliance.channel.messages import BundleContents
@@ -37,7 +37,7 @@ _HERE = Path()
 
 @bundle.command()
 def init(repository: Repository = _HERE, keys: Keys = None, passphrase_file: Secret = None) -> None:
-    """Make a repository with its keys: root, targets and snapshot encrypted, the timestamp's for the collector.
+    """Make a repository with encrypted keys for root, targets and snapshot, and the collector's timestamp key.
 
     Give `root.json` to the robots (fleet.bundles.root) and `timestamp.pem` to the collector. Keep the keys offline.
 
@@ -103,7 +103,7 @@ def withdraw(
     keys: Keys = None,
     passphrase_file: Secret = None,
 ) -> None:
-    """Sign a group's bundles without this one: robots never take it again.
+    """Withdraw a bundle: sign the group's other bundles, so that robots never take this one again.
 
     Example: rosrv-fleet bundle withdraw site-a/arms/12.tar
     """
@@ -119,7 +119,7 @@ def sign(
     keys: Keys = None,
     passphrase_file: Secret = None,
 ) -> None:
-    """Sign everything again before it expires; robots take nothing from expired metadata.
+    """Sign all metadata again before they expire; robots take no bundle from expired metadata.
 
     Example: rosrv-fleet bundle sign && rosrv-fleet bundle publish /srv/bundles
     """
@@ -139,7 +139,7 @@ def rotate(
     keys: Keys = None,
     passphrase_file: Secret = None,
 ) -> None:
-    """Replace the key of a role. Robots follow automatically; the old key signs nothing any more.
+    """Replace the key of a role. Robots accept the new key automatically, and reject the old one.
 
     Example: rosrv-fleet bundle rotate site-a.arms
     """
@@ -167,7 +167,7 @@ def publish(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The collector's folder of bundles")],
     repository: Repository = _HERE,
 ) -> None:
-    """Copy the signed files to the collector's folder; the snapshot comes last, so that no robot sees a part.
+    """Copy the signed files to the collector's folder; the snapshot comes last, so that no robot gets half of them.
 
     To another machine, copy `metadata` and `targets` with any tool; the collector waits until they are complete.
 
@@ -241,9 +241,7 @@ def _ring(text: str) -> Ring:
 def _files_in(folder: Path) -> dict[str, bytes]:
     """Return the files of a bundle in a folder. Raises `BundleArchiveError` for a file that does not belong there."""
     files = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_dir() and not path.is_symlink():
-            continue
+    for path in files_below(folder):
         name = str(path.relative_to(folder))
         if not is_bundle_file(name):
             raise BundleArchiveError(f"{path} does not belong in a bundle: remove it")

@@ -22,7 +22,7 @@ _SHORTEST = 8
 
 
 class KeyFileError(Exception):
-    """A key cannot be read or made; the text names the file and what to do."""
+    """A key cannot be read or made; the message has the file and the remedy."""
 
 
 class KeyFolder:

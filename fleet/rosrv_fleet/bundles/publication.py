@@ -33,7 +33,7 @@ class PublicationError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Publication:
+class PublishedBundles:
     """A complete publication: the root, the snapshot's version, and the signed bundles with their terms."""
 
     root: Root
@@ -42,7 +42,7 @@ class Publication:
     expires: datetime.datetime
 
 
-def read_publication(folder: Path) -> Publication:
+def read_publication(folder: Path) -> PublishedBundles:
     """Return the newest publication in a folder, fully verified. Raises `PublicationError`."""
     metadata = folder / "metadata"
     try:
@@ -66,11 +66,11 @@ def read_publication(folder: Path) -> Publication:
         raise PublicationError(
             f"{folder} is not a complete publication: {error}; publish it again"
         ) from error
-    return Publication(root.signed, version, bundles, min(expires))
+    return PublishedBundles(root.signed, version, bundles, min(expires))
 
 
 def next_timestamp(
-    publication: Publication, last: bytes | None, key: CryptoSigner, now: datetime.datetime
+    publication: PublishedBundles, last: bytes | None, key: CryptoSigner, now: datetime.datetime
 ) -> bytes | None:
     """Return a new timestamp, or None if the last one is good. Raises `PublicationError`.
 
@@ -80,16 +80,18 @@ def next_timestamp(
     if key.public_key.keyid not in keyids:
         raise PublicationError("the root names another timestamp key: copy timestamp.pem of the repository")
     before = _signed_before(last, publication.root)
+    expires = min(now + LIFETIME, publication.expires).replace(microsecond=0)
     if before is not None:
         if before.snapshot_meta.version > publication.snapshot:
             there = f"snapshot {publication.snapshot} is older than {before.snapshot_meta.version}"
             raise PublicationError(f"{there}, which robots know: publish the newest repository")
-        if before.snapshot_meta.version == publication.snapshot and before.expires - now > LIFETIME - _RENEW:
+        good = before.expires - now > LIFETIME - _RENEW or before.expires >= expires
+        if before.snapshot_meta.version == publication.snapshot and good:
             return None
     least = 1 if before is None else before.version + 1
     signed = Timestamp(
         version=max(least, int(now.timestamp())),
-        expires=min(now + LIFETIME, publication.expires).replace(microsecond=0),
+        expires=expires,
         snapshot_meta=MetaFile(publication.snapshot),
     )
     document = Metadata(signed)

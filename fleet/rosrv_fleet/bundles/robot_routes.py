@@ -1,39 +1,40 @@
 """Serve bundles to robots: metadata and targets as immutable files, their selection, events, and their reports.
 
-A robot is identified by its certificate. Metadata and targets are the same for all robots; selections, events and
-reports are about the robot that asks.
+A robot is identified by its certificate, and its group is pinned at the enrolment. Metadata are the same for all
+robots; targets, selections, events and reports are those of the robot's own group.
 """
 
 import asyncio
 import hashlib
 import re
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
+import structlog
 from fastapi import APIRouter, Depends, HTTPException, Request, Response
 from fastapi.responses import StreamingResponse
 from psycopg import Error as DatabaseError
-from starlette.requests import ClientDisconnect
 
 from appliance.bundles.poller import REPORT, RobotReport
 from appliance.bundles.process import EVENTS
 from appliance.bundles.verified_bundles import METADATA, SELECTION, TARGETS
+from rosrv_fleet.request_body import read_body
+from rosrv_fleet.robots import Robot, RobotGroup
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
-from rosrv_fleet.rollouts.store import Group
 
+_log = structlog.get_logger()
 _METADATA_NAME = re.compile(r"[1-9][0-9]{0,9}\.[a-z0-9.-]{1,130}\.json")
 _TARGET_NAME = re.compile(r"[0-9a-f]{64}\.[1-9][0-9]{0,8}\.tar")
 _FOREVER = {"Cache-Control": "public, max-age=31536000, immutable"}
 _HEARTBEAT_SECONDS = 30.0
 _LONGEST_REPORT = 16_384
-_REPORT_SECONDS = 30.0
 _MOST_LISTENERS = 2  # event streams of one robot: the old one may still be open when it connects again
 
-Identify = Callable[[Request], str]
-"""Returns the name of the robot with the client's certificate; raises `HTTPException` for any other caller."""
+Identify = Callable[[Request], Robot | Awaitable[Robot]]
+"""Returns the robot with the client's certificate; raises `HTTPException` for any other caller."""
 
 
 class EventStreams:
@@ -43,15 +44,15 @@ class EventStreams:
         self._service = service
         self._open: Counter[str] = Counter()
 
-    def open(self, robot: str, group: Group) -> AsyncIterator[bytes]:
+    def open(self, robot: str, group: RobotGroup) -> AsyncIterator[bytes]:
         """Return the stream of a robot's events. Raises `HTTPException` if it has too many."""
         if self._open[robot] >= _MOST_LISTENERS:
             raise HTTPException(429, "this robot has too many event streams")
         return self._stream(robot, group)
 
-    async def _stream(self, robot: str, group: Group) -> AsyncIterator[bytes]:
-        self._open[robot] += 1
+    async def _stream(self, robot: str, group: RobotGroup) -> AsyncIterator[bytes]:
         listener = self._service.listen(robot, group)
+        self._open[robot] += 1
         try:
             yield b": listening\n\n"
             while self._open[robot] <= _MOST_LISTENERS:  # several may have opened at the same time
@@ -72,56 +73,74 @@ class EventStreams:
                 del self._open[robot]
 
 
+class OwnGroups:
+    """The groups of robots, as enrolled. A robot that asks for another group is logged once."""
+
+    def __init__(self) -> None:
+        self._logged: set[str] = set()
+
+    def of(self, robot: Robot, site: str, group: str) -> RobotGroup:
+        """Return a robot's group. Raises `HTTPException` (403) if the robot claims another one."""
+        claimed = f"{site[:80]}/{group[:80]}"
+        if robot.group == claimed:
+            self._logged.discard(robot.name)
+            return RobotGroup.parse(robot.group)
+        enrolled = f"in {robot.group}" if robot.group else "without a group"
+        if robot.name not in self._logged:
+            self._logged.add(robot.name)
+            _log.warning("a robot claims another group", robot=robot.name, group=robot.group, claimed=claimed)
+        raise HTTPException(
+            403,
+            f"{robot.name} is enrolled {enrolled}, not in {claimed}; correct fleet.bundles of its appliance.yaml, or on"
+            f" the collector: rosrv-fleet robot group {robot.name} SITE/GROUP",
+        )
+
+
 def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     """Return the routes for robots."""
     router = APIRouter(tags=["bundles"])
-    robot_name = Annotated[str, Depends(identify)]
-
-    def group_of(site: str, group: str) -> Group:
-        try:
-            return service.group(site, group)
-        except RolloutRefusedError as error:
-            raise HTTPException(422, str(error)) from error
+    caller = Annotated[Robot, Depends(identify)]
+    groups = OwnGroups()
 
     @router.get(f"/{METADATA}/timestamp.json")
-    async def timestamp(request: Request, _robot: robot_name) -> Response:
+    async def timestamp(request: Request, _robot: caller) -> Response:
         """Return the newest timestamp."""
         if service.timestamp is None:
             raise HTTPException(404, service.trouble or "nothing is published")
         return _tagged(request, service.timestamp, "application/json")
 
     @router.get(f"/{METADATA}/{{name}}")
-    async def metadata(name: str, _robot: robot_name) -> Response:
+    async def metadata(name: str, _robot: caller) -> Response:
         """Return a signed metadata file."""
         if _METADATA_NAME.fullmatch(name) is None:
             raise HTTPException(404, "there are no such metadata")
         return await _file(service.folder / "metadata" / name, "application/json")
 
     @router.get(f"/{TARGETS}/{{site}}/{{group}}/{{name}}")
-    async def target(site: str, group: str, name: str, _robot: robot_name) -> Response:
-        """Return a bundle's archive."""
-        place = group_of(site, group)
+    async def target(site: str, group: str, name: str, robot: caller) -> Response:
+        """Return an archive of a bundle of the robot's group."""
+        place = groups.of(robot, site, group)
         if _TARGET_NAME.fullmatch(name) is None:
             raise HTTPException(404, "this bundle does not exist")
         return await _file(service.folder / "targets" / place.site / place.group / name, "application/x-tar")
 
     @router.get(f"/{SELECTION}/{{site}}/{{group}}")
-    async def selection(request: Request, site: str, group: str, robot: robot_name) -> Response:
+    async def selection(request: Request, site: str, group: str, robot: caller) -> Response:
         """Return the bundle that the robot should have; empty for none."""
-        return _tagged(request, service.selection(robot, group_of(site, group)).encode(), "text/plain")
+        own = groups.of(robot, site, group)
+        return _tagged(request, service.selection(robot.name, own).encode(), "text/plain")
 
     @router.put(f"/{REPORT}", status_code=204)
-    async def report(request: Request, robot: robot_name) -> None:
+    async def keep_report(request: Request, robot: caller) -> None:
         """Store what the robot reports about itself."""
+        body = await read_body(request, _LONGEST_REPORT)
         try:
-            async with asyncio.timeout(_REPORT_SECONDS):
-                body = await _body(request)
-            await service.report(robot, msgspec.json.decode(body, type=RobotReport))
-        except ClientDisconnect as error:
-            raise HTTPException(400, "the robot ended the connection") from error
-        except TimeoutError as error:
-            raise HTTPException(408, f"a report takes at most {_REPORT_SECONDS:g} s") from error
-        except (msgspec.DecodeError, RolloutRefusedError) as error:
+            report = msgspec.json.decode(body, type=RobotReport)
+        except ValueError as error:
+            raise HTTPException(422, str(error)) from error
+        try:
+            await service.report(robot.name, groups.of(robot, report.site, report.group), report)
+        except RolloutRefusedError as error:
             raise HTTPException(422, str(error)) from error
         except DatabaseError as error:
             raise HTTPException(503, "the database is unreachable: report again later") from error
@@ -129,23 +148,14 @@ def robot_routes(service: BundleService, identify: Identify) -> APIRouter:
     streams = EventStreams(service)
 
     @router.get(f"/{EVENTS}/{{site}}/{{group}}")
-    async def events(site: str, group: str, robot: robot_name) -> Response:
+    async def events(site: str, group: str, robot: caller) -> Response:
         """Send an event whenever the robot's selection changes."""
-        stream = streams.open(robot, group_of(site, group))
+        stream = streams.open(robot.name, groups.of(robot, site, group))
         return StreamingResponse(
             stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"}
         )
 
     return router
-
-
-async def _body(request: Request) -> bytes:
-    body = b""
-    async for part in request.stream():
-        body += part
-        if len(body) > _LONGEST_REPORT:
-            raise HTTPException(413, f"a report has at most {_LONGEST_REPORT} bytes")
-    return body
 
 
 def _tagged(request: Request, body: bytes, kind: str) -> Response:

@@ -1,35 +1,23 @@
 """`rosrv-fleet rollout`: start, watch, stop and revert rollouts over the collector's REST."""
 
-import ssl
+import datetime
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
-import httpx
 import typer
 
-from appliance.audit.record_format import printable
-from appliance.base.input_files import read_given
+from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to
 from rosrv_fleet.output import say, say_json
 
 rollout = typer.Typer(
     help="Bring a signed bundle to the robots of a group, ring by ring.", no_args_is_help=True
 )
 
-Url = Annotated[
-    str, typer.Option("--collector", envvar="ROSRV_FLEET_COLLECTOR", metavar="URL", help="https://HOST:PORT")
-]
-Authority = Annotated[
-    Path | None,
-    typer.Option("--ca", envvar="ROSRV_FLEET_CA", metavar="FILE", help="Authority of its certificate"),
-]
-Token = Annotated[
-    Path,
-    typer.Option("--token-file", envvar="ROSRV_FLEET_TOKEN_FILE", metavar="FILE", help="Your access token"),
-]
 Place = Annotated[str, typer.Argument(metavar="SITE/GROUP")]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
-_NO_TOKEN = Path("token")
-_NOT_FOUND = 404
+_NO_BUNDLES = "; without the section `bundles` of its configuration, a collector has no rollouts"
+_GOOD = ("in force", "no bundle")
 
 
 @rollout.command()
@@ -37,7 +25,7 @@ def start(
     bundle: Annotated[str, typer.Argument(metavar="BUNDLE", help="SITE/GROUP/VERSION.tar")],
     collector: Url,
     ca: Authority = None,
-    token_file: Token = _NO_TOKEN,
+    token_file: Token = NO_TOKEN,
     *,
     share: Annotated[float, typer.Option(help="Share of a ring that must have it in force")] = 0.95,
     tolerance: Annotated[float, typer.Option(help="Share of a ring that may be unhealthy")] = 0.05,
@@ -52,9 +40,7 @@ def start(
 
 
 @rollout.command()
-def status(
-    collector: Url, ca: Authority = None, token_file: Token = _NO_TOKEN, as_json: Json = False
-) -> None:
+def status(collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN, as_json: Json = False) -> None:
     """Show the last rollout of each group. Exit status 1 if one has stopped or nothing can be published.
 
     Example: rosrv-fleet rollout status
@@ -72,7 +58,7 @@ def status(
 
 
 @rollout.command()
-def stop(place: Place, collector: Url, ca: Authority = None, token_file: Token = _NO_TOKEN) -> None:
+def stop(place: Place, collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN) -> None:
     """Stop a running rollout: no further robot gets the bundle; those that have it keep it.
 
     Example: rosrv-fleet rollout stop site-a/arms
@@ -81,8 +67,8 @@ def stop(place: Place, collector: Url, ca: Authority = None, token_file: Token =
 
 
 @rollout.command()
-def revert(place: Place, collector: Url, ca: Authority = None, token_file: Token = _NO_TOKEN) -> None:
-    """Give all robots of a group the bundle from before the last rollout; it must still be signed.
+def revert(place: Place, collector: Url, ca: Authority = None, token_file: Token = NO_TOKEN) -> None:
+    """Give all robots of a group the bundle that preceded the last rollout; it must still be signed.
 
     Example: rosrv-fleet rollout revert site-a/arms
     """
@@ -93,36 +79,33 @@ def _asked(  # noqa: PLR0917  a request and its connection
     method: str, path: str, url: str, ca: Path | None, token_file: Path, body: dict[str, Any] | None = None
 ) -> dict[str, Any]:
     """Return the collector's answer; print an error and exit with status 1 if there is none."""
-    try:
-        token = read_given(token_file, 4096).decode().strip()
-        answer = httpx.request(
-            method,
-            f"{url.rstrip('/')}/v1/rollouts{path}",
-            json=body,
-            headers={"Authorization": f"Bearer {token}"},
-            verify=ssl.create_default_context(cafile=ca),
-            timeout=60.0,
-            trust_env=False,
-        )
-        answer.raise_for_status()
-        return dict(answer.json())
-    except httpx.HTTPStatusError as error:
-        reason = f"{error.response.status_code}: {error.response.text[:1000]}"
-        if error.response.status_code == _NOT_FOUND:
-            reason += "; without the section `bundles` of its configuration, a collector has no rollouts"
-    except (httpx.HTTPError, OSError, ValueError) as error:
-        reason = str(error)
-    typer.echo(f"rosrv-fleet rollout: {printable(reason)}", err=True)
-    raise typer.Exit(1)
+    with answer_to(
+        method, f"rollouts{path}", url, ca, token_file, not_found=_NO_BUNDLES, json=body
+    ) as answer:
+        return dict(json.loads(answer.read()))
+
+
+def _problems(group: dict[str, Any]) -> str:
+    found = [f"{count} {kind}" for kind, count in group["conditions"].items() if count and kind not in _GOOD]
+    return f": {', '.join(found)}" if found else ""
+
+
+def _time(seconds: float) -> str:
+    """Return a time since the epoch in UTC."""
+    return f"{datetime.datetime.fromtimestamp(seconds, datetime.UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _show(group: dict[str, Any]) -> None:
     shown = group["rollout"]
     place = f"{group['site']}/{group['group']}"
     if shown is None:
-        say(f"{place}: {group['robots_known']} robots, no rollout")
+        say(f"{place}: {group['robots_known']} robots, no rollout{_problems(group)}")
         return
     say(f"{place}: {shown['bundle']} {shown['state']}: {shown['why']}")
+    acts = (f"{act['act']} by {act['who']} at {_time(act['at'])}" for act in shown["acts"])
+    say(f"  {', '.join(acts)}")
+    if _problems(group):
+        say(f"  robots{_problems(group)}")
     for ring in shown["rings"]:
         state = "open" if ring["open"] else "not open"
         say(

@@ -10,6 +10,8 @@ Invariants:
 3. If too many robots of an open ring are unhealthy, the rollout stops. Then no further robot gets the bundle, until an
    operator decides. A stopped rollout never starts again automatically.
 4. Every selection is the bundle of the rollout or the one before it; nothing else.
+5. Only robots that are enrolled in the group are given to this module. A robot that has left the group does not count,
+   but a ring that has lost all its robots stops the rollout.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,9 +25,9 @@ RolloutState = Literal["running", "stopped", "reverted", "done"]
 
 
 class RobotSeen(msgspec.Struct, frozen=True):
-    """The last report of a robot, at `seen` (seconds since the epoch)."""
+    """The last report of a robot, at `seen` (seconds since the epoch; 0: it never reported)."""
 
-    seen: float
+    seen: float = 0.0
     in_force: str = ""
     trying: str = ""
     refused: str = ""
@@ -61,12 +63,21 @@ class Baseline(msgspec.Struct, frozen=True):
     failing: int
 
 
-class Rollout(msgspec.Struct, frozen=True):
+class OperatorAct(msgspec.Struct, frozen=True):
+    """The act of an operator (the name of the token) on a rollout, at a time in seconds since the epoch."""
+
+    at: float
+    who: str
+    act: Literal["start", "stop", "revert"]
+
+
+class BundleRollout(msgspec.Struct, frozen=True):
     """A rollout of the bundle `path` over the bundle `before` (empty: none).
 
-    The rings up to `ring` are open; -1: none yet. `opened` is when the last one opened, `healthy` since when all open
-    rings have been taken and healthy (None: they are not). `baselines` has the robots that count for the gates: those
-    that were not silent when their ring opened. `why` explains the state.
+    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened. `healthy` is the
+    time since which all open rings have been taken and healthy; None: they are not. `baselines` has the robots that
+    count for the gates: those that were not silent when their ring opened. `why` explains the state. `acts` are the
+    acts of operators.
     """
 
     path: str
@@ -80,6 +91,7 @@ class Rollout(msgspec.Struct, frozen=True):
     healthy: float | None = None
     baselines: dict[str, Baseline] = {}
     why: str = ""
+    acts: list[OperatorAct] = []
 
     @property
     def bundle(self) -> BundlePath:
@@ -87,12 +99,12 @@ class Rollout(msgspec.Struct, frozen=True):
         return BundlePath.parse(self.path)
 
 
-def ring_of(rollout: Rollout, robot: str) -> int:
+def ring_of(rollout: BundleRollout, robot: str) -> int:
     """Return the index of a robot's ring."""
     return rollout.terms.ring_of(robot, rollout.bundle)
 
 
-def selected(rollout: Rollout, robot: str, seen: RobotSeen | None) -> str:
+def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
     """Return the bundle that a robot should have; empty for none.
 
     After a stop, a robot keeps the bundle if it has it in force, and no other robot gets it.
@@ -107,15 +119,15 @@ def selected(rollout: Rollout, robot: str, seen: RobotSeen | None) -> str:
     return rollout.path if stays else rollout.before
 
 
-def advanced(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
-    """Return the rollout after a look at the robots of the group at `now`."""
+def advanced(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
+    """Return the next state of the rollout, from the state of the group's robots at `now`."""
     if rollout.state != "running":
         return rollout
     if rollout.ring < 0:
         return _opened(rollout, robots, now)
-    unhealthy = _unhealthy_ring(rollout, robots, now)
-    if unhealthy:
-        return _stopped(rollout, unhealthy)
+    unhealthy_ring = _unhealthy_ring(rollout, robots, now)
+    if unhealthy_ring:
+        return _stopped(rollout, unhealthy_ring)
     missing = _not_taken(rollout, robots)
     if missing:
         if now - rollout.opened > rollout.gates.ring_seconds:
@@ -124,7 +136,7 @@ def advanced(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> R
     return _healthy(rollout, robots, now)
 
 
-def _healthy(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
+def _healthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
     """Open the next ring, or end the rollout, if all open rings have been healthy for long enough."""
     healthy = now if rollout.healthy is None else rollout.healthy
     since = msgspec.structs.replace(rollout, healthy=healthy, why="healthy")
@@ -135,19 +147,29 @@ def _healthy(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> R
     return _opened(since, robots, now)
 
 
-def stopped(rollout: Rollout, why: str) -> Rollout:
-    """Return a running rollout stopped by an operator."""
+def stopped(rollout: BundleRollout, why: str) -> BundleRollout:
+    """Return a running rollout as stopped, for a reason other than its robots."""
     return _stopped(rollout, why) if rollout.state == "running" else rollout
 
 
-def reverted(rollout: Rollout, why: str) -> Rollout:
-    """Return the rollout reverted: all robots get the bundle from before."""
+def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
+    """Return the rollout as reverted: all robots get the previous bundle."""
+    if rollout.state == "reverted":
+        return rollout
     return msgspec.structs.replace(rollout, state="reverted", healthy=None, why=why)
 
 
-def counts(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
+def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
+    """Return a running rollout after `seconds` in which the collector heard no robot: they count for no gate."""
+    if rollout.state != "running" or rollout.ring < 0:
+        return rollout
+    why = f"the collector heard no robot for {seconds:.0f} s; the time of health begins again"
+    return msgspec.structs.replace(rollout, opened=rollout.opened + seconds, healthy=None, why=why)
+
+
+def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
     """Return each ring with its number of robots, of those with the bundle in force, refusing, and unhealthy ones."""
-    sick = _sick(rollout, robots, now)
+    sick = unhealthy(rollout, robots, now)
     rows: list[dict[str, object]] = []
     for index, ring in enumerate(rollout.terms.rings):
         members = [robot for robot in robots if ring_of(rollout, robot) == index]
@@ -164,7 +186,7 @@ def counts(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> lis
     return rows
 
 
-def _opened(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Rollout:
+def _opened(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> BundleRollout:
     """Open the next ring, if its signed time has come."""
     index = rollout.ring + 1
     earliest = rollout.terms.signed + rollout.terms.rings[index].after
@@ -189,22 +211,22 @@ def _opened(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> Ro
     )
 
 
-def _members(rollout: Rollout, index: int) -> list[str]:
-    return [robot for robot in rollout.baselines if ring_of(rollout, robot) == index]
-
-
-def _sick(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> dict[str, str]:
+def unhealthy(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> dict[str, str]:
     """Return the unhealthy robots of the open rings, each with the reason."""
     found = {}
     for robot, baseline in rollout.baselines.items():
-        seen = robots.get(robot)
-        why = "its report is gone" if seen is None else _why(rollout, seen, baseline, now)
+        why = _why(rollout, robots[robot], baseline, now) if robot in robots else ""
         if why:
             found[robot] = why
     return found
 
 
-def _why(rollout: Rollout, seen: RobotSeen, baseline: Baseline, now: float) -> str:
+def _members(rollout: BundleRollout, robots: Mapping[str, RobotSeen], index: int) -> list[str]:
+    """Return the robots of a ring that count for the gates."""
+    return [robot for robot in rollout.baselines if robot in robots and ring_of(rollout, robot) == index]
+
+
+def _why(rollout: BundleRollout, seen: RobotSeen, baseline: Baseline, now: float) -> str:
     gates = rollout.gates
     if now - seen.seen > gates.silent_seconds:
         return f"silent for {now - seen.seen:.0f} s"
@@ -219,32 +241,34 @@ def _why(rollout: Rollout, seen: RobotSeen, baseline: Baseline, now: float) -> s
     return ""
 
 
-def _unhealthy_ring(rollout: Rollout, robots: Mapping[str, RobotSeen], now: float) -> str:
-    """Return which open ring has too many unhealthy robots; empty for none."""
-    sick = _sick(rollout, robots, now)
+def _unhealthy_ring(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> str:
+    """Return the problem of an open ring: too many unhealthy robots, or no robots left; empty for none."""
+    sick = unhealthy(rollout, robots, now)
     for index in range(rollout.ring + 1):
-        members = _members(rollout, index)
+        members = _members(rollout, robots, index)
+        if not members and any(ring_of(rollout, robot) == index for robot in rollout.baselines):
+            return f"no robot of ring {rollout.terms.rings[index].name} is enrolled in the group any more"
         ill = [robot for robot in members if robot in sick]
         if len(ill) > rollout.gates.tolerance * len(members):
             return _why_sick(rollout, index, ill, len(members), sick[ill[0]])
     return ""
 
 
-def _why_sick(rollout: Rollout, index: int, ill: Sequence[str], size: int, why: str) -> str:
+def _why_sick(rollout: BundleRollout, index: int, ill: Sequence[str], size: int, why: str) -> str:
     name = rollout.terms.rings[index].name
     return f"{len(ill)} of {size} robots of ring {name} are unhealthy, such as {ill[0]}: {why}"
 
 
-def _not_taken(rollout: Rollout, robots: Mapping[str, RobotSeen]) -> str:
+def _not_taken(rollout: BundleRollout, robots: Mapping[str, RobotSeen]) -> str:
     """Return which open ring has not taken the bundle; empty if all have."""
     for index in range(rollout.ring + 1):
-        members = _members(rollout, index)
-        taken = sum(robots[robot].in_force == rollout.path for robot in members if robot in robots)
+        members = _members(rollout, robots, index)
+        taken = sum(robots[robot].in_force == rollout.path for robot in members)
         if taken < rollout.gates.share * len(members):
             name = rollout.terms.rings[index].name
             return f"{taken} of {len(members)} robots of ring {name} have it in force"
     return ""
 
 
-def _stopped(rollout: Rollout, why: str) -> Rollout:
+def _stopped(rollout: BundleRollout, why: str) -> BundleRollout:
     return msgspec.structs.replace(rollout, state="stopped", healthy=None, why=why)

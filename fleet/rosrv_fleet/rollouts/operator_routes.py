@@ -1,7 +1,8 @@
 """The REST operations of operators: published bundles, rollouts, and the robots of a group."""
 
 import asyncio
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
 import msgspec
@@ -10,11 +11,12 @@ from psycopg import Error as DatabaseError
 from pydantic import BaseModel, ConfigDict, Field
 
 from appliance.bundles.terms import BundlePath, TermsError
+from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import HealthGates
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
-from rosrv_fleet.rollouts.store import Group
 
-Authorize = Callable[[Request], str]
+Authorize = Callable[[Request], str | Awaitable[str]]
 """Returns the name of the operator; raises `HTTPException` if the request is not authorized."""
 
 _DEFAULTS = HealthGates()
@@ -66,25 +68,30 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
         """Return a group's last rollout, its robots and its earlier rollouts."""
         place = _group(service, site, group)
         history = await _answered(asyncio.to_thread(service.store.history, place, _HISTORY))
-        robots = service.robots.get(place, {})
+        robots, conditions = service.robots.get(place, {}), service.conditions(place)
         return group_state(service, place) | {
-            "robots": [{"name": name, **msgspec.structs.asdict(seen)} for name, seen in robots.items()],
+            "robots": [
+                {"name": name, "condition": conditions[name].kind, "condition_why": conditions[name].why,
+                 **msgspec.structs.asdict(seen)}
+                for name, seen in robots.items()
+            ],
             "history": [
                 {"number": stored.number, "bundle": stored.rollout.path, "state": stored.rollout.state,
-                 "started": stored.rollout.started, "why": stored.rollout.why}
+                 "started": stored.rollout.started, "why": stored.rollout.why,
+                 "acts": msgspec.to_builtins(stored.rollout.acts)}
                 for stored in history
             ],
         }  # fmt: skip
 
     @router.post("")
-    async def start(body: NewRollout, _who: changer) -> dict[str, Any]:
+    async def start(body: NewRollout, who: changer) -> dict[str, Any]:
         """Begin the rollout of a published bundle."""
         try:
             path = BundlePath.parse(body.bundle)
         except TermsError as error:
             raise HTTPException(422, str(error)) from error
-        await _answered(service.start(path, HealthGates(**body.gates.model_dump())))
-        return group_state(service, Group(path.site, path.group))
+        await _answered(service.start(path, HealthGates(**body.gates.model_dump()), who))
+        return group_state(service, RobotGroup(path.site, path.group))
 
     @router.post("/{site}/{group}/stop")
     async def stop(site: str, group: str, who: changer) -> dict[str, Any]:
@@ -95,7 +102,7 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
 
     @router.post("/{site}/{group}/revert")
     async def revert(site: str, group: str, who: changer) -> dict[str, Any]:
-        """Give all robots the bundle from before the last rollout."""
+        """Give all robots the bundle that preceded the last rollout."""
         place = _group(service, site, group)
         await _answered(service.revert(place, who))
         return group_state(service, place)
@@ -103,13 +110,15 @@ def operator_routes(service: BundleService, may_read: Authorize, may_change: Aut
     return router
 
 
-def group_state(service: BundleService, group: Group) -> dict[str, Any]:
-    """Return a group's last rollout with its rings, and the number of its robots by state."""
-    robots, stored = service.robots.get(group, {}), service.rollouts.get(group)
+def group_state(service: BundleService, group: RobotGroup) -> dict[str, Any]:
+    """Return a group's last rollout with its rings, and the number of its robots by condition."""
+    stored = service.rollouts.get(group)
+    found = Counter(condition.kind for condition in service.conditions(group).values())
     state: dict[str, Any] = {
         "site": group.site,
         "group": group.group,
-        "robots_known": len(robots),
+        "robots_known": found.total(),
+        "conditions": {kind: found[kind] for kind in ConditionKind},
         "rollout": None,
     }
     if stored is not None:
@@ -121,12 +130,13 @@ def group_state(service: BundleService, group: Group) -> dict[str, Any]:
             "state": rollout.state,
             "why": rollout.why,
             "started": rollout.started,
+            "acts": msgspec.to_builtins(rollout.acts),
             "rings": service.counts(group),
         }
     return state
 
 
-def _group(service: BundleService, site: str, group: str) -> Group:
+def _group(service: BundleService, site: str, group: str) -> RobotGroup:
     try:
         return service.group(site, group)
     except RolloutRefusedError as error:
@@ -134,10 +144,12 @@ def _group(service: BundleService, site: str, group: str) -> Group:
 
 
 async def _answered(work: Any) -> Any:
-    """Return the result of an order; its refusal is 409, a database that does not answer 503."""
+    """Return the result of an order; answer 409 if it is rejected, 503 if the database does not answer."""
     try:
         return await work
     except RolloutRefusedError as error:
         raise HTTPException(409, str(error)) from error
     except DatabaseError as error:
         raise HTTPException(503, "the database is unreachable: try again later") from error
+    except OSError as error:
+        raise HTTPException(503, f"the robots cannot be read: {error}") from error

@@ -3,6 +3,9 @@
 Robots' requests are answered from memory. `run` looks at the publication and the database once a second, advances the
 running rollouts, and wakes robots whose selection has changed. While the database is unreachable, robots get the last
 known selections, and no rollout advances.
+
+While the collector or the database is down, the collector hears no robot. This time counts neither as silence nor as
+health of robots.
 """
 
 import asyncio
@@ -11,36 +14,51 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import structlog
-from psycopg import Error as DatabaseError
 from tuf.api.metadata import Metadata
 
 from appliance.bundles.poller import RobotReport
-from appliance.bundles.terms import ROBOT_NAME, BundlePath, TermsError, role_of
+from appliance.bundles.terms import BundlePath, TermsError
 from rosrv_fleet.bundles.keys import KeyFileError, load_online_key
-from rosrv_fleet.bundles.publication import Publication, PublicationError, next_timestamp, read_publication
+from rosrv_fleet.bundles.publication import (
+    PublicationError,
+    PublishedBundles,
+    next_timestamp,
+    read_publication,
+)
+from rosrv_fleet.failures import failure_of
+from rosrv_fleet.robots import EnrolmentError, RobotGroup
 from rosrv_fleet.rollouts import machine
-from rosrv_fleet.rollouts.machine import HealthGates, RobotSeen, Rollout
-from rosrv_fleet.rollouts.store import Group, RolloutStore, StoredRollout
+from rosrv_fleet.rollouts.conditions import RobotCondition, conditions
+from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, OperatorAct, RobotSeen
+from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
 
 _log = structlog.get_logger()
 _TICK_SECONDS = 1.0
-_PAUSE_SECONDS = 5.0  # after a failure of the database
+_PAUSE_SECONDS = 5.0  # after a failure
+_DEAF_SECONDS = 60.0  # robots report every 30 s
+_CLOCK_SECONDS = 60.0  # by which the clocks of the operator and the collector may differ
+_MOST_COUNTED = 1_000_000_000
 _Stamp = tuple[tuple[str, int, int], ...]
 
 
+Members = Callable[[], Mapping[str, RobotGroup]]
+"""Returns the group of each enrolled robot that has one. Raises `OSError`."""
+
+
 class RolloutRefusedError(Exception):
-    """An order about a rollout is refused; the text has the reason and what to do."""
+    """An order about a rollout is rejected; the message has the reason and the remedy."""
 
 
 @dataclass(eq=False)
-class Listener:
+class SelectionListener:
     """A robot that listens for events: `changed` is set when its selection differs from the last one."""
 
     robot: str
-    group: Group
+    group: RobotGroup
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     last: str | None = None
 
@@ -49,19 +67,27 @@ class BundleService:
     """The collector's bundles. `folder` is what the operator publishes; `key` is the file of the timestamp's key."""
 
     def __init__(
-        self, folder: Path, key: Path, store: RolloutStore, clock: Callable[[], float] = time.time
+        self,
+        folder: Path,
+        key: Path,
+        store: RolloutStore,
+        members: Members,
+        clock: Callable[[], float] = time.time,
     ) -> None:
         self.folder = folder
         self.store = store
         self._key = key
+        self._members = members
         self._clock = clock
-        self.publication: Publication | None = None
+        self._ticked = 0.0  # the time of the last tick that reached the database
+        self._deaf = (0.0, 0.0)  # the beginning of the last time in which no robot was heard, and its seconds
+        self.publication: PublishedBundles | None = None
         self.trouble = "the publication is not read yet"
         self.timestamp: bytes | None = None
-        self.robots: dict[Group, dict[str, RobotSeen]] = {}
-        self.rollouts: dict[Group, StoredRollout] = {}
+        self.robots: dict[RobotGroup, dict[str, RobotSeen]] = {}
+        self.rollouts: dict[RobotGroup, StoredRollout] = {}
         self._stamp: _Stamp | None = None
-        self.listeners: set[Listener] = set()
+        self.listeners: set[SelectionListener] = set()
         self.stopping = False
 
     async def run(self) -> None:
@@ -69,60 +95,66 @@ class BundleService:
         while True:
             try:
                 await self.tick()
-            except DatabaseError as error:
-                _log.error("the database is unreachable: no rollout advances", reason=str(error))
+            except Exception as error:  # noqa: BLE001  after any failure, rollouts advance later
+                _log.error("no rollout advances", reason=failure_of(error))
                 await asyncio.sleep(_PAUSE_SECONDS)
             await asyncio.sleep(_TICK_SECONDS)
 
     async def tick(self) -> None:
         """Read the publication and the database, sign a due timestamp, advance rollouts, wake robots."""
         await self._publish()
-        self.robots = await asyncio.to_thread(self.store.robots)
+        members = await asyncio.to_thread(self._members)
+        reports = await asyncio.to_thread(self.store.reports)
+        self.robots = _by_group(members, reports)
         self.rollouts = await asyncio.to_thread(self.store.latest)
+        await self._resume(reports)
         await self._advance()
         self._wake()
 
+    @property
+    def advancing(self) -> bool:
+        """Whether rollouts advance: the database and the robots were read lately."""
+        return self._clock() - self._ticked < _DEAF_SECONDS
+
     # --- robots ---
 
-    def selection(self, robot: str, group: Group) -> str:
-        """Return the bundle that a robot should have; empty for none."""
+    def selection(self, robot: str, group: RobotGroup) -> str:
+        """Return the bundle that a robot should have; empty for none, or if it is no longer signed."""
         stored = self.rollouts.get(group)
         if stored is None:
             return ""
-        return machine.selected(stored.rollout, robot, self.robots.get(group, {}).get(robot))
+        chosen = machine.selected(stored.rollout, robot, self.robots.get(group, {}).get(robot))
+        return chosen if chosen in self._signed() else ""
 
-    async def report(self, robot: str, report: RobotReport) -> None:
-        """Store what a robot reports about itself. Raises `RolloutRefusedError` for an invalid name."""
-        group = self.group(report.site, report.group)
-        if ROBOT_NAME.fullmatch(robot) is None:
-            raise RolloutRefusedError(f"{robot[:80]!r} is not the name of a robot")
-        fields = msgspec.structs.asdict(report)
-        del fields["site"], fields["group"]
-        seen = RobotSeen(self._clock(), **fields)
-        self.robots.setdefault(group, {})[robot] = seen
+    async def report(self, robot: str, group: RobotGroup, report: RobotReport) -> None:
+        """Store what a robot of a group reports about itself. Raises `RolloutRefusedError` for an invalid report."""
+        seen = _checked(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
+        if robot in self.robots.get(group, {}):
+            self.robots[group][robot] = seen
 
-    def group(self, site: str, group: str) -> Group:
+    def group(self, site: str, group: str) -> RobotGroup:
         """Return a group. Raises `RolloutRefusedError` for invalid names."""
         try:
-            role_of(site, group)
-        except TermsError as error:
+            return RobotGroup.parse(f"{site}/{group}")
+        except EnrolmentError as error:
             raise RolloutRefusedError(str(error)) from error
-        return Group(site, group)
 
-    def listen(self, robot: str, group: Group) -> Listener:
+    def listen(self, robot: str, group: RobotGroup) -> SelectionListener:
         """Return a listener for a robot; `unlisten` ends it.
 
-        It is woken at once if the robot has not reported its selection in force: it may have missed an event.
+        It is woken at once if the robot has not reported its selection in force, because it may have missed an event;
+        and if the collector stops, because a request that began earlier must not delay the stop.
         """
-        listener = Listener(robot, group, last=self.selection(robot, group))
+        listener = SelectionListener(robot, group, last=self.selection(robot, group))
         seen = self.robots.get(group, {}).get(robot)
-        if listener.last and (seen is None or seen.in_force != listener.last):
+        behind = listener.last and (seen is None or seen.in_force != listener.last)
+        if behind or self.stopping:
             listener.changed.set()
         self.listeners.add(listener)
         return listener
 
-    def unlisten(self, listener: Listener) -> None:
+    def unlisten(self, listener: SelectionListener) -> None:
         """Remove a listener."""
         self.listeners.discard(listener)
 
@@ -134,7 +166,7 @@ class BundleService:
 
     # --- orders ---
 
-    async def start(self, path: BundlePath, gates: HealthGates) -> StoredRollout:
+    async def start(self, path: BundlePath, gates: HealthGates, who: str) -> StoredRollout:
         """Begin the rollout of a signed bundle. Raises `RolloutRefusedError`."""
         group = self.group(path.site, path.group)
         terms = None if self.publication is None else self.publication.bundles.get(str(path))
@@ -146,21 +178,33 @@ class BundleService:
         if before == str(path):
             raise RolloutRefusedError(f"{path} is in force already")
         now = self._clock()
-        rollout = Rollout(str(path), before, terms, gates, now)
-        number = await asyncio.to_thread(self.store.begin, group, rollout, now)
+        if terms.signed - now > _CLOCK_SECONDS:
+            raise RolloutRefusedError(
+                f"{path} was signed {terms.signed - now:.0f} s in the future: correct the clock of the collector, or"
+                " that of the machine that signs, and add the bundle again"
+            )
+        rollout = BundleRollout(str(path), before, terms, gates, now, acts=[OperatorAct(now, who, "start")])
+        number = await asyncio.to_thread(self.store.begin, group, last, rollout, now)
         if number is None:
             raise RolloutRefusedError(f"a rollout of {path.site}/{path.group} runs: stop it first")
         await self.tick()
         return self.rollouts[group]
 
-    async def stop(self, group: Group, who: str) -> StoredRollout:
-        """Stop the running rollout of a group. Raises `RolloutRefusedError`."""
-        return await self._change(group, lambda rollout: machine.stopped(rollout, f"stopped by {who}"))
+    async def stop(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
+        """Stop the running rollout of a group; with `number`, only this one. Raises `RolloutRefusedError`."""
 
-    async def revert(self, group: Group, who: str) -> StoredRollout:
-        """Give all robots of a group the bundle from before the last rollout. Raises `RolloutRefusedError`."""
+        def stop(rollout: BundleRollout) -> BundleRollout:
+            return self._by(machine.stopped(rollout, f"stopped by {who}"), rollout, who, "stop")
 
-        def back(rollout: Rollout) -> Rollout:
+        return await self._change(group, stop, number)
+
+    async def revert(self, group: RobotGroup, who: str, number: int | None = None) -> StoredRollout:
+        """Give all robots the bundle that preceded the last rollout; with `number`, only of this rollout.
+
+        Raises `RolloutRefusedError`.
+        """
+
+        def back(rollout: BundleRollout) -> BundleRollout:
             if not rollout.before:
                 raise RolloutRefusedError(
                     "there was no bundle before: add one with the former content, and roll it out"
@@ -169,31 +213,65 @@ class BundleService:
                 raise RolloutRefusedError(
                     f"{rollout.before} is withdrawn: add a bundle with its content, and roll that out"
                 )
-            return machine.reverted(rollout, f"reverted by {who}")
+            return self._by(machine.reverted(rollout, f"reverted by {who}"), rollout, who, "revert")
 
-        return await self._change(group, back)
+        return await self._change(group, back, number)
 
-    def counts(self, group: Group) -> list[dict[str, object]]:
+    def counts(self, group: RobotGroup) -> list[dict[str, object]]:
         """Return the rings of a group's last rollout with their robots."""
         stored = self.rollouts.get(group)
-        return (
-            []
-            if stored is None
-            else machine.counts(stored.rollout, self.robots.get(group, {}), self._clock())
-        )
+        return [] if stored is None else machine.counts(stored.rollout, self._heard(group), self._clock())
+
+    def conditions(self, group: RobotGroup) -> dict[str, RobotCondition]:
+        """Return the condition of each robot of a group."""
+        stored = self.rollouts.get(group)
+        rollout = None if stored is None else stored.rollout
+        return conditions(rollout, self._heard(group), self._clock())
 
     # --- inside ---
+
+    def _by(
+        self, changed: BundleRollout, before: BundleRollout, who: str, act: Literal["stop", "revert"]
+    ) -> BundleRollout:
+        """Return a changed rollout with the operator's act."""
+        if changed == before:
+            return before
+        return msgspec.structs.replace(changed, acts=[*before.acts, OperatorAct(self._clock(), who, act)])
+
+    def _heard(self, group: RobotGroup) -> dict[str, RobotSeen]:
+        """Return the robots of a group; time in which the collector could hear none of them is not silence."""
+        since, seconds = self._deaf
+        return {
+            robot: msgspec.structs.replace(seen, seen=seen.seen + seconds) if 0 < seen.seen <= since else seen
+            for robot, seen in self.robots.get(group, {}).items()
+        }
+
+    async def _resume(self, reports: Mapping[str, StoredReport]) -> None:
+        """Resume the running rollouts if the collector could not hear robots since the last tick."""
+        now = self._clock()
+        heard = max([self._ticked, *(report.seen.seen for report in reports.values())])
+        self._ticked = now
+        if not heard or now - heard <= _DEAF_SECONDS:
+            return
+        self._deaf = (heard, now - heard)
+        _log.warning("no robot was heard, because the collector was away", seconds=round(now - heard))
+        for group, stored in list(self.rollouts.items()):
+            await self._save(group, stored, machine.resumed(stored.rollout, now - heard), now)
 
     def _signed(self) -> Mapping[str, object]:
         return {} if self.publication is None else self.publication.bundles
 
-    async def _change(self, group: Group, change: Callable[[Rollout], Rollout]) -> StoredRollout:
+    async def _change(
+        self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
+    ) -> StoredRollout:
         stored = (await asyncio.to_thread(self.store.latest)).get(group)
         if stored is None:
-            raise RolloutRefusedError(f"there was no rollout of {group.site}/{group.group}")
+            raise RolloutRefusedError(f"there was no rollout of {group}")
         changed = change(stored.rollout)
-        if changed != stored.rollout and not await asyncio.to_thread(
-            self.store.replace, stored, changed, self._clock()
+        there = number in (None, stored.number)
+        if not there or (
+            changed != stored.rollout
+            and not await asyncio.to_thread(self.store.replace, group, stored, changed, self._clock())
         ):
             raise RolloutRefusedError("the rollout has changed in the meantime: look at it, and try again")
         await self.tick()
@@ -218,20 +296,32 @@ class BundleService:
             await asyncio.to_thread(self.store.save_timestamp, Metadata.from_bytes(made).signed.version, made)
             last = await asyncio.to_thread(self.store.timestamp)
         self.timestamp, self.trouble = last, ""
+        if self.publication.expires <= now:
+            self.trouble = (
+                f"the signed metadata expired at {self.publication.expires:%Y-%m-%d %H:%M} UTC, so robots take nothing:"
+                " rosrv-fleet bundle sign, then bundle publish"
+            )
 
     async def _advance(self) -> None:
         now = self._clock()
         for group, stored in list(self.rollouts.items()):
-            rollout = machine.advanced(stored.rollout, self.robots.get(group, {}), now)
-            if rollout == stored.rollout or not await asyncio.to_thread(
-                self.store.replace, stored, rollout, now
-            ):
-                continue
-            self.rollouts[group] = StoredRollout(stored.number, rollout)
-            if (rollout.state, rollout.ring) != (stored.rollout.state, stored.rollout.ring):
-                _log.warning(
-                    "a rollout has changed", bundle=rollout.path, state=rollout.state, why=rollout.why
-                )
+            if self.publication is not None and stored.rollout.path not in self.publication.bundles:
+                rollout = machine.stopped(stored.rollout, f"{stored.rollout.path} was withdrawn")
+            else:
+                rollout = machine.advanced(stored.rollout, self._heard(group), now)
+            await self._save(group, stored, rollout, now)
+
+    async def _save(
+        self, group: RobotGroup, stored: StoredRollout, rollout: BundleRollout, now: float
+    ) -> None:
+        """Store the next state of a rollout, unless another collector or an operator was faster."""
+        if rollout == stored.rollout or not await asyncio.to_thread(
+            self.store.replace, group, stored, rollout, now
+        ):
+            return
+        self.rollouts[group] = StoredRollout(stored.number, rollout)
+        if (rollout.state, rollout.ring) != (stored.rollout.state, stored.rollout.ring):
+            _log.warning("a rollout has changed", bundle=rollout.path, state=rollout.state, why=rollout.why)
 
     def _wake(self) -> None:
         for listener in self.listeners:
@@ -241,7 +331,36 @@ class BundleService:
                 listener.changed.set()
 
 
-def _in_force_after(rollout: Rollout) -> str:
+def _by_group(
+    members: Mapping[str, RobotGroup], reports: Mapping[str, StoredReport]
+) -> dict[RobotGroup, dict[str, RobotSeen]]:
+    """Return the robots of each group; a report from another group is not one of this group."""
+    found: dict[RobotGroup, dict[str, RobotSeen]] = {}
+    for name, group in sorted(members.items()):
+        report = reports.get(name, StoredReport(group, RobotSeen()))
+        found.setdefault(group, {})[name] = report.seen if report.group == group else RobotSeen()
+    return found
+
+
+def _checked(report: RobotReport, now: float) -> RobotSeen:
+    """Return a report as it is stored. Raises `RolloutRefusedError` if no robot can have written it."""
+    for path in filter(None, (report.in_force, report.trying, report.refused)):
+        try:
+            BundlePath.parse(path)
+        except TermsError as error:
+            raise RolloutRefusedError(f"a bundle of the report is invalid: {error}") from error
+    if not (0 <= report.denials <= _MOST_COUNTED and 0 <= report.failing <= _MOST_COUNTED):
+        raise RolloutRefusedError(f"a number of the report is not between 0 and {_MOST_COUNTED}")
+    fields = msgspec.structs.asdict(report)
+    del fields["site"], fields["group"]
+    # PostgreSQL stores no NUL in a text.
+    fields |= {
+        name: fields[name].replace("\0", "\N{REPLACEMENT CHARACTER}") for name in ("reason", "trouble")
+    }
+    return RobotSeen(now, **fields)
+
+
+def _in_force_after(rollout: BundleRollout) -> str:
     """Return the bundle that a group has after its last rollout."""
     return rollout.path if rollout.state == "done" else rollout.before
 

@@ -1,7 +1,7 @@
 """Store rollouts, robots' reports and the timestamp in PostgreSQL. Each method blocks: call it in a thread.
 
 Several collectors may share the database. A change of a rollout names the state that it was computed from, so a
-collector that is behind changes nothing.
+collector with an old state changes nothing.
 """
 
 from contextlib import AbstractContextManager
@@ -10,23 +10,24 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 from psycopg import Connection
 
-from rosrv_fleet.rollouts.machine import RobotSeen, Rollout
+from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.rollouts.machine import BundleRollout, RobotSeen
 
-MOST_ROBOTS = 100_000
+_LOCK_GROUP = "SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))"
 
 
-class Group(NamedTuple):
-    """A robot group of a site."""
+class StoredReport(NamedTuple):
+    """The last report of a robot, and the group that it was enrolled in at that time."""
 
-    site: str
-    group: str
+    group: RobotGroup
+    seen: RobotSeen
 
 
 class StoredRollout(NamedTuple):
     """A rollout with its number."""
 
     number: int
-    rollout: Rollout
+    rollout: BundleRollout
 
 
 class Connections(Protocol):
@@ -44,7 +45,7 @@ class RolloutStore:
 
     # --- robots ---
 
-    def save_report(self, name: str, group: Group, seen: RobotSeen) -> None:
+    def save_report(self, name: str, group: RobotGroup, seen: RobotSeen) -> None:
         """Store a robot's last report."""
         query = """
             INSERT INTO bundle_robot (name, site, robot_group, report) VALUES (%s, %s, %s, %s)
@@ -55,25 +56,18 @@ class RolloutStore:
         with self._database.writing() as connection:
             connection.execute(query, (name, *group, document))
 
-    def robots(self) -> dict[Group, dict[str, RobotSeen]]:
-        """Return the last report of every robot, by group and name."""
-        query = "SELECT name, site, robot_group, report::text FROM bundle_robot ORDER BY name LIMIT %s"
-        found: dict[Group, dict[str, RobotSeen]] = {}
+    def reports(self) -> dict[str, StoredReport]:
+        """Return the last report of every robot that ever sent one."""
+        query = "SELECT name, site, robot_group, report::text FROM bundle_robot"
         with self._database.writing() as connection:
-            cursor = connection.execute(query, (MOST_ROBOTS,))
-            for name, site, group, report in cursor:
-                found.setdefault(Group(site, group), {})[name] = msgspec.json.decode(report, type=RobotSeen)
-        return found
-
-    def forget(self, name: str) -> bool:
-        """Remove a robot's report; return whether there was one."""
-        with self._database.writing() as connection:
-            cursor = connection.execute("DELETE FROM bundle_robot WHERE name = %s", (name,))
-            return bool(cursor.rowcount)
+            return {
+                name: StoredReport(RobotGroup(site, group), msgspec.json.decode(report, type=RobotSeen))
+                for name, site, group, report in connection.execute(query)
+            }
 
     # --- rollouts ---
 
-    def latest(self) -> dict[Group, StoredRollout]:
+    def latest(self) -> dict[RobotGroup, StoredRollout]:
         """Return the last rollout of every group."""
         query = """
             SELECT DISTINCT ON (site, robot_group) id, site, robot_group, document::text FROM rollout
@@ -82,33 +76,47 @@ class RolloutStore:
         with self._database.writing() as connection:
             cursor = connection.execute(query)
             return {
-                Group(site, group): StoredRollout(number, msgspec.json.decode(document, type=Rollout))
+                RobotGroup(site, group): StoredRollout(
+                    number, msgspec.json.decode(document, type=BundleRollout)
+                )
                 for number, site, group, document in cursor
             }
 
-    def begin(self, group: Group, rollout: Rollout, now: float) -> int | None:
-        """Store a new rollout and return its number; None if one runs already."""
+    def begin(
+        self, group: RobotGroup, last: StoredRollout | None, rollout: BundleRollout, now: float
+    ) -> int | None:
+        """Store a new rollout and return its number; None if `last` is no longer the last one, or runs."""
+        newest = """
+            SELECT id, document = %s::jsonb FROM rollout WHERE site = %s AND robot_group = %s
+            ORDER BY id DESC LIMIT 1
+        """
         query = """
             INSERT INTO rollout (site, robot_group, document, state, changed) VALUES (%s, %s, %s, %s, %s)
             ON CONFLICT (site, robot_group) WHERE state = 'running' DO NOTHING RETURNING id
         """
+        old = None if last is None else msgspec.json.encode(last.rollout).decode()
         document = msgspec.json.encode(rollout).decode()
         with self._database.writing() as connection:
-            cursor = connection.execute(query, (*group, document, rollout.state, now))
-            row = cursor.fetchone()
+            connection.execute(_LOCK_GROUP, (str(group),))
+            found = connection.execute(newest, (old, *group)).fetchone()
+            if found != (None if last is None else (last.number, True)):
+                return None
+            row = connection.execute(query, (*group, document, rollout.state, now)).fetchone()
         return None if row is None else int(row[0])
 
-    def replace(self, before: StoredRollout, rollout: Rollout, now: float) -> bool:
-        """Store a rollout's next state; return False if another collector or operator has changed it."""
+    def replace(self, group: RobotGroup, before: StoredRollout, rollout: BundleRollout, now: float) -> bool:
+        """Store the next state of a group's last rollout; return False if another one has changed it."""
         query = """
             UPDATE rollout SET document = %s, state = %s, changed = %s WHERE id = %s AND document = %s::jsonb
+            AND id = (SELECT max(id) FROM rollout WHERE site = %s AND robot_group = %s)
         """
         new, old = (msgspec.json.encode(one).decode() for one in (rollout, before.rollout))
         with self._database.writing() as connection:
-            cursor = connection.execute(query, (new, rollout.state, now, before.number, old))
+            connection.execute(_LOCK_GROUP, (str(group),))
+            cursor = connection.execute(query, (new, rollout.state, now, before.number, old, *group))
             return cursor.rowcount == 1
 
-    def history(self, group: Group, limit: int) -> list[StoredRollout]:
+    def history(self, group: RobotGroup, limit: int) -> list[StoredRollout]:
         """Return the last rollouts of a group, the newest first."""
         query = """
             SELECT id, document::text FROM rollout WHERE site = %s AND robot_group = %s ORDER BY id DESC LIMIT %s
@@ -116,7 +124,7 @@ class RolloutStore:
         with self._database.writing() as connection:
             cursor = connection.execute(query, (*group, limit))
             return [
-                StoredRollout(number, msgspec.json.decode(document, type=Rollout))
+                StoredRollout(number, msgspec.json.decode(document, type=BundleRollout))
                 for number, document in cursor
             ]
 

@@ -22,7 +22,7 @@ from rosrv_fleet.robots import Robots
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.log import AuditLog
 from appliance.audit.signatures import read_public_key, write_public_key
-from appliance.forwarding.collector_connection import https_collector
+from appliance.collector.connection import robot_connection
 from appliance.forwarding.segment_pusher import SegmentPusher
 from tests.support.audit import decision, settle
 from tests.support.certificates import Certificates, make_certificates
@@ -97,6 +97,12 @@ class FleetSite:
             self._process.wait(60)
             self._process = None
 
+    @property
+    def pid(self) -> int:
+        """Return the process id of the running collector."""
+        assert self._process is not None
+        return self._process.pid
+
     def kill(self) -> None:
         """Kill the collector."""
         self.stop(signal.SIGKILL)
@@ -159,7 +165,9 @@ class FleetSite:
 class FleetRobot:
     """A robot: a real audit log with a signer's key, a certificate, and the appliance's pusher."""
 
-    def __init__(self, site: FleetSite, name: str, *, enrolled: bool = True, every: int = 10) -> None:
+    def __init__(
+        self, site: FleetSite, name: str, *, enrolled: bool = True, every: int = 10, group: str = ""
+    ) -> None:
         self.site, self.name = site, name
         self.folder = site.folder / "robots" / name
         self.folder.mkdir(parents=True)
@@ -174,8 +182,8 @@ class FleetRobot:
         if enrolled:
             assert site.data is not None
             key, certificate = self.folder / "audit.pub.pem", self.certificates.certificate
-            Robots(site.data / "robots").add(name, key.read_bytes(), certificate.read_bytes())
-            eventually(self._trusted, "the running collector notices the robot")
+            Robots(site.data / "robots").add(name, key.read_bytes(), certificate.read_bytes(), group)
+            eventually(self.is_trusted, "the running collector notices the robot")
 
     def _open(self) -> None:
         self.log = AuditLog(self.log_file, checkpoint_every=self._every, signer=self._sign)
@@ -192,7 +200,8 @@ class FleetRobot:
         log.close()
         self._open()
 
-    def _trusted(self) -> bool:
+    def is_trusted(self) -> bool:
+        """Whether the collector accepts the certificate."""
         try:
             with self.site.client(self.certificates) as client:
                 return client.get(f"/v1/logs/{'0' * 32}").status_code == 200
@@ -219,8 +228,9 @@ class FleetRobot:
     def pusher(self) -> SegmentPusher:
         """Return the appliance's client for this robot."""
         tls = self.certificates
-        link = https_collector(("127.0.0.1", self.site.port), self.site.server.ca, tls.certificate, tls.key)
-        return SegmentPusher(self.log_file, self.folder / "state", link, self.site.receipt_key)
+        url = f"https://127.0.0.1:{self.site.port}"
+        collector = robot_connection(url, self.site.server.ca, tls.certificate, tls.key)
+        return SegmentPusher(self.log_file, self.folder / "state", collector, self.site.receipt_key)
 
     def push(self) -> SegmentPusher:
         """Push all sealed segments; fail with the first trouble."""

@@ -71,6 +71,12 @@ class PostgresCluster:
             return False
         return True
 
+    @property
+    def pid(self) -> int:
+        """Return the process id of the running server."""
+        assert self._process is not None
+        return self._process.pid
+
     def stop(self) -> None:
         """Shut the server down."""
         if self._process is not None:

@@ -3,15 +3,20 @@
 import json
 import os
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from appliance.audit.signatures import write_public_key
 from tests.support.appliance import Appliance
+from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 from tests.support.certificates import make_certificates
+from tests.support.lying_collector import Visitor, lying_collector
 from tests.support.rosmaster import master_at
-from tests.support.waiting import eventually
+from tests.support.waiting import allowed, eventually
 from tests.system.fleet.fleet_site import FleetSite
 
 PUSHER = (61023, 61014)  # its user, in the group that may read the log
@@ -83,3 +88,45 @@ def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
     (proof,) = map(json.loads, site.run("verify", "--json").stdout.splitlines())
     assert (proof["ok"], proof["missing"]) == (True, 0)
     assert proof["last"] >= last
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="the appliance's processes have users of their own")
+def test_a_collector_that_never_answers_holds_nothing_up() -> None:
+    """While both clients wait for their answer, calls are decided and recorded, and the appliance stops soon."""
+    appliance = Appliance()
+    fleet = BundleSite(appliance.directory / "fleet")
+    certificate, key = fleet.authority.issue(ROBOT)
+    key.chmod(0o644)
+    public = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
+    write_public_key(fleet.folder / "receipts.pub", public)
+    shutil.copy(fleet.repository.folder / "root.json", fleet.folder / "root.json")
+    for file in (fleet.folder, fleet.folder / "receipts.pub", fleet.folder / "root.json"):
+        file.chmod(0o755)
+    asked: set[bytes] = set()
+
+    def never(visitor: Visitor) -> None:
+        asked.add(visitor.request().split()[1].split(b"/")[2])
+        visitor.wait()
+
+    with lying_collector(fleet.authority.server_context, never) as url:
+        settings = {
+            "collector": url, "ca": str(fleet.authority.ca), "certificate": str(certificate), "key": str(key),
+            "receipt_key": str(fleet.folder / "receipts.pub"), "retention_waits": True, "robot": ROBOT,
+            "bundles": {"root": str(fleet.folder / "root.json"), "site": SITE, "group": GROUP},
+        }  # fmt: skip
+        config = appliance.directory / "appliance.yaml"
+        config.write_text(
+            json.dumps({"audit": {"checkpoint_seconds": 1, "retention_days": 30}, "fleet": settings})
+        )
+        appliance.options = ("--config", str(config))
+        with appliance:
+            work(appliance, 1)
+            eventually(lambda: asked >= {b"logs", b"bundles"}, "both clients wait for an answer")
+            began = time.monotonic()
+            work(appliance, 50)
+            assert time.monotonic() - began < allowed(5)
+            eventually(
+                lambda: "/value49" in appliance.rosrv("audit", "export").stdout, "the last call is recorded"
+            )
+            began = time.monotonic()
+        assert time.monotonic() - began < allowed(15)

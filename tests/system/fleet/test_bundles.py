@@ -2,16 +2,15 @@
 
 import json
 import os
-import ssl
+import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from appliance.forwarding.collector_connection import https_collector
+from appliance.collector.connection import CollectorError, robot_connection
 from tests.support.appliance import Appliance
 from tests.support.certificates import make_certificates
 from tests.support.sources import ROOT
@@ -20,6 +19,7 @@ from tests.system.fleet.fleet_site import FleetSite
 from tests.system.fleet.test_appliance import pushing
 
 BUNDLE = "site-a/arms/1.tar"
+PAGE_METRICS = set(re.findall(r"`(rosrv_fleet_\w+)`", (ROOT / "docs/fleet.md").read_text()))
 POLICY = (
     "[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n[Subscribers]\ndefault = *\n[Commands]\ndefault = *\n"
     "# of the bundle\n"
@@ -63,9 +63,13 @@ class Operator:
 
     def rollout(self, verb: str, *arguments: str, token: Path | None = None, status: int = 0) -> str:
         """Run a verb of `rosrv-fleet rollout`."""
+        return self.remote("rollout", verb, *arguments, token=token, status=status)
+
+    def remote(self, *arguments: str, token: Path | None = None, status: int = 0) -> str:
+        """Run a command that asks the running collector."""
         url, ca = f"https://127.0.0.1:{self._site.port}", str(self._site.server.ca)
         access = ("--collector", url, "--ca", ca, "--token-file", str(token or self.token))
-        return self.run("rollout", verb, *arguments, *access, status=status)
+        return self.run(*arguments, *access, status=status)
 
     def group(self) -> dict[str, Any]:
         """Return the only group's last rollout, from `rosrv-fleet rollout status`."""
@@ -116,7 +120,7 @@ def test_an_appliance_pushes_its_log_and_takes_a_bundle(site: FleetSite, tmp_pat
         certificate = str(appliance.directory / "fleet" / "peer.pem")
         site.run(
             "robot", "add", "arm1", "--key", str(appliance.state / "control" / "audit.pub"),
-            "--certificate", certificate,
+            "--certificate", certificate, "--group", "site-a/arms",
         )  # fmt: skip
         refused = operator.rollout("start", BUNDLE, token=operator.viewer, status=1)
         assert "the role viewer; this needs operator" in refused
@@ -131,11 +135,15 @@ def test_an_appliance_pushes_its_log_and_takes_a_bundle(site: FleetSite, tmp_pat
         assert (robot["name"], robot["in_force"]) == ("arm1", BUNDLE)
         eventually(lambda: site.search(robot="arm1", event="bundle in force"), "its record is searchable")
         with site.client() as client:
-            page = client.get("/", headers={"Cookie": f"__Host-rosrv-fleet={site.token}"})
+            page = client.get("/rollouts", headers={"Cookie": f"__Host-rosrv-fleet={site.token}"})
         assert BUNDLE in page.text
-        began = time.monotonic()
+        metrics = site.get("/metrics").text
+        assert set(re.findall(r"^# TYPE (\w+)", metrics, re.MULTILINE)) == PAGE_METRICS
+        assert 'rosrv_fleet_robots{condition="in force",group="arms",site="site-a"} 1.0' in metrics
+        assert 'rosrv_fleet_rollout{group="arms",site="site-a",state="stopped"} 0.0' in metrics
+        assert "rosrv_fleet_rollouts_up 1.0" in metrics
         site.stop()  # while the robot's event stream is open
-        assert time.monotonic() - began < 15
+        assert "graceful shutdown exceeded" not in (site.folder / "log").read_text()
     (proof,) = map(json.loads, site.run("verify", "--json").stdout.splitlines())
     assert (proof["ok"], proof["missing"]) == (True, 0)
 
@@ -153,6 +161,6 @@ def test_only_enrolled_robots_get_bundles(site: FleetSite, tmp_path: Path) -> No
 def test_the_pusher_checks_the_name_in_the_certificate(site: FleetSite, tmp_path: Path) -> None:
     """With `fleet.name`, the collector's certificate must have that name, not the address."""
     robot = make_certificates(tmp_path / "robot", authority="authority of arm1")
-    place, files = ("127.0.0.1", site.port), (site.server.ca, robot.certificate, robot.key)
-    with pytest.raises(ssl.SSLCertVerificationError, match=r"not valid for 'fleet\.example'"):
-        https_collector(place, *files, "fleet.example").head("0" * 32, 1)
+    url, files = f"https://127.0.0.1:{site.port}", (site.server.ca, robot.certificate, robot.key)
+    with pytest.raises(CollectorError, match=r"not valid for 'fleet\.example'"):
+        robot_connection(url, *files, "fleet.example").get(f"v1/logs/{'0' * 32}")

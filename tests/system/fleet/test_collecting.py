@@ -1,6 +1,7 @@
 """Segments of real logs are pushed, stored, proven and found."""
 
 import json
+import shutil
 from collections.abc import Callable
 
 import msgspec
@@ -56,6 +57,35 @@ def test_a_restarted_client_continues_where_the_collector_is(site: FleetSite, ma
     second = robot.push()
     assert second.progress.checkpoint > first.progress.checkpoint
     assert second.progress.sent == second.progress.checkpoint - first.progress.checkpoint
+
+
+def test_a_restored_collector_gets_the_newer_segments_again(site: FleetSite, make_robot: MakeRobot) -> None:
+    """A robot that was idle while the collector was restored from a backup sends all segments since the backup."""
+    robot = make_robot("arm1")
+    pusher = robot.pusher()
+    robot.record(20)
+    while pusher.step() == 0:
+        pass
+    site.stop()
+    assert site.data is not None
+    shutil.copytree(site.data, site.folder / "backup")
+    site.start()
+    robot.record(20)
+    while pusher.step() == 0:
+        pass
+    assert pusher.progress.sequence == robot.sealed()
+    site.stop()
+    shutil.rmtree(site.data)
+    shutil.copytree(site.folder / "backup", site.data)
+    site.start()
+    robot.record(20)
+    while pusher.step() == 0:
+        pass
+    assert not pusher.progress.trouble
+    assert pusher.progress.sequence == robot.sealed()
+    pusher.close()
+    (proof,) = map(json.loads, site.run("verify", "--json").stdout.splitlines())
+    assert (proof["ok"], proof["missing"], proof["last"]) == (True, 0, robot.sealed())
 
 
 def test_a_search_continues_with_its_cursor(site: FleetSite, make_robot: MakeRobot) -> None:
@@ -145,6 +175,21 @@ def test_the_index_is_rebuilt_from_segments(site: FleetSite, make_robot: MakeRob
     assert len(before) >= 25
     site.run("reindex")
     assert site.search(limit=1000) == before
+
+
+def test_a_damaged_segment_does_not_stop_reindex(site: FleetSite, make_robot: MakeRobot) -> None:
+    """`reindex` names a damaged segment, indexes all others, and exits with status 1."""
+    damaged, other = make_robot("arm1"), make_robot("arm2")
+    for robot in (damaged, other):
+        robot.record(20)
+        robot.push()
+    site.indexed()
+    assert site.data is not None
+    file = sorted((site.data / "segments" / "arm1").rglob("*.gz"))[0]
+    file.write_bytes(b"damaged")
+    assert f"{file} is not indexed" in site.run("reindex", status=1).stderr
+    assert len(site.search(robot="arm2", event="decision")) == 20
+    assert 0 < len(site.search(robot="arm1", event="decision")) < 20
 
 
 def test_a_silent_robot_is_reported(site: FleetSite, make_robot: MakeRobot) -> None:

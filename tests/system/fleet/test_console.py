@@ -1,34 +1,60 @@
 """The collector's console in a real browser: log in, robots, search; no script, no text of a robot as markup."""
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
 
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+import httpx
+import msgspec
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+from rosrv_fleet.robots import Robot
 
+from tests.support.processes import LIMIT
 from tests.support.requirements import need_program
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite
+from tests.system.fleet.incidents import incident
+from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 
+PLACE = "site-a/arms"
 MakeRobot = Callable[..., FleetRobot]
+_LIMIT = 1000 * LIMIT  # milliseconds to wait for an answer
 _MARKUP = "<script>document.title='owned'</script><b id=owned>"
 
 
 @contextmanager
-def opened_page() -> Iterator[Page]:
+def opened_page(width: int = 1280, theme: Literal["light", "dark"] = "light") -> Iterator[Page]:
     """Return a page of headless Chromium; an error in its console fails the test."""
     program = need_program("chromium", "chromium")
     with sync_playwright() as playwright:
         browser: Browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        opened = browser.new_page(ignore_https_errors=True, viewport={"width": 1280, "height": 800})
+        opened = browser.new_page(
+            ignore_https_errors=True, viewport={"width": width, "height": 800}, color_scheme=theme
+        )
+        opened.set_default_timeout(_LIMIT)
         said: list[str] = []
 
         def hear(message: ConsoleMessage) -> None:
-            if message.type in ("error", "warning"):
+            # The browser reports pages with an error status itself.
+            if message.type in ("error", "warning") and "Failed to load resource" not in message.text:
                 said.append(message.text)
 
         opened.on("console", hear)
         yield opened
         browser.close()
         assert said == []
+
+
+def log_in(page: Page, site: FleetSite, token: str) -> None:
+    """Log in, with the keyboard."""
+    page.goto(f"https://127.0.0.1:{site.port}/login")
+    expect(page.get_by_label("Token")).to_be_focused(timeout=_LIMIT)
+    page.keyboard.type(token)
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="Robots", exact=True).wait_for()
 
 
 def test_the_console(site: FleetSite, make_robot: MakeRobot) -> None:
@@ -48,8 +74,9 @@ def _look_around(site: FleetSite, page: Page) -> None:
     page.wait_for_url("**/login")
     page.get_by_label("Token").fill(site.token)
     page.get_by_role("button", name="Log in").click()
-    assert page.get_by_role("row", name="arm1").get_by_role("cell").first.inner_text() == "complete"
+    assert page.get_by_role("row", name="arm1").get_by_role("cell").nth(1).inner_text() == "complete"
     assert "never" in page.get_by_role("row", name="arm2").inner_text()
+    page.get_by_role("link", name="Search").click()
     page.get_by_label("text", exact=True).fill("owned")
     page.get_by_role("button", name="Search").click()
     records = page.get_by_role("table", name="Records").get_by_role("row")
@@ -79,3 +106,189 @@ def test_a_wrong_token_is_refused(site: FleetSite) -> None:
         given = client.post("/login", data={"token": site.token})
         cookie = given.headers["set-cookie"].lower()
         assert all(word in cookie for word in ("httponly", "secure", "samesite=strict", "__host-"))
+
+
+class RolloutSite:
+    """A collector with two rollouts of a group whose robots only report, an operator and a viewer."""
+
+    def __init__(self, site: FleetSite, folder: Path, make_robot: MakeRobot) -> None:
+        self.site = site
+        self.operator = Operator(site, folder / "operator")
+        serve_bundles(site, self.operator)
+        self.robots = [make_robot(f"arm{number}", group=PLACE) for number in range(3)]
+        self.report()
+        self.operator.rollout("start", BUNDLE, "--healthy", "600")
+        self.report(in_force=BUNDLE)
+
+    @property
+    def token(self) -> str:
+        """Return the operator's token."""
+        return self.operator.token.read_text().strip()
+
+    def report(self, **changes: Any) -> None:
+        """Report for all robots but the last one, which was never seen."""
+        report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
+        report |= {"site": "site-a", "group": "arms", "changed": False, "denials": 0, "failing": 0} | changes
+        for robot in self.robots[:-1]:
+            with self.site.client(robot.certificates) as client:
+                assert client.put("/v1/bundles/report", json=report).status_code == 204
+
+    def order(self, token: str, number: str, **headers: str) -> httpx.Response:
+        """Send the form that stops the rollout."""
+        cookie = {"Cookie": f"__Host-rosrv-fleet={token}"}
+        with self.site.client() as client:
+            return client.post(f"/rollouts/{PLACE}/stop", data={"number": number}, headers=cookie | headers)
+
+    def rollout(self) -> dict[str, Any]:
+        """Return the last rollout."""
+        return dict(self.site.get(f"/v1/rollouts/{PLACE}").json()["rollout"])
+
+
+@pytest.fixture
+def rollouts(site: FleetSite, tmp_path: Path, make_robot: MakeRobot) -> RolloutSite:
+    """Return a collector with a running rollout."""
+    return RolloutSite(site, tmp_path, make_robot)
+
+
+def _follow(page: Page, name: str) -> None:
+    """Press Tab until the link or button with this name has the focus, then Enter, and wait for the next page."""
+    focused = "document.activeElement.textContent.trim()"
+    for _ in range(60):
+        if page.evaluate(focused) == name:
+            with page.expect_navigation():
+                page.keyboard.press("Enter")
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{name} cannot be reached with the keyboard")
+
+
+def test_an_operator_stops_a_rollout_with_the_keyboard(rollouts: RolloutSite) -> None:
+    """Keyboard only: log in, open the group, stop its rollout after a confirmation; the history has the name."""
+    with opened_page() as page:
+        log_in(page, rollouts.site, rollouts.token)
+        for name in ("Rollouts", PLACE, "Stop…"):
+            _follow(page, name)
+        assert rollouts.rollout()["state"] == "running"
+        assert page.get_by_text("No further robot gets this bundle").is_visible()
+        _follow(page, "Stop the rollout")
+        assert "stop by olga" in page.get_by_role("table", name="History").inner_text()
+        assert "stopped by olga" in page.locator("main").inner_text()
+        robots = page.get_by_role("table", name="Robots").get_by_role("row")
+        assert "never seen" in robots.nth(1).inner_text()  # the problem is first
+        assert page.get_by_role("link", name="Stop…").count() == 0
+    assert rollouts.rollout()["state"] == "stopped"
+
+
+def test_only_an_operator_on_this_site_stops_a_rollout(rollouts: RolloutSite) -> None:
+    """A viewer sees no button and gets 403; so does a form of another site; an order about another rollout gets 409."""
+    viewer = rollouts.site.token
+    own = f"https://127.0.0.1:{rollouts.site.port}"
+    with opened_page() as page:
+        log_in(page, rollouts.site, viewer)
+        page.goto(f"{own}/rollouts/{PLACE}")
+        assert page.get_by_role("table", name="Rings").is_visible()
+        assert page.get_by_role("link", name="Stop…").count() == 0
+        answer = page.goto(f"{own}/rollouts/{PLACE}/stop")
+        assert answer is not None
+        assert answer.status == 403
+    number = str(rollouts.rollout()["number"])
+    assert rollouts.order(viewer, number, Origin=own).status_code == 403
+    for origin in ("https://elsewhere.example", "null", own.replace("https", "http")):
+        assert rollouts.order(rollouts.token, number, Origin=origin).status_code == 403
+    assert rollouts.order("unknown", number).headers["location"] == "/login"
+    for wrong in ("", "x", "999"):
+        assert rollouts.order(rollouts.token, wrong).status_code == 409
+    assert rollouts.rollout()["state"] == "running"
+    assert rollouts.order(rollouts.token, number, Origin=own).status_code == 303
+    assert rollouts.rollout()["state"] == "stopped"
+
+
+_VIEWS: tuple[tuple[Literal["light", "dark"], int], ...] = (("light", 1280), ("dark", 640), ("light", 320))
+PAGES = {
+    "robots": "/",
+    "nothing found": "/?name=unknown",
+    "rollouts": "/rollouts",
+    "one rollout": f"/rollouts/{PLACE}",
+    "stop": f"/rollouts/{PLACE}/stop",
+    "an unknown group": "/rollouts/site-a/legs",
+    "search": "/search",
+    "records": "/search?robot=arm0",
+    "no record": "/search?text=unknown",
+    "a wrong time": "/search?since=soon",
+    "evidence": "/evidence",
+    "no evidence": "/evidence?robot=unknown",
+}
+
+
+def test_axe_finds_nothing(rollouts: RolloutSite) -> None:
+    """On every page axe finds nothing, also in the dark; at 200 % and 400 % zoom no page is wider than the window."""
+    robot = rollouts.robots[0]
+    robot.record(
+        10, reason="no rule of the policy names 10.0.0.5, which registers /a_publisher_with_a_long_name"
+    )
+    robot.push()
+    bundle = str(incident(robot, rollouts.site.folder / "incident.zip"))
+    rollouts.operator.remote("evidence", "add", bundle, "--robot", robot.name)
+    rollouts.site.indexed()
+    found: dict[str, object] = {}
+    for theme, width in _VIEWS:
+        with opened_page(width, theme) as page:
+            found |= {f"{name}, {theme}, {width}": wrong for name, wrong in _violations(page, rollouts)}
+    assert {name: violations for name, violations in found.items() if violations} == {}
+
+
+def _violations(page: Page, rollouts: RolloutSite) -> Iterator[tuple[str, list[str]]]:
+    """Yield what is wrong with each page."""
+    page.goto(f"https://127.0.0.1:{rollouts.site.port}/login")
+    yield "login", _axe(page)
+    page.get_by_label("Token").fill("wrong")
+    page.keyboard.press("Enter")
+    page.get_by_text("This token is unknown").wait_for()
+    yield "a wrong token", _axe(page)
+    log_in(page, rollouts.site, rollouts.token)
+    for name, path in PAGES.items():
+        page.goto(f"https://127.0.0.1:{rollouts.site.port}{path}")
+        too_wide = page.evaluate("document.documentElement.scrollWidth > innerWidth")
+        yield name, _axe(page) + ["it is wider than the window"] * too_wide
+
+
+def _axe(page: Page) -> list[str]:
+    """Return the violations of WCAG 2.2 AA and best practices that axe-core finds."""
+    kinds = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+    found = Axe().run(page, options={"resultTypes": ["violations"], "runOnly": kinds})
+    return [
+        f"{one['id']}: {[node['target'] for node in one['nodes'][:3]]}"
+        for one in found.response["violations"]
+    ]
+
+
+def test_hundreds_of_robots_are_usable(site: FleetSite) -> None:
+    """With 250 robots, those with problems come first, a filter finds some, and each page has a hundred."""
+    assert site.data is not None
+    certificate = site.server.certificate.read_text()
+    long_ago, now = 1, time.time_ns()
+    for number in range(250):
+        added = long_ago if number == 200 else now
+        robot = Robot(
+            name=f"arm{number:03}", key=f"{number:064x}", certificate=certificate, added=added,
+            group=f"site-{number % 2}/arms",
+        )  # fmt: skip
+        (site.data / "robots" / f"{robot.name}.json").write_bytes(msgspec.json.encode(robot))
+    with opened_page() as page:
+        log_in(page, site, site.token)
+        rows = page.get_by_role("table", name="Robots").get_by_role("row")
+        assert rows.count() == 101
+        assert "arm200" in rows.nth(1).inner_text()
+        assert "arm000" in rows.nth(2).inner_text()
+        page.get_by_role("link", name="Next").click()
+        page.get_by_role("link", name="Next").click()
+        assert page.get_by_text("201 to 250 of 250").is_visible()
+        page.get_by_role("link", name="1 with problems").click()
+        assert rows.count() == 2
+        page.get_by_label("state").select_option("")
+        page.get_by_label("name").fill("M04")
+        page.get_by_label("group").select_option("site-1/arms")
+        page.get_by_role("button", name="Show").click()
+        assert [rows.nth(number).get_by_role("rowheader").inner_text() for number in range(1, rows.count())] == [
+            "arm041", "arm043", "arm045", "arm047", "arm049",
+        ]  # fmt: skip

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import psycopg
 import pytest
-from rosrv_fleet.database import MIGRATIONS, Database, migrate
+from rosrv_fleet.database import MIGRATIONS, IndexDatabase, migrate
 
 
 def test_migrations_run_once_and_in_order(database: str) -> None:
@@ -26,7 +26,7 @@ def test_a_failed_migration_changes_nothing(database: str, tmp_path: Path) -> No
 
 def test_a_reading_transaction_is_limited_and_cannot_write(database: str) -> None:
     """A search that takes too long is cancelled, and its transaction writes nothing."""
-    index = Database(database, connections=1, statement_seconds=0.2)
+    index = IndexDatabase(database, connections=1, statement_seconds=0.2)
     index.open()
     try:
         with pytest.raises(psycopg.errors.QueryCanceled), index.reading() as connection:

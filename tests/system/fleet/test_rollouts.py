@@ -1,9 +1,11 @@
 """Rollouts with robots that use the real client, a real collector and PostgreSQL."""
 
+import asyncio
 import json
 import shutil
 import ssl
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,16 +13,19 @@ from typing import Any
 
 import httpx
 import pytest
-from rosrv_fleet.rollouts.console_section import rollouts_section
-from rosrv_fleet.rollouts.store import Group
+from rosrv_fleet.console.rollout_pages import group_page, groups_page
+from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.rollouts.machine import BundleRollout
+from rosrv_fleet.rollouts.service import RolloutRefusedError
 
-from appliance.bundles.collector_connection import robot_context
 from appliance.bundles.poller import Poller
 from appliance.bundles.terms import BundlePath, Ring
 from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
+from appliance.collector.connection import robot_context
 from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
-from tests.support.rollout_collector import RolloutCollector, collector
+from tests.support.rollout_collector import RolloutCollector, collector, serving
 from tests.support.waiting import eventually
+from tests.system.fleet.postgres import PostgresCluster
 
 QUICK = {"healthy_seconds": 0, "share": 0.9}
 RINGS = (Ring("canary", ["r-0", "r-1"]), Ring("half", [], 50), Ring("rest", [], 100))
@@ -66,6 +71,7 @@ class Fleet:
         """Add robots."""
         for _ in range(count):
             name = f"r-{len(self.robots)}"
+            self.collector.enrol(RobotGroup(SITE, GROUP), name)
             client = self.site.robot(self.collector.url, self.folder / name, name)
             robot = Robot(
                 name,
@@ -172,9 +178,11 @@ def test_a_bad_canary_stops_the_rollout(fleet: Fleet) -> None:
     fleet.start(path)
     state = fleet.until(lambda state: state["state"] == "stopped")
     assert "refused: policy.ini:3:1" in state["why"]
-    section = rollouts_section(fleet.collector.service)
-    assert '<td class="bad">stopped: ' in section
-    assert "<script>" not in section
+    service = fleet.collector.service
+    pages = groups_page(service) + group_page(service, RobotGroup(SITE, GROUP), may_change=True)
+    assert '<span class="badge bad">stopped</span>' in pages
+    assert "error: &lt;script&gt;" in pages
+    assert "<script>" not in pages
     fleet.poll()
     assert {name for name, robot in fleet.robots.items() if robot.taken} <= {"r-1"}
 
@@ -205,7 +213,9 @@ def test_a_robot_speaks_for_itself_only(fleet: Fleet) -> None:
     """A report has the name of the certificate, a robot is not an operator, and clients without one get no answer."""
     fleet.add(1)
     fleet.poll()
-    assert set(fleet.collector.service.robots[Group(SITE, GROUP)]) == {"r-0"}
+    eventually(
+        lambda: set(fleet.collector.service.robots.get(RobotGroup(SITE, GROUP), ())) == {"r-0"}, "it reported"
+    )
     certificate, key = fleet.site.authority.issue("r-0")
     with httpx.Client(verify=_context(fleet.site, certificate, key), trust_env=False) as robot:
         assert robot.get(f"{fleet.collector.url}/v1/rollouts").status_code == 403
@@ -240,6 +250,15 @@ def test_an_event_wakes_the_robot(fleet: Fleet) -> None:
     assert woken.is_set()
 
 
+def test_a_stream_ends_that_opens_while_the_collector_stops(fleet: Fleet) -> None:
+    """A request that began before the stop may open its stream afterwards; the stop need not wait for it."""
+    fleet.add(1)
+    fleet.collector.service.end_streams()
+    connection = fleet.site.connection(fleet.collector.url, "r-0")
+    parts = list(connection.events(f"v1/bundles/events/{SITE}/{GROUP}"))
+    assert b"event: selection" not in b"".join(parts)
+
+
 def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
     """While the files of a snapshot are missing or damaged, the collector signs no timestamp for it and says why."""
     service = fleet.collector.service
@@ -256,3 +275,229 @@ def test_half_of_a_publication_is_not_served(fleet: Fleet) -> None:
     eventually(lambda: "publish it again" in service.trouble, lambda: service.trouble)
     shutil.move(hidden, archive)
     eventually(lambda: not service.trouble and service.timestamp != before, lambda: service.trouble)
+
+
+def _put(fleet: Fleet, name: str, **changes: Any) -> httpx.Response:
+    """Send a robot's report, as a compromised robot could write it."""
+    report: dict[str, Any] = dict.fromkeys(("in_force", "trying", "refused", "reason", "trouble"), "")
+    report |= {"site": SITE, "group": GROUP, "changed": False, "denials": 0, "failing": 0} | changes
+    certificate, key = fleet.site.authority.issue(name)
+    with httpx.Client(verify=_context(fleet.site, certificate, key), timeout=30, trust_env=False) as robot:
+        return robot.put(f"{fleet.collector.url}/v1/bundles/report", json=report)
+
+
+def test_a_robot_of_another_group_has_no_part_in_a_rollout(fleet: Fleet) -> None:
+    """Reports, selections, bundles and events for another group than the enrolled one get 403; the rollout goes on."""
+    fleet.add(2)
+    other = RobotGroup(SITE, "legs")
+    fleet.collector.enrol(other, "liar")
+    path = fleet.publish(*RINGS)
+    fleet.poll()
+    fleet.start(path)
+    answer = _put(fleet, "liar", refused=str(path), reason="a lie")
+    assert answer.status_code == 403
+    assert "liar is enrolled in site-a/legs, not in site-a/arms" in answer.text
+    assert "rosrv-fleet robot group liar SITE/GROUP" in answer.text
+    certificate, key = fleet.site.authority.issue("liar")
+    with httpx.Client(verify=_context(fleet.site, certificate, key), trust_env=False) as robot:
+        for place in ("selection/{}", "events/{}", "targets/{}/" + "0" * 64 + ".1.tar"):
+            url = f"{fleet.collector.url}/v1/bundles/{place.format(f'{SITE}/{GROUP}')}"
+            assert robot.get(url).status_code == 403
+    fleet.until(lambda state: state["state"] == "done")
+    assert set(fleet.collector.service.robots) == {RobotGroup(SITE, GROUP), other}
+    fleet.collector.enrol(other, "r-1")
+    eventually(lambda: len(fleet.collector.service.robots[other]) == 2, "r-1 has moved")
+    assert _put(fleet, "r-1").status_code == 403
+    assert _put(fleet, "nobody").status_code == 403
+
+
+def test_enrolled_robots_that_never_reported_are_visible(fleet: Fleet) -> None:
+    """A robot that is enrolled and never reported is in its group as never seen, and holds up nothing."""
+    fleet.add(2)
+    fleet.collector.enrol(RobotGroup(SITE, GROUP), "absent")
+    path = fleet.publish(Ring("all", [], 100))
+    fleet.poll()
+    fleet.start(path)
+    fleet.until(lambda state: state["state"] == "done")
+    robots = fleet.operator.get(f"/v1/rollouts/{SITE}/{GROUP}").json()["robots"]
+    assert {one["name"]: one["condition"] for one in robots} == {
+        "absent": "never seen",
+        "r-0": "in force",
+        "r-1": "in force",
+    }
+
+
+@pytest.mark.parametrize(
+    ("lie", "reason"),
+    [
+        ({"in_force": "../../x"}, "not SITE/GROUP/VERSION.tar"),
+        ({"trying": "latest"}, "not SITE/GROUP/VERSION.tar"),
+        ({"denials": -1}, "not between 0"),
+        ({"failing": 2_000_000_000}, "not between 0"),
+    ],
+)
+def test_an_impossible_report_is_rejected(fleet: Fleet, lie: dict[str, Any], reason: str) -> None:
+    """A report that no robot writes is rejected with the reason, and changes nothing."""
+    fleet.add(1)
+    answer = _put(fleet, "r-0", **lie)
+    assert answer.status_code == 422
+    assert reason in answer.text
+    assert not fleet.collector.call(_seen(fleet, "r-0"))
+
+
+async def _seen(fleet: Fleet, name: str) -> bool:
+    await fleet.collector.service.tick()
+    return fleet.collector.service.robots[RobotGroup(SITE, GROUP)][name].seen > 0
+
+
+def test_a_reason_with_a_null_character_stops_only_its_rollout(fleet: Fleet) -> None:
+    """A reason that PostgreSQL cannot store stops the rollout like any other, and no other work of the collector."""
+    fleet.add(2)
+    path = fleet.publish(*RINGS)
+    fleet.poll()
+    fleet.start(path)
+    assert _put(fleet, "r-0", refused=str(path), reason="x\0y").status_code == 204
+    state = eventually(
+        lambda: (state := fleet.state())["state"] == "stopped" and state, lambda: json.dumps(fleet.state())
+    )
+    assert "refused: x\ufffdy" in state["why"]
+    assert fleet.collector.service.advancing
+
+
+def test_removed_robots_do_not_count(fleet: Fleet) -> None:
+    """A robot that is removed during a rollout counts no more; a ring that loses all its robots stops the rollout."""
+    fleet.add(4)
+    path = fleet.publish(*RINGS)
+    fleet.poll()
+    fleet.robots["r-1"].judge = lambda _bundle: "never"
+    fleet.start(path, healthy_seconds=600, tolerance=0.6)
+    fleet.until(lambda state: state["rings"][0]["refused"] == 1)
+    del fleet.collector.groups["r-1"]
+    state = fleet.until(lambda state: state["rings"][0]["robots"] == 1 and state["why"] == "healthy")
+    assert state["state"] == "running"
+    del fleet.collector.groups["r-0"]
+    state = fleet.until(lambda state: state["state"] == "stopped")
+    assert state["why"] == "no robot of ring canary is enrolled in the group any more"
+
+
+def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: Fleet, database: str) -> None:
+    """After an hour without a collector a rollout goes on: robots are not silent, and the healthy time begins again."""
+    fleet.add(54)
+    path = fleet.publish(*RINGS)
+    fleet.poll()
+    fleet.start(path, healthy_seconds=600)
+    fleet.until(lambda state: state["why"] == "healthy")
+    made = RolloutCollector(fleet.site.repository.folder, fleet.site.authority, database, ahead=3600)
+    made.enrol(RobotGroup(SITE, GROUP), *fleet.robots)
+    with serving(made) as later:
+        service = later.service
+        stored = eventually(lambda: service.rollouts.get(RobotGroup(SITE, GROUP)), "the rollout is read")
+        eventually(lambda: service.timestamp is not None, "a timestamp")
+        later.call(service.tick())
+        stored = service.rollouts[RobotGroup(SITE, GROUP)]
+        assert (stored.rollout.state, stored.rollout.ring) == ("running", 0)
+        assert {one.kind for one in service.conditions(RobotGroup(SITE, GROUP)).values()} == {
+            "in force",
+            "no bundle",
+        }
+        healthy = eventually(
+            lambda: service.rollouts[RobotGroup(SITE, GROUP)].rollout.healthy, "it is healthy"
+        )
+        assert healthy > stored.rollout.started + 3000
+
+
+def test_a_rollout_survives_a_restart_of_postgresql(fleet: Fleet, cluster: PostgresCluster) -> None:
+    """While PostgreSQL is down, robots get their selections and orders get 503; afterwards the rollout ends."""
+    fleet.add(4)
+    path = fleet.publish(*RINGS)
+    fleet.poll()
+    fleet.start(path, healthy_seconds=2)
+    fleet.until(lambda state: state["rings"][0]["in_force"] == 2)
+    cluster.kill()
+    try:
+        assert fleet.operator.post(f"/v1/rollouts/{SITE}/{GROUP}/stop").status_code == 503
+        assert _put(fleet, "r-0", in_force=str(path)).status_code == 503
+        assert fleet.collector.service.selection("r-0", RobotGroup(SITE, GROUP)) == str(path)
+    finally:
+        cluster.start()
+    fleet.until(lambda state: state["state"] == "done")
+
+
+def test_a_withdrawn_bundle_stops_its_rollout(fleet: Fleet) -> None:
+    """Withdrawing a bundle during its rollout stops it; no robot is asked to take a bundle that is not signed."""
+    fleet.add(4)
+    first = fleet.publish(Ring("all", [], 100))
+    fleet.poll()
+    fleet.start(first)
+    fleet.until(lambda state: state["state"] == "done")
+    second = fleet.publish(*RINGS, policy_dot_ini="[Nodes]\n")
+    fleet.start(second, healthy_seconds=600)
+    fleet.until(lambda state: state["rings"][0]["in_force"] == 2)
+    fleet.site.repository.withdraw(second)
+    state = fleet.until(lambda state: state["state"] == "stopped")
+    assert state["why"] == f"{second} was withdrawn"
+    fleet.poll()
+    assert {robot.poller.progress.trouble for robot in fleet.robots.values()} == {""}
+
+
+def test_a_bundle_that_is_signed_in_the_future_does_not_start(fleet: Fleet) -> None:
+    """A rollout of a bundle from a machine whose clock is ahead is refused with the remedy."""
+    fleet.add(1)
+    terms = everywhere(time.time() + 7200, Ring("all", [], 100))
+    path = fleet.site.repository.add(SITE, GROUP, bundle_files(), terms)
+    service = fleet.collector.service
+    eventually(
+        lambda: service.publication and str(path) in service.publication.bundles, lambda: service.trouble
+    )
+    answer = fleet.operator.post("/v1/rollouts", json={"bundle": str(path)})
+    assert answer.status_code == 409
+    assert "in the future: correct the clock" in answer.text
+
+
+def test_the_history_names_the_operators(fleet: Fleet) -> None:
+    """Start, stop and revert are in the history with the operator's name and the time; of two stops, one counts."""
+    fleet.add(2)
+    first = fleet.publish(Ring("all", [], 100))
+    fleet.poll()
+    fleet.start(first)
+    fleet.until(lambda state: state["state"] == "done")
+    second = fleet.publish(*RINGS, policy_dot_ini="[Nodes]\n")
+    fleet.start(second, healthy_seconds=600)
+    began = time.time()
+    service, place = fleet.collector.service, RobotGroup(SITE, GROUP)
+
+    async def both() -> tuple[Any, ...]:
+        orders = (service.stop(place, "olga"), service.stop(place, "otto"))
+        return await asyncio.gather(*orders, return_exceptions=True)
+
+    fleet.collector.call(both())
+    assert fleet.operator.post(f"/v1/rollouts/{SITE}/{GROUP}/revert").status_code == 200
+    acts = fleet.operator.get(f"/v1/rollouts/{SITE}/{GROUP}").json()["history"][0]["acts"]
+    assert [act["act"] for act in acts] == ["start", "stop", "revert"]
+    assert (acts[0]["who"], acts[2]["who"]) == ("operator", "operator")
+    assert acts[1]["who"] in ("olga", "otto")
+    assert abs(acts[2]["at"] - began) < 60
+    with pytest.raises(RolloutRefusedError, match="changed in the meantime"):
+        fleet.collector.call(service.revert(place, "olga", number=1))
+
+
+def test_a_start_and_a_revert_at_the_same_time_exclude_each_other(fleet: Fleet) -> None:
+    """A start that was decided on a state which a revert has changed since is refused."""
+    fleet.add(2)
+    paths = [
+        fleet.publish(Ring("all", [], 100), policy_dot_ini=f"[Nodes]\n# {number}\n") for number in (1, 2)
+    ]
+    fleet.poll()
+    for path in paths:
+        fleet.start(path)
+        fleet.until(lambda state: state["state"] == "done")
+    store, place = fleet.collector.service.store, RobotGroup(SITE, GROUP)
+    before = store.latest()[place]
+    rollout = BundleRollout(
+        str(paths[0]), str(paths[1]), before.rollout.terms, before.rollout.gates, time.time()
+    )
+    assert fleet.operator.post(f"/v1/rollouts/{SITE}/{GROUP}/revert").status_code == 200
+    assert store.begin(place, before, rollout, time.time()) is None
+    now = store.latest()[place]
+    assert store.begin(place, now, rollout, time.time()) is not None
+    assert not store.replace(place, now, now.rollout, time.time())  # no longer the last one

@@ -8,6 +8,7 @@ from rosrv_fleet.bundles.publication import PublicationError, read_publication
 from typer.testing import CliRunner, Result
 
 from tests.support.bundle_site import PASSPHRASE, POLICY
+from tests.support.unreadable_folders import make_unreadable
 
 
 class Desk:
@@ -62,6 +63,14 @@ def test_a_bundle_from_the_folder_to_the_collector(desk: Desk) -> None:
     assert list(read_publication(served).bundles) == ["site-a/arms/2.tar"]
     assert "site-a/arms/2.tar" in desk.good("list")
     assert not list(served.rglob("*.pem"))
+
+
+def test_a_folder_that_may_not_be_read_is_not_signed(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bundle would be signed without the files in it, for example without its monitors."""
+    (desk.robot / "monitors").mkdir()
+    make_unreadable(desk.robot / "monitors", monkeypatch)
+    done = desk.run("add", "site-a/arms", str(desk.robot))
+    assert (done.exit_code, "Permission denied" in done.output, "signed;" in done.output) == (1, True, False)
 
 
 def test_a_bundle_with_errors_is_not_signed(desk: Desk) -> None:

@@ -1,18 +1,29 @@
 """Tests of `rosrv_fleet.config`: a wrong file is refused with its key and the reason."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
-from rosrv_fleet.config import ConfigError, load_config
+from rosrv_fleet.config import FleetConfigError, load_config
 
 from tests.support.sources import ROOT
 
 
 def test_the_example_is_valid() -> None:
-    """The example has a valid configuration; paths are relative to its folder."""
+    """The example has a valid configuration; its certificate is that of `init`."""
     found = load_config(ROOT / "fleet/fleet.example.yaml")
-    assert found.certificate == ROOT / "fleet/server.pem"
+    assert found.certificate == Path("/var/lib/rosrv-fleet/server.pem")
     assert found.address == ("0.0.0.0", 8444)
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    """Also the default paths of the certificate and its key, which are in the data folder."""
+    file = tmp_path / "fleet.yaml"
+    file.write_text("data: here\n")
+    assert load_config(file).key == tmp_path / "here/server.key"
+    file.write_text("data: here\ncertificate: own.pem\nkey: own.key\n")
+    assert load_config(file).certificate == tmp_path / "own.pem"
 
 
 @pytest.mark.parametrize(
@@ -24,6 +35,7 @@ def test_the_example_is_valid() -> None:
         ("certificate: a\nkey: b\nlisten: h:99999", "no valid port"),
         ("certificate: a\nkey: b\ntypo: 1", "typo"),
         ("certificate: a\nkey: b\nlimits: {uploads: 0}", "limits.uploads"),
+        ("certificate: a\nkey: b\nevidence: {bundle_bytes: 0}", "evidence.bundle_bytes"),
         ("certificate: [a]\nkey: b", "path"),
         (":", "fleet.yaml"),
     ],
@@ -32,6 +44,19 @@ def test_a_wrong_configuration_is_refused(text: str, why: str, tmp_path: Path) -
     """The error has the file and the reason."""
     file = tmp_path / "fleet.yaml"
     file.write_text(text)
-    with pytest.raises(ConfigError, match=why) as error:
+    with pytest.raises(FleetConfigError, match=why) as error:
         load_config(file)
     assert str(file) in str(error.value)
+
+
+def test_an_unreadable_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names the user that must read the file, who is another one in the container, and the command."""
+    file = tmp_path / "fleet.yaml"
+
+    def refuse(_path: Path, encoding: str | None = None) -> str:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", refuse)
+    monkeypatch.setattr(os, "geteuid", lambda: 61030)
+    with pytest.raises(FleetConfigError, match=r"denied; let user 61030 read it, .* chmod 644 fleet.yaml"):
+        load_config(file)

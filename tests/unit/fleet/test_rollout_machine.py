@@ -5,12 +5,14 @@ from collections.abc import Mapping
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosrv_fleet.rollouts.conditions import conditions
 from rosrv_fleet.rollouts.machine import (
+    BundleRollout,
     HealthGates,
     RobotSeen,
-    Rollout,
     advanced,
     counts,
+    resumed,
     reverted,
     ring_of,
     selected,
@@ -41,9 +43,9 @@ looks = st.lists(
 )
 
 
-def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> Rollout:
+def begun(terms: Terms | None = None, gates: HealthGates = GATES) -> BundleRollout:
     """Return a new rollout at time 0."""
-    return Rollout(NEW, OLD, terms or Terms(0, RINGS), gates, 0.0)
+    return BundleRollout(NEW, OLD, terms or Terms(0, RINGS), gates, 0.0)
 
 
 def all_at(now: float, in_force: str = NEW) -> dict[str, RobotSeen]:
@@ -103,19 +105,14 @@ def test_healthy_robots_finish_a_rollout() -> None:
         (RobotSeen(60, NEW, failing=1), "1 monitors fail"),
         (RobotSeen(60, "", trying=NEW, denials=12), "denials"),
         (RobotSeen(-200, NEW), "silent"),
-        (None, "report is gone"),
     ],
 )
-def test_a_bad_canary_stops(sick: RobotSeen | None, word: str) -> None:
+def test_a_bad_canary_stops(sick: RobotSeen, word: str) -> None:
     """One canary that refuses, denies more, fails or is silent stops the rollout, with the reason."""
     known = {robot: RobotSeen(0, OLD, denials=4) for robot in ROBOTS}
     rollout = advanced(begun(), known, 0)
     assert rollout.ring == 0
-    robots = all_at(60)
-    if sick is None:
-        del robots["r1"]
-    else:
-        robots["r1"] = sick
+    robots = all_at(60) | {"r1": sick}
     rollout = advanced(rollout, robots, 60)
     assert rollout.state == "stopped"
     assert word in rollout.why
@@ -158,3 +155,51 @@ def test_a_canary_ring_without_robots_waits() -> None:
     assert rollout.ring == -1
     assert "no robot of the first ring" in rollout.why
     assert stopped(rollout, "by hand").state == "stopped"
+
+
+def test_a_removed_robot_counts_no_more() -> None:
+    """A canary that has left the group neither stops the rollout nor is waited for; without any canary it stops."""
+    rollout = advanced(begun(), all_at(0), 0)
+    robots = all_at(10)
+    del robots["r1"]
+    assert advanced(rollout, robots, 10).why == "healthy"
+    del robots["r0"]
+    late = advanced(rollout, robots, 10)
+    assert late.state == "stopped"
+    assert "no robot of ring canary is enrolled" in late.why
+
+
+def test_a_time_without_a_collector_counts_for_no_gate() -> None:
+    """After `resumed`, neither the time of health nor the time to take the ring includes the collector's absence."""
+    rollout = advanced(advanced(begun(), all_at(0), 0), all_at(1), 1)
+    assert rollout.healthy == 1
+    later = resumed(rollout, 5000)
+    assert advanced(later, all_at(5001), 5001).ring == 0
+    assert advanced(later, all_at(5001, OLD), 5001).state == "running"
+    assert advanced(rollout, all_at(5001, OLD), 5001).state == "stopped"
+
+
+@pytest.mark.parametrize(
+    ("seen", "kind", "why"),
+    [
+        (RobotSeen(), "never seen", "never reported"),
+        (RobotSeen(10), "silent", "no report for 990 s"),
+        (RobotSeen(1000, NEW, failing=1), "unhealthy", "1 monitors fail"),
+        (RobotSeen(1000, OLD, refused=NEW, reason="a test"), "unhealthy", "refused: a test"),
+        (RobotSeen(1000, OLD, trouble="no route"), "behind", "no route"),
+        (RobotSeen(1000, NEW), "in force", ""),
+        (RobotSeen(1000, NEW, changed=True), "in force", "changed by an operator"),
+    ],
+)
+def test_the_condition_is_the_worst_that_applies(seen: RobotSeen, kind: str, why: str) -> None:
+    """The condition of a robot says what is wrong with it first, and why."""
+    rollout = advanced(begun(), all_at(0), 0)
+    found = conditions(rollout, all_at(1000) | {"r0": seen}, 1000)["r0"]
+    assert found.kind == kind
+    assert why in found.why
+
+
+def test_without_a_rollout_a_robot_is_not_behind() -> None:
+    """In a group without a rollout a robot has no bundle, or still the one of its former group."""
+    found = conditions(None, {"r0": RobotSeen(1000), "r1": RobotSeen(1000, OLD), "r2": RobotSeen(5)}, 1000)
+    assert [one.kind for one in found.values()] == ["no bundle", "in force", "silent"]

@@ -1,0 +1,67 @@
+"""Record each change of robots, invitations, tokens and evidence with its author, in a file of the data folder.
+
+Invariants:
+1. No change takes effect without a record on the disk: the act is recorded before, with the result `asked`.
+2. A second line has the result: `done`, or `failed: REASON`. An act without this line ended in between (a crash, a full
+   disk), and may have taken effect.
+"""
+
+import contextlib
+import datetime
+import errno
+import fcntl
+import json
+import os
+import pwd
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+FILE = "acts.ndjson"
+
+
+@contextmanager
+def recorded(data: Path, act: str, about: str, detail: str = "", who: str = "") -> Iterator[None]:
+    """Record an act of `who` (default: this command's user), run the block that carries it out, and record the result.
+
+    With sudo, the user is the one who called sudo. Raises `OSError` if the act cannot be recorded; then the block does
+    not run.
+    """
+    fields = {"who": who or _user(), "act": act, "about": about, "detail": detail}
+    _append(data, fields | {"result": "asked"})
+    result = "done"
+    try:
+        yield
+    except BaseException as error:
+        result = f"failed: {str(error) or type(error).__name__}"
+        raise
+    finally:
+        with contextlib.suppress(OSError):  # the act is recorded already
+            _append(data, fields | {"result": result})
+
+
+def _append(data: Path, fields: dict[str, str]) -> None:
+    time = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+    line = json.dumps({"time": time} | fields).encode() + b"\n"
+    with contextlib.ExitStack() as opened:
+        folder = os.open(data, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        opened.callback(os.close, folder)
+        file = os.open(FILE, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600, dir_fd=folder)
+        opened.callback(os.close, file)
+        fcntl.flock(file, fcntl.LOCK_EX)
+        end = os.fstat(file).st_size
+        if end and os.pread(file, 1, end - 1) != b"\n":  # a full disk or a crash cut the last line off
+            line = b"\n" + line
+        if os.write(file, line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / FILE))
+        os.fsync(file)
+        os.fsync(folder)
+
+
+def _user() -> str:
+    try:
+        own = pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:
+        own = str(os.getuid())
+    behind = os.environ.get("SUDO_USER", "")
+    return f"{behind} as {own}" if behind and os.getuid() == 0 else own

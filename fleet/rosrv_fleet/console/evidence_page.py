@@ -1,0 +1,50 @@
+"""The page of the evidence bundles, which only the command `rosrv-fleet evidence` adds."""
+
+from collections.abc import Mapping
+
+from appliance.audit.record_format import rfc3339
+from rosrv_fleet.collector import Collector
+from rosrv_fleet.console.frame import Column, field, link, moment, row, table, text
+from rosrv_fleet.evidence.store import StoredEvidence
+
+FILTERS = ("robot", "id")
+_COLUMNS = (
+    Column("Robot"),
+    Column("From (UTC)"),
+    Column("Until"),
+    Column("Recording"),
+    Column("Records", number=True),
+    Column("Bytes", number=True),
+    Column("Checkpoints"),
+    Column("Added"),
+    Column("Bundle"),
+)
+
+
+def evidence_page(collector: Collector, asked: Mapping[str, str], *, may_get: bool) -> str:
+    """Return the page's body; `may_get` adds links to the bundles. Raises `OSError`."""
+    stored = collector.evidence.all(asked["robot"])
+    rows = (_bundle(one, may_get=may_get) for one in stored if asked["id"] in ("", one.id))
+    return (
+        '<h1>Evidence</h1><form class="filter" action="/evidence" role="search" aria-label="Evidence">'
+        + field("robot", asked["robot"])
+        + "<button>Show</button></form>"
+        + table("Evidence bundles", _COLUMNS, rows, "None: rosrv-fleet evidence add FILE --robot NAME")
+    )
+
+
+def _bundle(one: StoredEvidence, *, may_get: bool) -> str:
+    name = one.id[:12]
+    return row(
+        _COLUMNS,
+        (
+            link("/evidence", one.robot, robot=one.robot),
+            *(text(rfc3339(at)[:19].replace("T", " ")) for at in (one.since, one.until)),
+            text(one.recording),
+            f"{one.records:,}",
+            f"{one.bytes:,}",
+            f"{one.collected:,} of {one.checkpoints:,} are collected",
+            f"{moment(one.added / 10**9)} by {text(one.by)}",
+            link(f"/v1/evidence/{one.id}", name) if may_get else text(name),
+        ),
+    )

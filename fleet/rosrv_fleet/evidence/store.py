@@ -1,0 +1,131 @@
+"""Store verified evidence bundles as files.
+
+    evidence/ID/bundle.zip    a bundle; its id is its SHA-256
+    evidence/ID/about.json    `StoredEvidence`
+    evidence/incoming/        uploads that are not verified, and bundles while they are removed
+
+A folder gets its id in one step, when both files are on the disk. It never changes until `remove`.
+"""
+
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import structlog
+
+from appliance.audit.record_format import rfc3339
+from appliance.base.atomic_files import write_whole
+from rosrv_fleet.acts import recorded
+from rosrv_fleet.robots import make_folder
+from rosrv_fleet.segment_store import sync
+from rosrv_fleet.stored_files import DamagedFileError, read_stored
+
+BUNDLE = "bundle.zip"
+_ABOUT = "about.json"
+_ID = re.compile("[0-9a-f]{64}")
+_log = structlog.get_logger()
+
+
+class EvidenceContent(msgspec.Struct, frozen=True, kw_only=True):
+    """The verified content of an evidence bundle; times are nanoseconds since the epoch.
+
+    It has `records` records of `log` from `since` (inclusive) to `until` (exclusive), and the messages of `recording`,
+    if that is not empty. `collected` of its `checkpoints` are also in the robot's collected segments. `unproven` lists
+    facts that the robot's log does not prove.
+    """
+
+    log: str
+    since: int
+    until: int
+    recording: str
+    records: int
+    checkpoints: int
+    collected: int
+    unproven: list[str]
+
+
+class StoredEvidence(EvidenceContent, frozen=True, kw_only=True):
+    """A stored bundle of `robot`, and the operator (`by`) who added it."""
+
+    id: str
+    robot: str
+    bytes: int
+    added: int
+    by: str
+
+    def has(self, record: Mapping[str, Any]) -> bool:
+        """Whether it contains a record of a search."""
+        is_same_log = self.robot == record["robot"] and self.log == record["log"]
+        return is_same_log and rfc3339(self.since) <= str(record["time"]) < rfc3339(self.until)
+
+
+class EvidenceStore:
+    """The evidence bundles in a folder. Thread-safe; one process adds."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[str, StoredEvidence] = {}
+        self._damaged: set[str] = set()
+        make_folder(folder / "incoming")
+
+    def remove_unfinished(self) -> None:
+        """Remove the uploads that a killed collector left; no other may run."""
+        for upload in (self._folder / "incoming").iterdir():
+            shutil.rmtree(upload)
+
+    def incoming(self) -> Path:
+        """Return a new folder for the file `BUNDLE`; the caller removes the folder unless it was kept."""
+        return Path(tempfile.mkdtemp(dir=self._folder / "incoming"))
+
+    def keep(self, upload: Path, about: StoredEvidence) -> None:
+        """Store a verified upload and record the act; when this returns, it is on the disk. Raises `OSError`."""
+        bundle = upload / BUNDLE
+        bundle.chmod(0o400)
+        sync(bundle)
+        write_whole(upload / _ABOUT, msgspec.json.encode(about), 0o400)
+        with recorded(self._folder.parent, "evidence add", about.robot, about.id, about.by):
+            upload.rename(self._folder / about.id)
+            sync(self._folder)
+
+    def remove(self, evidence: str) -> StoredEvidence | None:
+        """Remove a bundle and record the act; return what it was, or None if there is none. Raises like `get`."""
+        about = self.get(evidence) if _ID.fullmatch(evidence) else None
+        if about is not None:
+            removed = self.incoming()  # a killed command leaves it there
+            with recorded(self._folder.parent, "evidence remove", about.robot, evidence):
+                (self._folder / evidence).rename(removed / evidence)
+                sync(self._folder)
+            shutil.rmtree(removed)
+        return about
+
+    def path(self, evidence: str) -> Path:
+        """Return the file of a bundle."""
+        return self._folder / evidence / BUNDLE
+
+    def get(self, evidence: str) -> StoredEvidence | None:
+        """Return the bundle with this id, or None. Raises `OSError`."""
+        try:
+            return read_stored(self._folder / evidence / _ABOUT, StoredEvidence)
+        except FileNotFoundError:
+            return None
+
+    def all(self, robot: str = "") -> list[StoredEvidence]:
+        """Return the bundles of a robot (default: of all robots), the latest first. Raises `OSError`.
+
+        One whose description is damaged is missing here, and is logged once.
+        """
+        names = {path.name for path in self._folder.iterdir() if _ID.fullmatch(path.name)}
+        for name in names - self._known.keys():
+            try:
+                if (found := self.get(name)) is not None:
+                    self._known[name] = found
+            except DamagedFileError as error:
+                if name not in self._damaged:
+                    _log.error("an evidence bundle is not listed", reason=str(error))
+                    self._damaged.add(name)
+        known = (self._known[name] for name in names & self._known.keys())
+        return sorted((one for one in known if robot in ("", one.robot)), key=lambda one: -one.added)

@@ -1,0 +1,23 @@
+"""Name what failed in the collector's background work, which continues after every failure."""
+
+from concurrent.futures.process import BrokenProcessPool
+
+import psycopg
+import structlog
+
+_PARTS = (
+    (psycopg.Error, "the database"),
+    (BrokenProcessPool, "a worker"),
+    (OSError, "the store"),  # a full disk takes no marker
+)
+_log = structlog.get_logger()
+
+
+def failure_of(error: Exception) -> str:
+    """Return which part failed and why. An error that no part raises is a defect; its traceback is logged."""
+    reason = str(error).strip() or type(error).__name__
+    for kind, part in _PARTS:
+        if isinstance(error, kind):
+            return f"{part}: {reason}"
+    _log.error("a defect of rosrv-fleet, please report it", exc_info=error)
+    return f"a defect of rosrv-fleet, please report it: {type(error).__name__}: {reason}"

@@ -1,0 +1,118 @@
+"""Keep the invitations with which robots enrol themselves.
+
+Invariants:
+
+1. Only the output of `add` has a token; its hash is the name of its file. The secret has 256 random bits, so a fast
+   hash is enough.
+2. A token is valid for one request of one robot, until it expires, or a newer invitation of the robot replaces it, or
+   it is withdrawn. The first request is noted in the file before the robot is enrolled. Repeating it is harmless, also
+   after a crash; any other request with this token is rejected.
+3. Whatever else changes a robot's certificate withdraws its invitations, so no repeated request can undo it.
+"""
+
+import hashlib
+import re
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+
+from appliance.base.atomic_files import write_whole
+from rosrv_fleet.acts import recorded
+from rosrv_fleet.robots import EnrolmentError, changing
+
+_TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
+
+
+class InvalidInvitationError(Exception):
+    """A token that is not valid; the text does not reveal why."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the invitation is wrong, already used or expired: make another one on the collector"
+            " (rosrv-fleet robot invite NAME)"
+        )
+
+
+class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A robot that may join until `expires` (seconds since the epoch). `group` is SITE/GROUP, or empty.
+
+    `request` is the SHA-256 of the request that used the invitation, in hexadecimal; empty: none has.
+    """
+
+    name: str
+    group: str
+    expires: float
+    request: str = ""
+
+
+class Invitations:
+    """The invitations in a folder of the data folder, one file each; a running collector immediately accepts new ones.
+
+    Making and withdrawing one are acts (`recorded`).
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def add(self, name: str, group: str, seconds: float) -> tuple[PendingRobot, str]:
+        """Make an invitation that replaces earlier ones of the robot; return its token. Raises `OSError`."""
+        pending = PendingRobot(name=name, group=group, expires=time.time() + seconds)
+        token = f"rosrv-join_{secrets.token_urlsafe(32)}"
+        with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
+            self._remove(name)
+            self._keep(token, pending)
+        return pending, token
+
+    def withdraw(self, name: str) -> None:
+        """Remove the invitations of a robot, used ones too. Raises `OSError`."""
+        with changing(self._folder):
+            kept = map(_read, self._folder.glob("*.json"))
+            if any(pending is not None and pending.name == name for pending in kept):
+                with recorded(self._folder.parent, "invitation withdraw", name):
+                    self._remove(name)
+
+    def _remove(self, name: str) -> None:
+        """Remove the invitations of a robot, and expired ones."""
+        for file in self._folder.glob("*.json"):
+            pending = _read(file)
+            if pending is None or pending.name == name or pending.expires <= time.time():
+                file.unlink()
+
+    @contextmanager
+    def using(self, token: str, request: bytes) -> Iterator[PendingRobot]:
+        """Use a token for a request, and enrol its robot in the block; `request` of the result: it is repeated.
+
+        If the block raises `EnrolmentError`, another request may use the token. Raises `InvalidInvitationError` and
+        `OSError`.
+        """
+        digest = hashlib.sha256(request).hexdigest()
+        with changing(self._folder):
+            pending = _read(self._file(token)) if _TOKEN.fullmatch(token) else None
+            if pending is None or pending.expires <= time.time() or pending.request not in ("", digest):
+                raise InvalidInvitationError
+            if pending.request:
+                yield pending
+                return
+            self._keep(token, msgspec.structs.replace(pending, request=digest))
+            try:
+                yield pending
+            except EnrolmentError:
+                self._keep(token, pending)
+                raise
+
+    def _keep(self, token: str, pending: PendingRobot) -> None:
+        write_whole(self._file(token), msgspec.json.encode(pending), 0o600)
+
+    def _file(self, token: str) -> Path:
+        return self._folder / f"{hashlib.sha256(token.encode()).hexdigest()}.json"
+
+
+def _read(file: Path) -> PendingRobot | None:
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=PendingRobot)
+    except (FileNotFoundError, ValueError):
+        return None

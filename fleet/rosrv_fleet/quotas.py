@@ -1,0 +1,110 @@
+"""Limit the bytes of each robot in a day, and pause a robot after refused uploads.
+
+The used bytes are on the disk, one file for each robot, so that a restart gives no robot a new quota. They decrease
+evenly, by the quota in a day. The files are not synced: a power cut may lose the last changes.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import structlog
+
+from rosrv_fleet.config import Limits
+from rosrv_fleet.robots import make_folder
+
+_DAY_SECONDS = 86_400.0
+_LEAST_BYTES = 64 << 10  # a segment costs at least this: files, markers and folders also cost
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 600.0
+_REST = 10.0  # a refused segment costs this many times its processor time
+_log = structlog.get_logger()
+
+
+class OverQuotaError(Exception):
+    """A robot has to wait for `seconds`."""
+
+    def __init__(self, reason: str, seconds: float) -> None:
+        super().__init__(reason)
+        self.seconds = seconds
+
+
+class UsedBytes(msgspec.Struct, frozen=True):
+    """The bytes that a robot has used at a time (seconds since the epoch): compressed and uncompressed ones."""
+
+    time: float = 0.0
+    received: float = 0.0
+    unpacked: float = 0.0
+
+
+class _Refusals(NamedTuple):
+    times: int
+    until: float
+
+
+class RobotQuotas:
+    """The quotas of robots in a folder. One call for a robot at a time."""
+
+    def __init__(self, folder: Path, limits: Limits, clock: Callable[[], float] = time.time) -> None:
+        make_folder(folder)
+        self._folder = folder
+        self._limits = limits
+        self._clock = clock
+        self._refusals: dict[str, _Refusals] = {}
+
+    def check(self, robot: str) -> None:
+        """Raise `OverQuotaError` while the robot has used its quota, or has to pause. Raises `OSError`."""
+        rest = self._refusals.get(robot, _Refusals(0, 0.0)).until - time.monotonic()
+        if rest > 0:
+            raise OverQuotaError("uploads of this robot were refused: it has to pause", rest)
+        used, limits = self._used(robot), self._limits
+        for name, value, quota in (
+            ("robot_bytes_per_day", used.received, limits.robot_bytes_per_day),
+            ("robot_unpacked_bytes_per_day", used.unpacked, limits.robot_unpacked_bytes_per_day),
+        ):
+            if value >= quota:
+                raise OverQuotaError(
+                    f"this robot has used its limit of bytes for a day (limits.{name})",
+                    (value - quota) * _DAY_SECONDS / quota,
+                )
+
+    def charge(self, robot: str, received: int, unpacked: int) -> None:
+        """Add the bytes of an upload, stored or refused. Raises `OSError`."""
+        used = self._used(robot)
+        added = msgspec.structs.replace(
+            used,
+            received=used.received + max(received, _LEAST_BYTES),
+            unpacked=used.unpacked + max(unpacked, _LEAST_BYTES),
+        )
+        making = self._folder / f"{robot}.new"
+        making.write_bytes(msgspec.json.encode(added))
+        making.rename(self._folder / f"{robot}.json")
+
+    def refused(self, robot: str, seconds: float) -> None:
+        """Make the robot pause after a refused upload that took `seconds` of processor time."""
+        count = self._refusals.get(robot, _Refusals(0, 0.0)).times + 1
+        pause = min(_LONGEST_PAUSE, max(_FIRST_PAUSE * 2.0 ** min(count, 14), _REST * seconds))
+        self._refusals[robot] = _Refusals(count, time.monotonic() + pause)
+
+    def stored(self, robot: str) -> None:
+        """Shorten the next pause of the robot after a stored upload."""
+        count = self._refusals.pop(robot, _Refusals(0, 0.0)).times - 1
+        if count > 0:
+            self._refusals[robot] = _Refusals(count, 0.0)
+
+    def _used(self, robot: str) -> UsedBytes:
+        now = self._clock()
+        try:
+            used = msgspec.json.decode((self._folder / f"{robot}.json").read_bytes(), type=UsedBytes)
+        except FileNotFoundError:
+            return UsedBytes(now)
+        except ValueError as error:
+            _log.error("a robot's quota begins again: its file is damaged", robot=robot, reason=str(error))
+            return UsedBytes(now)
+        days, limits = max(0.0, now - used.time) / _DAY_SECONDS, self._limits
+        return UsedBytes(
+            now,
+            max(0.0, used.received - days * limits.robot_bytes_per_day),
+            max(0.0, used.unpacked - days * limits.robot_unpacked_bytes_per_day),
+        )

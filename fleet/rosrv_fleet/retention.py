@@ -1,0 +1,107 @@
+"""Remove old data: whole partitions of the index, and segments from the beginning of a log.
+
+The last segment of a log stays, and so does a segment that waits for the index. Before segments are removed, the last
+removed checkpoint is noted, so that `verify` can prove the rest (`RemovalNote`).
+
+Afterwards, the segments that the index could not have wait for it again, so none stays set aside for a reason that has
+passed.
+"""
+
+import threading
+import time
+import zlib
+from datetime import date
+
+import structlog
+from psycopg import sql
+
+from rosrv_fleet.config import RetentionConfig
+from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.failures import failure_of
+from rosrv_fleet.robots import Robots
+from rosrv_fleet.segment_store import SegmentStore
+
+_EVERY_SECONDS = 3600.0
+_LOCK_MS = 3000  # searches wait behind this lock
+_DAY = 86_400 * 10**9
+_DAYS = """
+    SELECT day FROM (
+        SELECT day FROM segment
+        UNION
+        SELECT to_date(right(relname, 8), 'YYYYMMDD') FROM pg_inherits JOIN pg_class ON pg_class.oid = inhrelid
+        WHERE inhparent = 'record'::regclass
+    ) AS known WHERE day < %s ORDER BY day
+"""  # a partition without segments is left if none of a day could be indexed
+_UNREADABLE = (OSError, EOFError, ValueError, zlib.error)
+_log = structlog.get_logger()
+
+
+class Pruner:
+    """The retention of a collector: `step` once, or `run` every hour until `stop`."""
+
+    def __init__(
+        self, store: SegmentStore, robots: Robots, database: IndexDatabase, retention: RetentionConfig
+    ) -> None:
+        self._store = store
+        self._robots = robots
+        self._database = database
+        self._retention = retention
+        self._ending = threading.Event()
+        self.trouble: str | None = None
+
+    def run(self) -> None:
+        """Prune until `stop`; a failure is reported and tried again."""
+        while not self._ending.is_set():
+            try:
+                self.step()
+            except Exception as error:  # noqa: BLE001  after any failure, it tries again
+                self.trouble = f"retention: {failure_of(error)}"
+                _log.error("old data was not removed", reason=self.trouble)
+            self._ending.wait(_EVERY_SECONDS)
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._ending.set()
+
+    def step(self) -> None:
+        """Remove the data that is too old now; a damaged log stays, and is reported.
+
+        Raises `psycopg.Error` and `OSError`.
+        """
+        trouble = None
+        if self._retention.segment_days is not None:
+            by = f"retention.segment_days: {self._retention.segment_days}"
+            before = time.time_ns() - self._retention.segment_days * _DAY
+            for robot in self._robots.known():
+                for log in self._store.logs(robot):
+                    if self._ending.is_set():
+                        return
+                    try:
+                        removed = self._store.prune(robot, log, before, by)
+                    except _UNREADABLE as error:
+                        trouble = f"retention: {robot}: log {log}: {error}; run 'rosrv-fleet verify {robot}'"
+                        _log.error("old segments were not removed", reason=trouble)
+                        continue
+                    if removed:
+                        _log.warning("old segments were removed", robot=robot, log=log, segments=removed)
+        oldest = self._retention.oldest_day()
+        if oldest is not None:
+            for day in drop_partitions(self._database, oldest):
+                _log.warning("an old day of the index was removed", day=day.isoformat())
+        self.trouble = trouble
+        self._store.try_again()  # last: a segment that waits is not removed
+
+
+def drop_partitions(database: IndexDatabase, oldest: date) -> list[date]:
+    """Drop the partitions of days before `oldest`; return the days. Raises `psycopg.Error`."""
+    with database.writing() as connection:
+        found = connection.execute(_DAYS, (oldest,))
+        days: list[date] = [day for (day,) in found]
+    for day in days:
+        with database.writing() as connection:
+            connection.execute("SELECT set_config('lock_timeout', %s, true)", (str(_LOCK_MS),))
+            connection.execute(
+                sql.SQL("DROP TABLE IF EXISTS {}").format(sql.Identifier(f"record_{day:%Y%m%d}"))
+            )
+            connection.execute("DELETE FROM segment WHERE day = %s", (day,))
+    return days

@@ -1,0 +1,57 @@
+"""Determine the condition of each robot of a group: whether it has the bundle that it should have. No I/O."""
+
+import enum
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, selected, unhealthy
+
+
+class ConditionKind(enum.StrEnum):
+    """The condition of a robot: the first one that applies, in order of severity."""
+
+    UNHEALTHY = "unhealthy"
+    SILENT = "silent"
+    NEVER_SEEN = "never seen"
+    BEHIND = "behind"
+    IN_FORCE = "in force"
+    NO_BUNDLE = "no bundle"
+
+
+class RobotCondition(NamedTuple):
+    """The condition of a robot, and the reason; an empty string if it needs none."""
+
+    kind: ConditionKind
+    why: str = ""
+
+
+def conditions(
+    rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
+) -> dict[str, RobotCondition]:
+    """Return the condition of each robot of a group, whose last rollout is given (None: there was none)."""
+    sick = {} if rollout is None else unhealthy(rollout, robots, now)
+    silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
+    found = {}
+    for robot, seen in robots.items():
+        wanted = "" if rollout is None else selected(rollout, robot, seen)
+        if not seen.seen:
+            found[robot] = RobotCondition(ConditionKind.NEVER_SEEN, "it never reported")
+        elif now - seen.seen > silent:
+            found[robot] = RobotCondition(ConditionKind.SILENT, f"no report for {now - seen.seen:.0f} s")
+        elif robot in sick:
+            found[robot] = RobotCondition(ConditionKind.UNHEALTHY, sick[robot])
+        elif wanted and seen.refused == wanted:
+            found[robot] = RobotCondition(ConditionKind.UNHEALTHY, f"refused: {seen.reason[:200]}")
+        elif wanted and seen.in_force != wanted:
+            found[robot] = RobotCondition(ConditionKind.BEHIND, seen.trouble[:200] or f"{wanted} is selected")
+        else:
+            found[robot] = _settled(seen)
+    return found
+
+
+def _settled(seen: RobotSeen) -> RobotCondition:
+    if not seen.in_force:
+        return RobotCondition(ConditionKind.NO_BUNDLE)
+    return RobotCondition(
+        ConditionKind.IN_FORCE, "changed by an operator on the robot" if seen.changed else ""
+    )

@@ -1,0 +1,38 @@
+"""Verify an upload within a limit of processor time. This runs in a worker."""
+
+import gzip
+import time
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+from appliance.audit.segments import SegmentError, SegmentReader, SegmentSummary
+from rosrv_fleet.workers import OutOfTimeError, processor_time
+
+
+class SegmentVerdict(NamedTuple):
+    """The result of a check: the summary of a valid segment, or the error; `late` if the time was too short.
+
+    `size` is the number of uncompressed bytes that were read, `seconds` the processor time.
+    """
+
+    summary: SegmentSummary | None
+    reason: str
+    late: bool
+    size: int
+    seconds: float
+
+
+def check_segment(upload: Path, key: bytes, most_bytes: int, seconds: float) -> SegmentVerdict:
+    """Verify a compressed segment with the raw public key `key` in at most `seconds`. Raises `OSError`."""
+    begun = time.process_time()
+    summary, reason, late = None, "", False
+    with gzip.open(upload) as file:
+        try:
+            with processor_time(seconds):
+                summary = SegmentReader(file, key, most_bytes).summary()
+        except OutOfTimeError as error:
+            reason, late = str(error), True
+        except (SegmentError, EOFError, zlib.error, gzip.BadGzipFile) as error:
+            reason = str(error)
+        return SegmentVerdict(summary, reason, late, file.tell(), time.process_time() - begun)

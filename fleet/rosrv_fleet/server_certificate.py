@@ -1,0 +1,70 @@
+"""Make the collector's certificate, and find in it what robots need: an address, and the authority that they trust."""
+
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from appliance.base.atomic_files import write_whole
+from appliance.signing.own_certificate import make_own_certificate
+from rosrv_fleet.config import FleetConfig
+
+_DAYS = 3650  # every robot pins it, and must join again after a change
+
+
+class ServerCertificateError(Exception):
+    """The collector's certificate is missing or unusable for robots; the message has the remedy."""
+
+
+def make_certificate(config: FleetConfig, address: str | None) -> bool:
+    """Make a key and a certificate for an address, unless they exist; return whether they were made.
+
+    Raises `ServerCertificateError` and `OSError`.
+    """
+    if config.certificate.exists():
+        named = _addresses(config.certificate)
+        if address is not None and address not in named:
+            raise ServerCertificateError(
+                f"{config.certificate} names {', '.join(named) or 'no address'}: to replace it, remove it and its key,"
+                " repeat this, restart the collector, and let every robot join again"
+            )
+        return False
+    try:
+        key, certificate = make_own_certificate("rosrv-fleet", _DAYS, address or "")
+    except ValueError:
+        raise ServerCertificateError(
+            f"{config.certificate} does not exist: give --address, an address at which robots reach this machine"
+        ) from None
+    write_whole(config.key, key, 0o600)
+    write_whole(config.certificate, certificate, 0o644)
+    return True
+
+
+def authority_of(certificate: Path) -> str:
+    """Return the last certificate of the file (PEM), which must sign itself. Raises `ServerCertificateError`."""
+    last = x509.load_pem_x509_certificates(certificate.read_bytes())[-1]
+    if last.issuer != last.subject:
+        raise ServerCertificateError(
+            f"{certificate} does not end with its authority's certificate, which robots need: append it"
+        )
+    return last.public_bytes(Encoding.PEM).decode("ascii")
+
+
+def url_of(config: FleetConfig) -> str:
+    """Return the URL of the collector for robots. Raises `ServerCertificateError`."""
+    addresses = _addresses(config.certificate)
+    if not addresses:
+        raise ServerCertificateError(
+            f"{config.certificate} names no IP address in its subjectAltName: make another one"
+        )
+    shown = f"[{addresses[0]}]" if ":" in addresses[0] else addresses[0]
+    return f"https://{shown}:{config.address[1]}"
+
+
+def _addresses(certificate: Path) -> list[str]:
+    first = x509.load_pem_x509_certificates(certificate.read_bytes())[0]
+    try:
+        names = first.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return []
+    return [str(address) for address in names.get_values_for_type(x509.IPAddress)]

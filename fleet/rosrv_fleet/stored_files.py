@@ -1,0 +1,23 @@
+"""Read the small files of the data folder: a damaged one is an error with its path, as an unreadable one is."""
+
+import errno
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+T = TypeVar("T")
+
+
+class DamagedFileError(OSError):
+    """A file of the data folder has no valid content."""
+
+
+def read_stored(file: Path, type_: type[T]) -> T:
+    """Return the content of a JSON file. Raises `OSError`, also if it is damaged (`DamagedFileError`)."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=type_)
+    except ValueError as error:
+        raise DamagedFileError(
+            errno.EIO, f"damaged ({error}); restore it from a backup", str(file)
+        ) from error

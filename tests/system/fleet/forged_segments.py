@@ -1,0 +1,70 @@
+"""Segments of a compromised robot: its own key seals any content, under any number of any log."""
+
+import functools
+import hashlib
+import secrets
+import time
+from typing import Any, NamedTuple
+
+from appliance.audit.chain import StoredColumns, genesis, record_hash
+from appliance.audit.chain_proofs import ChainProof, evidence_line
+from appliance.audit.columns import from_columns, to_columns
+from appliance.audit.copies import SignedCheckpoint
+from appliance.audit.record import AuditRecord
+from appliance.audit.record_format import LogEntry
+from appliance.audit.segments import RecordPlace, SegmentHeader, SegmentSummary
+from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint
+from tests.system.fleet.fleet_site import FleetRobot
+
+
+class _Placed(NamedTuple):
+    """A record in the chain, and its line if it is not the last of its segment."""
+
+    columns: StoredColumns
+    before: bytes
+    hash: bytes
+    line: bytes
+
+
+@functools.cache
+def _chain(log: str, start: int, records: int, fields: tuple[tuple[str, Any], ...]) -> list[_Placed]:
+    digest = genesis(log) if start == 0 else bytes(32)
+    placed = []
+    for sequence in range(start + 1, start + records + 1):
+        usual: dict[str, Any] = {
+            "id": f"{sequence:026}", "time": time.time_ns(), "event": "decision", "reason": "x" * 400,
+        }  # fmt: skip
+        columns = to_columns(AuditRecord(**usual | dict(fields)), sequence)
+        before, digest = digest, record_hash(digest, columns)
+        placed.append(_Placed(columns, before, digest, _line(columns, before, digest, None)))
+    return placed
+
+
+def _line(columns: StoredColumns, before: bytes, digest: bytes, end: SignedCheckpoint | None) -> bytes:
+    proof = ChainProof(previous=before.hex(), hash=digest.hex(), then=[], checkpoint=end)
+    return evidence_line(LogEntry(columns.sequence, from_columns(columns)), proof).encode() + b"\n"
+
+
+def forged(
+    robot: FleetRobot, records: int, *, log: str = "", number: int = 1, **fields: Any
+) -> tuple[SegmentSummary, bytes]:
+    """Return a valid segment with this number of records, uncompressed; `fields` are those of the records.
+
+    A segment with a number above 1 begins after records that retention removed, as it claims.
+    """
+    log = log or secrets.token_hex(16)
+    start = 0 if number == 1 else number
+    placed = _chain(log, start, records, tuple(sorted(fields.items())))
+    last = placed[-1]
+    previous = NO_CHECKPOINT if number == 1 else secrets.token_hex(32)
+    text = Checkpoint(log, number, start + records, last.hash.hex(), time.time_ns(), previous).text()
+    end = SignedCheckpoint.of(text, robot.key.sign(text), robot.public)
+    after = None if number == 1 else RecordPlace(sequence=start, hash=bytes(32).hex())
+    header = SegmentHeader(begin=None, after=after, end=end)
+    lines = [
+        header.line(),
+        *(one.line for one in placed[:-1]),
+        _line(last.columns, last.before, last.hash, end),
+    ]
+    body = b"".join(lines)
+    return SegmentSummary(hashlib.sha256(body).hexdigest(), header, 0, 0), body

@@ -1,0 +1,22 @@
+"""Evidence bundles of the robots of a fleet, made by the appliance's own export."""
+
+import time
+from pathlib import Path
+
+from appliance.evidence.bundle import RecordingSelection, export
+from tests.system.fleet.fleet_site import FleetRobot
+from tests.unit.evidence.conftest import Control
+
+
+def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:
+    """Let a robot work, and export this time; with the messages of a recording if a `bag` is given."""
+    control = Control(robot.log)
+    control.load_policy(7, "[Nodes]\ndefault = *\n")
+    control.load_specifications(2, {"a.rv": "a() { }"})
+    control.begun = time.time_ns()
+    control.work()
+    if not bag:
+        return control.exported(place)
+    recording: RecordingSelection = control.record(robot.folder, bag)
+    place.write_bytes(b"".join(export(robot.log_file, recording, control.ask)))
+    return place

@@ -1,0 +1,140 @@
+"""Tests of `rosrv_fleet.failures`: the collector's background work continues after an unexpected error."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, NoReturn
+
+import psycopg
+import pytest
+import structlog
+from rosrv_fleet import indexer, retention
+from rosrv_fleet.config import FleetConfig, RetentionConfig
+from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.failures import failure_of
+from rosrv_fleet.indexer import LANES, Indexer
+from rosrv_fleet.output import configure_log
+from rosrv_fleet.retention import Pruner
+from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.rollouts import service
+from rosrv_fleet.rollouts.service import BundleService
+from rosrv_fleet.rollouts.store import RolloutStore
+from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.workers import Workers
+
+from tests.support.enrolled_robots import enrolled_robots
+
+_DEFECT = "a defect of rosrv-fleet, please report it: RuntimeError: unforeseen"
+
+
+class _Defect:
+    """A function that always raises an unexpected error; before the second one, it calls `second`."""
+
+    def __init__(self, second: Callable[[], object]) -> None:
+        self._second = second
+        self.calls = 0
+
+    def __call__(self, *_arguments: object, **_named: object) -> NoReturn:
+        self.calls += 1
+        if self.calls == 2:
+            self._second()
+        raise RuntimeError("unforeseen")
+
+
+class _WithoutMemory(Workers):
+    """Workers that have no memory for their work."""
+
+    def submit(self, *_work: Any, **_named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_exception(MemoryError())
+        return future
+
+
+def test_the_indexer_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The defect is reported as the reason why segments are not indexed."""
+    work = Indexer(
+        SegmentStore(tmp_path, 0),
+        enrolled_robots(tmp_path, "arm1"),
+        Workers(1),
+        FleetConfig(certificate=tmp_path, key=tmp_path),
+    )
+    troubles: list[str | None] = []
+
+    def stop() -> None:
+        troubles.append(work.trouble)
+        work.stop()
+
+    monkeypatch.setattr(indexer, "_PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(psycopg, "connect", _Defect(stop))
+    work.run("pending")
+    assert troubles == [_DEFECT]
+
+
+def test_a_segment_that_causes_a_defect_is_set_aside(tmp_path: Path) -> None:
+    """So it does not delay the segments of other robots."""
+    store = SegmentStore(tmp_path, 0)
+    place = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
+    (tmp_path / "pending" / "arm1").mkdir()
+    (tmp_path / "pending" / "arm1" / place.mark).touch()
+    work = Indexer(
+        store,
+        enrolled_robots(tmp_path, "arm1"),
+        _WithoutMemory(1),
+        FleetConfig(certificate=tmp_path, key=tmp_path),
+    )
+    assert [work.step(lane) for lane in LANES] == [True, False]
+    assert (store.marked("pending", "arm1", 9), store.marked("damaged", "arm1", 9)) == ([], [place])
+    assert work.trouble is not None
+    assert "a defect of rosrv-fleet, please report it: MemoryError" in work.trouble
+
+
+def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The defect is reported, and old data is removed later."""
+    database = IndexDatabase("", connections=1, statement_seconds=1.0)
+    work = Pruner(
+        SegmentStore(tmp_path, 0), enrolled_robots(tmp_path, "arm1"), database, RetentionConfig(index_days=1)
+    )
+    drop = _Defect(work.stop)
+    monkeypatch.setattr(retention, "_EVERY_SECONDS", 0.0)
+    monkeypatch.setattr(retention, "drop_partitions", drop)
+    work.run()
+    assert (drop.calls, work.trouble) == (2, f"retention: {_DEFECT}")
+
+
+def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the defect, the next tick reads the robots again."""
+    monkeypatch.setattr(service, "_PAUSE_SECONDS", 0.0)
+    monkeypatch.setattr(service, "_TICK_SECONDS", 0.0)
+    database = IndexDatabase("", connections=1, statement_seconds=1.0)
+
+    async def run() -> None:
+        loop, again = asyncio.get_running_loop(), asyncio.Event()
+        defect = _Defect(lambda: loop.call_soon_threadsafe(again.set))
+
+        def members() -> Mapping[str, RobotGroup]:
+            return defect()
+
+        bundles = BundleService(tmp_path / "absent", tmp_path / "key", RolloutStore(database), members)
+        running = asyncio.create_task(bundles.run())
+        await asyncio.wait_for(again.wait(), 30)
+        running.cancel()
+        await asyncio.wait([running])
+
+    asyncio.run(run())
+
+
+def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
+    """A value of a local variable may be a key; the log shows only lines of code."""
+    earlier = structlog.get_config()
+    try:
+        configure_log()
+        secret = "".join(chr(code) for code in range(ord("a"), ord("m")))
+        with pytest.raises(RuntimeError) as caught:
+            _Defect(lambda: None)(secret)
+        failure_of(caught.value)
+    finally:
+        structlog.configure(**earlier)
+    shown = capfd.readouterr().err
+    assert "raise RuntimeError" in shown
+    assert secret not in shown

@@ -1,0 +1,75 @@
+"""Tests of `rosrv_fleet.indexer`: a failure that is not the segment's fault sets no segment aside."""
+
+import errno
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from rosrv_fleet.config import FleetConfig
+from rosrv_fleet.indexer import Indexer
+from rosrv_fleet.robots import Robots
+from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.workers import Workers
+
+from tests.support.enrolled_robots import enrolled_robots
+
+_PLACE = SegmentPlace("arm1", "0" * 32, 1, "a" * 64)
+
+
+class _NoProcesses(Workers):
+    """Workers on a machine that starts no more processes."""
+
+    def submit(self, *_work: Any, **_named: Any) -> NoReturn:
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SegmentStore:
+    """Return a store with a segment of arm1 that waits for the index."""
+    store = SegmentStore(tmp_path, 0)
+    (tmp_path / "pending" / "arm1").mkdir()
+    (tmp_path / "pending" / "arm1" / _PLACE.mark).touch()
+    return store
+
+
+def _indexer(store: SegmentStore, data: Path) -> Indexer:
+    config = FleetConfig(certificate=data, key=data)
+    return Indexer(store, Robots(data / "robots"), _NoProcesses(1), config)
+
+
+def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_path: Path) -> None:
+    """If the system starts no process, the segment waits."""
+    enrolled_robots(tmp_path, "arm1")
+    with pytest.raises(BlockingIOError):
+        _indexer(store, tmp_path).step("pending")
+    assert store.marked("pending", "arm1", 9) == [_PLACE]
+    assert store.marked("damaged", "arm1", 9) == []
+
+
+def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentStore, tmp_path: Path) -> None:
+    """They are not set aside, and those of other robots have their turn."""
+    enrolled_robots(tmp_path, "arm2")
+    (tmp_path / "robots" / "arm1.json").write_bytes(b"damaged")
+    indexer = _indexer(store, tmp_path)
+    assert not indexer.step("pending")
+    other = _PLACE._replace(robot="arm2")
+    (tmp_path / "pending" / "arm2").mkdir()
+    (tmp_path / "pending" / "arm2" / other.mark).touch()
+    with pytest.raises(BlockingIOError):
+        indexer.step("pending")
+    assert store.marked("pending", "arm1", 9) == [_PLACE]
+    assert store.marked("damaged", "arm1", 9) == []
+
+
+def test_a_segment_that_is_tried_again_stays_reported(store: SegmentStore, tmp_path: Path) -> None:
+    """A segment of a robot without a file is set aside; until it is indexed, each try counts it once."""
+    indexer = _indexer(store, tmp_path)
+    for lane in ("pending", "large"):
+        assert indexer.step(lane)
+        assert store.marked(lane, "arm1", 9) == []
+        assert store.marked("damaged", "arm1", 9) == [_PLACE]
+        store.try_again()
+        assert store.marked("large", "arm1", 9) == store.marked("damaged", "arm1", 9) == [_PLACE]
+        assert store.waiting(9) == 1
+    store.indexed(_PLACE)
+    assert store.waiting(9) == 0

@@ -1,0 +1,26 @@
+"""Tests of `rosrv_fleet.bundles.publication`: when the collector signs a timestamp."""
+
+import datetime
+from pathlib import Path
+
+from rosrv_fleet.bundles.keys import load_online_key
+from rosrv_fleet.bundles.publication import next_timestamp, read_publication
+from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
+
+from tests.support.bundle_site import BundleSite
+
+
+def test_a_timestamp_is_signed_only_when_it_lasts_longer(tmp_path: Path) -> None:
+    """Before the metadata expire, and afterwards, the collector does not sign the same expiry every second."""
+    site = BundleSite(tmp_path)
+    publication = read_publication(site.repository.folder)
+    key = load_online_key(site.repository.folder / TIMESTAMP_KEY)
+    second = datetime.timedelta(seconds=1)
+    for now in (publication.expires - datetime.timedelta(hours=2), publication.expires + second):
+        made = next_timestamp(publication, None, key, now)
+        assert made is not None
+        assert next_timestamp(publication, made, key, now + second) is None
+    early = publication.expires - datetime.timedelta(days=9)
+    made = next_timestamp(publication, None, key, early)
+    assert next_timestamp(publication, made, key, early + datetime.timedelta(hours=7)) is None
+    assert next_timestamp(publication, made, key, early + datetime.timedelta(hours=9)) is not None

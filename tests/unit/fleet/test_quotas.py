@@ -1,0 +1,99 @@
+"""Tests of `rosrv_fleet.quotas`."""
+
+from pathlib import Path
+
+import pytest
+from rosrv_fleet.config import Limits
+from rosrv_fleet.quotas import OverQuotaError, RobotQuotas
+
+_DAY = 86_400.0
+
+
+class _Clock:
+    """A clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 1e9
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> _Clock:
+    """Return a clock."""
+    return _Clock()
+
+
+def quotas(folder: Path, clock: _Clock) -> RobotQuotas:
+    """Return the quotas of a collector that has just started."""
+    limits = Limits(robot_bytes_per_day=1_000_000, robot_unpacked_bytes_per_day=4_000_000)
+    return RobotQuotas(folder, limits, clock)
+
+
+@pytest.mark.parametrize("used", [(1_000_000, 0), (0, 4_000_000)])
+def test_used_bytes_survive_a_restart_and_return_evenly(
+    used: tuple[int, int], clock: _Clock, tmp_path: Path
+) -> None:
+    """Compressed and uncompressed bytes count for a day, also after a restart; the error has the time to wait."""
+    found = quotas(tmp_path, clock)
+    found.check("arm1")
+    found.charge("arm1", 2 * used[0], 2 * used[1])
+    clock.now += _DAY / 2
+    for again in (found, quotas(tmp_path, clock)):
+        with pytest.raises(OverQuotaError) as error:
+            again.check("arm1")
+        assert error.value.seconds == pytest.approx(_DAY / 2)
+        again.check("arm2")
+    clock.now += _DAY / 2 + 1
+    found.check("arm1")
+
+
+def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
+    """A robot cannot store countless files with few bytes."""
+    found = quotas(tmp_path, clock)
+    for _ in range(1_000_000 // 65_536 + 1):
+        found.check("arm1")
+        found.charge("arm1", 1, 1)
+    with pytest.raises(OverQuotaError, match="robot_bytes_per_day"):
+        found.check("arm1")
+
+
+def test_the_pause_grows_with_refusals_and_processor_time(
+    clock: _Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After refused uploads a robot pauses longer each time, at most ten minutes; a stored one shortens the next."""
+    now = [0.0]
+    monkeypatch.setattr("rosrv_fleet.quotas.time.monotonic", lambda: now[0])
+    found = quotas(tmp_path, clock)
+
+    def pause() -> float:
+        with pytest.raises(OverQuotaError, match="has to pause") as error:
+            found.check("arm1")
+        now[0] += error.value.seconds
+        found.check("arm1")
+        return error.value.seconds
+
+    pauses = []
+    for _ in range(16):
+        found.refused("arm1", 0.0)
+        pauses.append(pause())
+    assert pauses[:4] == pytest.approx([0.1, 0.2, 0.4, 0.8])
+    assert pauses[-1] == 600.0
+    for _ in range(15):
+        found.stored("arm1")
+    found.refused("arm1", 0.0)
+    assert pause() == pytest.approx(0.2)
+    found.refused("arm1", 30.0)
+    assert pause() == pytest.approx(300.0)
+    found.check("arm2")
+
+
+def test_a_damaged_file_begins_again(clock: _Clock, tmp_path: Path) -> None:
+    """After a power cut the file of a robot may be damaged: the robot can push, and is limited again."""
+    (tmp_path / "arm1.json").write_bytes(b"")
+    found = quotas(tmp_path, clock)
+    found.check("arm1")
+    found.charge("arm1", 2_000_000, 0)
+    with pytest.raises(OverQuotaError):
+        found.check("arm1")
