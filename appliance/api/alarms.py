@@ -159,7 +159,6 @@ def _bundles(bundles: BundlesState | None) -> Iterator[_Condition]:
 
 
 def _failing(process: ProcessInfo) -> str:
-    """Return the reason why a process keeps restarting, with its last output."""
     lines = "".join(f"\n    {line}" for line in process.output)
     printed = f"; it printed last:{lines}" if lines else ""
     return f"{process.role} is failing, after {process.restarts} restarts: {process.failing}{printed}"

@@ -109,7 +109,6 @@ def pin_of(home: Path) -> str:
 
 
 def _kept_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """Return the stored key, which enrolled hosts have pinned; make a key if none is stored."""
     if path.exists():
         key = serialization.load_pem_private_key(path.read_bytes(), password=None)
         if isinstance(key, ec.EllipticCurvePrivateKey):

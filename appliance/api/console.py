@@ -90,11 +90,9 @@ def routes(settings: Settings) -> APIRouter:
     )
 
     async def index(request: Request) -> Response:
-        """Answer with the page; its address selects the view."""
         return _answer(request, page)
 
     async def file(request: Request, name: str) -> Response:
-        """Answer with one of the page's files."""
         found = served.get(name)
         if found is None:
             raise ProblemError(404, "unknown-path", "the console has no such file")
@@ -124,7 +122,6 @@ def _answer(request: Request, found: _File) -> Response:
 
 
 def _collect(folder: Traversable, prefix: str) -> dict[str, _File]:
-    """Return all files under a folder, by their paths relative to it."""
     found: dict[str, _File] = {}
     for entry in folder.iterdir():
         if entry.is_dir():

@@ -159,7 +159,6 @@ class _Joining:
             yield found[1], found[2] or found[1]
 
     def _value(self, path: str, address: str, name: str, line: int) -> str:
-        """Return the expression for an imported name."""
         if address.startswith("/"):
             return self._separate.setdefault((address, name), f"$v{len(self._separate)}")
         imported = _path(path, address)
@@ -191,7 +190,6 @@ def _apart(before: str, after: str) -> bool:
 
 
 def _declared(tokens: list[_Token]) -> str | None:
-    """Return the name that an exported declaration declares."""
     words = [one.text for one in tokens]
     if words[:1] == ["async"]:
         words = words[1:] if words[1:2] == ["function"] else []
@@ -257,7 +255,6 @@ def _awaits_value(before: _Token) -> bool:
 
 
 def _next(text: str, at: int, *, in_template: bool, value_follows: bool) -> tuple[str, str] | None:
-    """Return kind and text of the next token; None if it is not closed."""
     if text[at] == "`" or in_template:
         found = _TEMPLATE.match(text, at + 1)
         return found and ("template", text[at : found.end()])

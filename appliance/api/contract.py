@@ -103,7 +103,6 @@ def _tagged(responses: dict[str, Any]) -> None:
 
 
 def _exemplified(operation: dict[str, Any]) -> None:
-    """Add the examples for answers without a kind, and for bodies that are sent as text."""
     name = operation["operationId"]
     if name in EXAMPLES:
         (answer,) = operation["responses"]["200"]["content"].values()

@@ -176,7 +176,6 @@ class _Patience:
             raise too_many("too-many-failures", "too many wrong enrolment tokens were sent", seconds)
 
     def failed(self, peer: str) -> None:
-        """Count a wrong token."""
         now = time.monotonic()
         self._one.take(peer, now)
         self._all.take(_ALL, now)

@@ -99,7 +99,6 @@ async def _ports(call: OperationCall[admin.HostPorts]) -> Tagged[answers.PortsSe
 
 
 def _archive(parts: answers.KitParts, wishes: KitOptions, key: str | None, status: int = 200) -> Response:
-    """Return a kit as a downloadable archive."""
     headers = {
         "ETag": etag(parts.revision),
         "Content-Disposition": f'attachment; filename="rosrv-{parts.name}.tar.gz"',

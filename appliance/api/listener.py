@@ -95,7 +95,6 @@ class _Connection(Front, asyncio.Protocol):
         self.connection_table.file(self, Stage.SERVED)
 
     def answered(self) -> None:
-        """Note that an answer is sent."""
         self._unanswered -= 1
         if self._unanswered:
             return

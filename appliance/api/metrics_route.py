@@ -192,7 +192,6 @@ def _forwarding(to: str, forwarding: ForwardingState | None) -> dict[str, _Sampl
 
 
 def _standby(state: StandbyState | None) -> dict[str, _Samples]:
-    """Return the samples of one of two appliances; none on a single appliance."""
     if state is None:
         return {metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")}
     other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
@@ -200,6 +199,7 @@ def _standby(state: StandbyState | None) -> dict[str, _Samples]:
         "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],
         "rosrv_standby_connected": [((), other.connected)],
         "rosrv_standby_in_sync": [((), other.in_sync)] if active else [],
+        "rosrv_standby_obstacle": [((), bool(state.obstacle))],
         "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
         "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
         "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],

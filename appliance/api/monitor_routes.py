@@ -49,12 +49,10 @@ class _Looking:
         return loaded, row
 
     async def described(self, loaded: Monitors, name: str) -> Described:
-        """Compile and describe a monitor."""
         async with self._services.judging:
             return await asyncio.to_thread(self.compiler.described, loaded, name)
 
     async def picture(self, loaded: Monitors, name: str) -> str | None:
-        """Compile and draw a monitor."""
         async with self._services.judging:
             return await asyncio.to_thread(self.compiler.picture, loaded, name)
 

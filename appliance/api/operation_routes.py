@@ -145,7 +145,6 @@ def _answer_type(operation: Operation, own: Answer | None) -> Any:
 
 
 def _parameters(operation: Operation) -> list[inspect.Parameter]:
-    """Return the parameters of a route, in the order in which they are checked."""
     same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
     found: dict[str, tuple[Any, Any]] = {"request": (Request, inspect.Parameter.empty)}
     for name, field in operation.fields().items():

@@ -12,6 +12,7 @@ import os
 import socket
 import ssl
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.request_gate import RequestGate
 from appliance.api.services import Services
+from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import ApiLink
@@ -80,7 +82,6 @@ class _Api:
         self._without_control: asyncio.TimerHandle | None = None
 
     async def run(self) -> None:
-        """Serve until the process ends."""
         loop = asyncio.get_running_loop()
         # There are more threads than concurrent tasks, so a verification of the log never delays the check of a token.
         loop.set_default_executor(ThreadPoolExecutor(_THREADS, "api"))
@@ -117,9 +118,10 @@ class _Api:
             return
         self._await_control()
         self._report(messages.Ready({"tls": self._settings.api_tls}))
-        running = [loop.create_task(self._flush()), loop.create_task(history.run())]
+        work = {"the journal of calls": self._flush, "the history of measurements": history.run}
         if context is not None:
-            running.append(loop.create_task(self._renew(context)))
+            work["the certificate of REST"] = partial(self._renew, context)
+        running = [loop.create_task(run_always(what, one)) for what, one in work.items()]
         await self._stopping.wait()
         for task in running:
             task.cancel()
@@ -144,7 +146,6 @@ class _Api:
                 _log.error("the certificate of REST cannot be renewed", reason=str(error))
 
     def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
-        """Return the certificate's folder, its names, and the time."""
         address = self._settings.api_address
         names = [*self._settings.api_names]
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only

@@ -73,8 +73,6 @@ def routes(services: Services) -> Routes:
 
 
 def _add_bag(router: Routes, services: Services) -> None:
-    """Add the route of all messages of a recording, as a file."""
-
     @router.get(
         "/{recording_id:recording}/bag",
         operation_id="recording_bag",
@@ -99,7 +97,6 @@ def _add_bag(router: Routes, services: Services) -> None:
 
 
 def _add_reading(router: Routes, services: Services) -> None:
-    """Add the routes that read a recording's bag."""
     reading = asyncio.Semaphore(1)
 
     async def read(

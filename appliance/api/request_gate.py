@@ -223,7 +223,6 @@ class _Answer:
 
 
 async def _disconnected(receive: Receive) -> None:
-    """Wait until the client disconnects."""
     while (await receive())["type"] != "http.disconnect":
         pass
 

@@ -109,19 +109,17 @@ class _Body:
             except msgspec.ValidationError as error:
                 # msgspec reports the first wrong field; invalid JSON may follow this field.
                 wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [_bad(error)]
-        except (msgspec.DecodeError, RecursionError) as error:
+        except (ValueError, RecursionError) as error:
             raise _not_json(text, error) from None
         raise bad_input(wrong)
 
     def schema(self) -> dict[str, Any]:
-        """Return the body's description for the contract."""
         kinds = content(self.kind)
         if self.text is not None:
             kinds["text/plain"] = {"schema": {"type": "string", "minLength": 1}}
         return {"requestBody": {"required": True, "content": kinds}}
 
     def responses(self) -> Responses:
-        """Return the contract's responses for bodies that are rejected."""
         wrong: Responses = {422: {"description": "A parameter or the body is invalid."}}
         if self.text is not None:
             wrong[415] = {"description": "The body is neither text/plain nor JSON."}

@@ -111,7 +111,6 @@ class Budget:
         return RATE if self._left is None else RATE // _SCARCE
 
     def _pay(self) -> None:
-        """Apply queued changes, and reduce all debts according to the elapsed time."""
         while self._changes:
             host, change = self._changes.popleft()
             if change > 0:

@@ -117,7 +117,6 @@ class ChainReader:
         return str(msgspec.json.decode(row[0])["last_hash"]) if row is not None else NO_CHECKPOINT
 
     def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
-        """Return the first signed checkpoint that seals a record."""
         known = self._sealing
         if self._unsealed or (known is not None and known.sequence >= sequence):
             return None if self._unsealed else known

@@ -56,7 +56,6 @@ def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
 
 
 def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
-    """Whether a column of these types can store a value unchanged."""
     kind = type(value)
     if kind is str:
         short = len(value) <= LONGEST_TEXT and kind in kinds

@@ -181,7 +181,6 @@ def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditR
 
 
 def _times(record: AuditRecord) -> tuple[int, int]:
-    """Return the first and the last time of a record's events."""
     detail = record.detail
     first, last = detail.get("first_time"), detail.get("last_time")
     return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)

@@ -72,7 +72,6 @@ class _LossCounter:
             self.count += 1
 
     def take(self) -> dict[str, Any]:
-        """Return the detail of the record about the losses, and reset the counter."""
         with self._lock:
             detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
             self.count = 0
@@ -103,7 +102,7 @@ class AuditLog:
         budget: Budget | None = None,
         reserve: int = AUDIT_RESERVE.bounds.whole,
         queue_limit: int = 100_000,
-        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  ignored
+        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  the default ignores them
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.path = path
@@ -241,7 +240,6 @@ class AuditLog:
         return self._unwritten
 
     def _put(self, item: AuditRecord | Waiter | Callable[[], None]) -> None:
-        """Queue a record, a waiter, or a call for the log's thread."""
         self._queue.append(item)
         # The thread sets `_idle` before it checks the queue once more: it sees the item, or this call sees `_idle`.
         if self._idle:
@@ -290,7 +288,6 @@ class AuditLog:
             self._writer.close()
 
     def _turn(self) -> None:
-        """Write the queued records, and do the work that is due."""
         while True:
             more = self._drain()
             now = time.monotonic()

@@ -299,7 +299,6 @@ class ChainWriter:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
-        """Commit the statements of the block at its end, or roll back."""
         execute = self._connection.execute
         execute("BEGIN IMMEDIATE")
         try:

@@ -64,7 +64,8 @@ def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRe
     """
     waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
     for record in sorted(evidence, key=_rank):
-        who = _UNKNOWN_HOSTS if record.detail.get("stranger") else str(record.host)
+        # Version 0.1.0 wrote `stranger`.
+        who = _UNKNOWN_HOSTS if {"unknown_host", "stranger"} & record.detail.keys() else str(record.host)
         waiting.setdefault(who, []).append(record)
     chosen: set[str] = set()
     while waiting and len(chosen) < removed // 2:

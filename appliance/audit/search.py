@@ -10,8 +10,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-import msgspec
-
 from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
 from appliance.audit.ids import ID_LENGTH
@@ -143,7 +141,7 @@ def _reading(path: Path, read: Callable[[sqlite3.Connection], _Found]) -> _Found
             return read(connection)
     except FilterError:
         raise
-    except (sqlite3.Error, msgspec.MsgspecError, ValueError, TypeError, RecursionError, MemoryError) as error:
+    except (sqlite3.Error, ValueError, TypeError, RecursionError, MemoryError) as error:
         raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
 
 

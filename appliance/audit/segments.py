@@ -32,7 +32,7 @@ from appliance.audit.signatures import signature_is_valid
 from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash
 
 LONGEST_LINE = 2 << 20  # bytes; details have at most 64 KiB, and escapes take twelve times as many
-_NOT_A_RECORD = (msgspec.MsgspecError, ValueError, KeyError, TypeError, RecursionError, OverflowError)
+_NOT_A_RECORD = (ValueError, KeyError, TypeError, RecursionError, OverflowError)
 
 
 class SegmentError(ValueError):

@@ -21,7 +21,7 @@ TOOK_OVER, HANDED_OVER, STAYED = "took over", "handed over", "switchover failed"
 CLOCK_EVENTS = ("clock set back", "clock set forward")
 _Epoch = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z][a-z0-9-]{0,31}\Z")]
-_NOT_AS_WRITTEN = (msgspec.MsgspecError, ValueError, RecursionError, MemoryError)
+_NOT_AS_WRITTEN = (ValueError, RecursionError, MemoryError)
 
 
 class EpochOf(msgspec.Struct, frozen=True):

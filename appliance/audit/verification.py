@@ -38,7 +38,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0)]
 _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 
 
-_NOT_AS_WRITTEN = (msgspec.MsgspecError, TypeError, ValueError, RecursionError, MemoryError)
+_NOT_AS_WRITTEN = (TypeError, ValueError, RecursionError, MemoryError)
 
 
 class _Removal(msgspec.Struct, frozen=True):
@@ -119,7 +119,6 @@ def _row(row: tuple[object, ...]) -> _Row:
 
 
 def _log_id(connection: sqlite3.Connection) -> str:
-    """Return the id of the log; empty unless there is exactly one, well formed."""
     try:
         rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
     except sqlite3.DatabaseError:
@@ -280,7 +279,6 @@ class _Verifier:
             self._find(FindingKind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
 
     def _step(self, row: _Row, previous: bytes) -> bytes:
-        """Check one record; return the hash that the next one must follow."""
         sequence, expected = row.sequence, self.last + 1
         if sequence < expected:
             self._find(FindingKind.INSERTED, sequence, sequence, "stands before the first record of the log")

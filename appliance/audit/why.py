@@ -69,10 +69,8 @@ def _valued(values: object) -> str:
 
 
 def _mapping(value: object) -> Mapping[str, Any]:
-    """Return the value if it is a mapping, otherwise an empty mapping."""
     return value if isinstance(value, dict) else {}
 
 
 def _list(value: object) -> list[Any]:
-    """Return the value if it is a list, otherwise an empty list."""
     return value if isinstance(value, list) else []

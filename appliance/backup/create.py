@@ -234,7 +234,6 @@ def copy_database(path: Path, owner: os.stat_result, copy: Path) -> None:
 
 @contextmanager
 def _rights_of(owner: os.stat_result) -> Iterator[None]:
-    """Replace root's rights by those of `owner` in the `with` block; do nothing if this process is not root."""
     if os.geteuid() != 0 or owner.st_uid == 0:
         yield
         return

@@ -69,7 +69,7 @@ class AgeClock:
         self._open = True  # whether the time off is still unknown
         try:
             self._kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
-        except (FileNotFoundError, msgspec.MsgspecError) as error:
+        except (FileNotFoundError, ValueError) as error:
             if not isinstance(error, FileNotFoundError):
                 _log.warning("the saved ages cannot be read: they restart from zero", file=str(path))
             now = wall()

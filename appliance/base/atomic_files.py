@@ -6,6 +6,7 @@ import re
 import secrets
 import stat
 import sys
+from mmap import mmap
 from pathlib import Path
 
 _UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
@@ -33,7 +34,7 @@ def remove_unfinished(folder: str, place: int) -> None:
                     os.unlink(name, dir_fd=inside)
 
 
-def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
+def write_whole(path: Path, data: bytes | mmap, mode: int, owner: tuple[int, int] | None = None) -> None:
     """Replace a file and sync it to the disk. Raises `OSError`, which leaves the old file unchanged.
 
     `owner` (user and group; default: the writer) is set before the file gets its final name. With concurrent writers,
@@ -69,7 +70,7 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
         raise NotLastingError(error.errno, why, str(path)) from error
 
 
-def write_where_told(path: Path, data: bytes) -> None:
+def write_where_told(path: Path, data: bytes | mmap) -> None:
     """Write data to a path that a person chose. Raises `OSError`.
 
     A regular file is replaced atomically and keeps its mode and owner, even if `path` is a symbolic link. A pipe, a

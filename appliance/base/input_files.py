@@ -56,6 +56,22 @@ def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict")
         return text.read()
 
 
+def files_below(folder: Path) -> list[Path]:
+    """Return the files below a folder, sorted; a link is one of them. Raises `OSError`.
+
+    `Path.glob` and `rglob` take a folder that may not be read for an empty one.
+    """
+    found: list[Path] = []
+    for place, folders, files in os.walk(folder, onerror=_raise):
+        found += [path for path in map(Path(place).joinpath, folders) if path.is_symlink()]
+        found += map(Path(place).joinpath, files)
+    return sorted(found)
+
+
+def _raise(error: OSError) -> None:
+    raise error
+
+
 def lines_given(path: Path, longest: int) -> Iterator[bytes]:
     """Yield the lines of a file, each at most `longest` bytes. Raises `OSError`."""
     with open_given(path) as file:

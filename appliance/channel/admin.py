@@ -388,16 +388,6 @@ class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     force: Force = False
 
 
-@rest("operator", "PATCH", _SEVERAL, of=MONITORS)
-@rest("operator", "PATCH", _ONE, of=MONITORS)
-class MonitorTrial(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor trial"):
-    """Put monitors into shadow mode by its name of earlier versions; deprecated."""
-
-    names: SomeMonitors
-    trial: bool
-    expected: str | None = None
-
-
 @rest("operator", "PATCH", _SEVERAL, says={"held": False}, of=MONITORS)
 @rest("operator", "PATCH", _ONE, says={"held": False}, of=MONITORS)
 class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor resume"):
@@ -770,5 +760,5 @@ def answer_to(kind: type[AdminRequest[A]]) -> type[A]:
 
 
 def decode(document: bytes, request: AdminRequest[A]) -> AdminAnswer[A]:
-    """Decode the answer to a request. Raises `msgspec.MsgspecError`."""
+    """Decode the answer to a request. Raises `ValueError`."""
     return _decoder(type(request)).decode(document)

@@ -129,7 +129,7 @@ class Channel:
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
         """Return all messages that have arrived completely, with their descriptors. The caller owns the descriptors.
 
-        Raises `ChannelClosedError` if the other end is gone. Raises `msgspec.DecodeError` if a message does not belong
+        Raises `ChannelClosedError` if the other end is gone. Raises `ValueError` if a message does not belong
         to this link, is too long, or lacks its descriptors. The link is unusable after this error.
         """
         closed = False
@@ -196,7 +196,7 @@ class Channel:
                 self.close()
                 closed()
                 return
-            except msgspec.DecodeError as error:
+            except ValueError as error:
                 self.close()
                 if refused is None:
                     closed()

@@ -95,7 +95,7 @@ class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The wanted state of a monitor: exactly one of `enabled`, `shadow` and `held` (or `trial`)."""
+    """The wanted state of a monitor: exactly one of `enabled`, `shadow` and `held`."""
 
     enabled: bool | None = None
     for_seconds: Annotated[
@@ -109,11 +109,10 @@ class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             "true: put it into shadow mode, where its would-be actions are only recorded; false: end shadow mode"
         ),
     ] = None
-    trial: Annotated[bool | None, doc("the same as `shadow`; deprecated")] = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError`."""
-        if [self.enabled, self.held, self.shadow, self.trial].count(None) != 3 or self.held is True:
+        if [self.enabled, self.held, self.shadow].count(None) != 2 or self.held is True:
             raise ValueError("one of `enabled` (true or false), `shadow` (true or false) and `held` (false)")
         if self.for_seconds is not None and self.enabled is not False:
             raise ValueError("`for_seconds` goes with `enabled`: false")

@@ -30,6 +30,8 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Sta
             f" only {holder}; stop this appliance, then start it again"
         )
         yield StandbyTrouble("alarm", "both-active", text)
+    if state.obstacle:
+        yield _unready(state)
     lasting = other.trouble_seconds
     if lasting is not None and lasting >= patience:
         yield _away(state, lasting) if not other.connected else _behind(other, lasting)
@@ -74,6 +76,16 @@ def _away(state: StandbyState, seconds: float) -> StandbyTrouble:
             f" since then are missing here{why}; {check}"
         )
     return StandbyTrouble("warning", "standby-away", text)
+
+
+def _unready(state: StandbyState) -> StandbyTrouble:
+    active = state.role == "active"
+    name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
+    text = (
+        f"the standby {name} ({address}) cannot take over: {state.obstacle}; once this is corrected, {name} notices it"
+        " within seconds"
+    )
+    return StandbyTrouble("alarm", "standby-unready", text)
 
 
 def _behind(other: OtherAppliance, seconds: float) -> StandbyTrouble:

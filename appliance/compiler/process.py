@@ -65,7 +65,6 @@ class CompilerProcess:
         self._child.close()
 
     async def _work(self, wanted: _Question) -> None:
-        """Answer a question within its budget of processor time."""
         budget = _budget(wanted)
         ends = _used() + budget
         self._working = True
@@ -110,7 +109,6 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
 
 
 def _used() -> float:
-    """Return the seconds of processor time that this process has used."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 

@@ -53,7 +53,6 @@ class _Place:
     below: "dict[str, _Place]" = field(default_factory=dict)
 
     def owned(self) -> "Iterator[_Place]":
-        """Yield the places at this key and below."""
         if self.owner is not None:
             yield self
         for place in self.below.values():
@@ -157,7 +156,6 @@ class ParameterCharges:
         return weight
 
     def _path(self, parts: Sequence[str]) -> list[_Place]:
-        """Return the known places on the path from the root to this key."""
         path = [self._root]
         for part in parts:
             below = path[-1].below.get(part)

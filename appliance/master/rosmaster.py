@@ -207,7 +207,6 @@ class RosMaster:
 
 
 def _outcome(method: str, value: Value) -> Answer | CallFailedError:
-    """Return the answer to one part of a multicall."""
     match value:
         case [one]:
             return _answer_to(method, one)

@@ -240,12 +240,10 @@ def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
 
 
 def _names(route: Any) -> dict[int, str]:
-    """Return the names of the interfaces by index."""
     return {link["index"]: str(link.get_attr("IFLA_IFNAME")) for link in route.get_links()}
 
 
 def _held(route: Any, **of: int) -> list[str]:
-    """Return the addresses (`of` an interface, if given), with their prefix lengths."""
     return [f"{entry.get_attr('IFA_ADDRESS')}/{entry['prefixlen']}" for entry in route.get_addr(**of)]
 
 

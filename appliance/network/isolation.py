@@ -107,7 +107,6 @@ class _IpForwarding:
         self._host = host
 
     def has_ipv6(self) -> bool:
-        """Whether the host uses IPv6."""
         if not self._host.run(Path("/proc/sys/net/ipv6").exists):
             return False
         return self._host.sysctl("net/ipv6/conf/all/disable_ipv6") == "0"
@@ -126,7 +125,6 @@ class _IpForwarding:
         return {key: self._host.sysctl(key) for key in keys}
 
     def enable(self, families: Sequence[Family]) -> None:
-        """Enable forwarding."""
         if 6 in families and not self.before(6):
             for name in interfaces.links(self._host):
                 key = f"net/ipv6/conf/{name}/accept_ra"
@@ -317,14 +315,12 @@ class Isolation:
         return self.settings.directory / "isolation.json"
 
     def _recorded_name(self) -> str:
-        """Return the name of the running appliance's namespace, for an error message."""
         try:
             return f"namespace {json.loads(self._record.read_text(encoding='utf-8'))['namespace']}"
         except (OSError, ValueError, KeyError, TypeError):
             return "still starting"
 
     def _write_record(self) -> None:
-        """Record, before any change, the settings to restore."""
         record = {
             "namespace": self.settings.name,
             "link": self.settings.link,
@@ -333,7 +329,6 @@ class Isolation:
         write_whole(self._record, json.dumps(record).encode(), 0o644)
 
     def _clear_leftovers(self) -> None:
-        """Undo the changes in the record, if there is one."""
         try:
             record = json.loads(self._record.read_text(encoding="utf-8"))
             leftover, link = Namespace(record["namespace"]), str(record["link"])

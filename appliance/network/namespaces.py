@@ -262,7 +262,6 @@ def namespaces(prefix: str = "") -> list[Namespace]:
 
 
 def _in_thread(function: Callable[[], T]) -> T:
-    """Call `function` in a thread of its own; return its result or raise its exception."""
     outcome: Future[T] = Future()
 
     def work() -> None:
@@ -356,7 +355,6 @@ def end_processes(pids: Sequence[int]) -> None:
 
 
 def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit: float) -> None:
-    """Send a signal to the remaining processes and wait for their end, at most `limit` seconds."""
     poll = select.poll()
     waiting = set(descriptors)
     for descriptor in descriptors:

@@ -60,5 +60,4 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
 
 
 def _first(network: Network) -> Address:
-    """Return the first address of a network that a machine can have."""
     return network[1] if network.num_addresses > 2 else network[0]

@@ -73,7 +73,6 @@ def compile_policy(
 
 
 def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionText]:
-    """Return the sections by their documented names. Unknown and repeated sections are errors."""
     by_fold = {name.casefold(): name for name in sections.NAMES}
     there = {section.name.text.casefold() for section in found}
     by_name: dict[str, SectionText] = {}

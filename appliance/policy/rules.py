@@ -93,7 +93,6 @@ class RuleCompiler:
         return category, Word(name, entry.key.line, entry.key.column + len(verb) + 1)
 
     def _key(self, category: Category, name: Word) -> Key | None:
-        """Return the parsed key. Return None for `default`, and for an invalid key, which is reported as an error."""
         if name.text == DEFAULT:
             return None
         if category is Category.COMMAND:

@@ -88,7 +88,6 @@ def _within(outer: Network, inner: Network) -> bool:
 
 
 def _outside(policy: Policy, networks: list[Network]) -> Address | None:
-    """Return an address that the policy does not name, or None if it names all."""
     starts: list[Address] = [
         ipaddress.IPv4Address(0),
         *_ends([one for one in networks if one.version == 4]),

@@ -45,7 +45,6 @@ class _Process:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Record until the supervisor stops the process."""
         self._child.attach(messages.Ready())
         ended = asyncio.ensure_future(self._child.ended.wait())
         recorder: Recorder | None = None

@@ -18,7 +18,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import structlog
 
 from appliance.audit.ids import IdSource
@@ -143,7 +142,6 @@ class Recorder:
             )
 
     def _record_temporarily(self, wanted: messages.MemoryWanted) -> None:
-        """Make a temporary recording of the requested period from memory."""
         now = self._clock()
         since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
         until = min(wanted.until, now)
@@ -320,7 +318,6 @@ class Recorder:
             self._close(making)
 
     def _close(self, making: RecordingInProgress) -> None:
-        """Finish a recording with its last messages, its audit records and its description."""
         making.step()
         self._finish(making)
 
@@ -339,7 +336,6 @@ class Recorder:
         _log.info("a recording is closed", recording=recording.id, size=recording.size)
 
     def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
-        """Discard a recording that cannot be written, and report the failure."""
         _log.error("a recording cannot be written", reason=str(error))
         making.leave()
         progress = making.progress
@@ -356,7 +352,7 @@ class Recorder:
         for folder in self._store.parts():
             try:
                 progress = load_progress(folder)
-            except (OSError, msgspec.MsgspecError):
+            except (OSError, ValueError):
                 _log.warning("an unfinished recording is removed", folder=folder.name)
                 shutil.rmtree(folder)
                 continue

@@ -90,7 +90,7 @@ class Progress(msgspec.Struct):
 
 
 def load_progress(folder: Path) -> Progress:
-    """Return the progress of the recording in `folder`. Raises `OSError` and `msgspec.MsgspecError`."""
+    """Return the progress of the recording in `folder`. Raises `OSError` and `ValueError`."""
     return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
@@ -178,7 +178,6 @@ class RecordingInProgress:
                 progress.left_out.append(row)
 
     def _connection(self, header: dict[str, str]) -> int:
-        """Return the number of a connection; a publisher with the same header gets the same number."""
         number = self._numbers.get(_key(header))
         if number is None:
             number = self._numbers[_key(header)] = self._bag.connect(header)

@@ -73,7 +73,7 @@ class RecordingStore:
             if _ID.fullmatch(path.name):
                 try:
                     yield msgspec.json.decode((path / ABOUT).read_bytes(), type=Recording)
-                except (OSError, msgspec.MsgspecError) as error:
+                except (OSError, ValueError) as error:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
 
     def _kept_since(self, recording: Recording) -> int:
@@ -177,10 +177,10 @@ class RecordingStore:
         for folder in self._named(_GONE):
             try:
                 recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
-            except (OSError, msgspec.MsgspecError):
+            except (OSError, ValueError):
                 continue
             who, reason = "", "the recorder crashed during the recording"
-            with suppress(OSError, msgspec.MsgspecError):
+            with suppress(OSError, ValueError):
                 who, reason = msgspec.json.decode((folder / _REMOVED).read_bytes(), type=tuple[str, str])
             yield recording, who, reason
 

@@ -71,7 +71,6 @@ class _Columns:
         self._width = (until - since) // number + 1
 
     def count(self, times: Iterable[int], counts: list[int]) -> None:
-        """Count each time in its column; ignore times outside."""
         for time in times:
             if self.since <= time <= self.until:
                 counts[(time - self.since) // self._width] += 1
@@ -123,7 +122,6 @@ def timeline(
 
 
 def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
-    """Return the number of messages on each topic in each column."""
     flows: dict[tuple[str, str], RecordedFlow] = {}
     of: dict[int, RecordedFlow] = {}
     for number in _of_nodes(reader):
@@ -148,7 +146,6 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
 
 
 def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent]:
-    """Yield the events of a period, in order."""
     for said, time in _records(reader, since):
         if time > until:
             return
@@ -169,7 +166,6 @@ def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent
 
 
 def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
-    """Yield the audit records in the bag from a time on, in order, each with its time."""
     numbers = {
         number
         for number, header in reader.connections.items()
@@ -279,7 +275,6 @@ def _place_of_record(
 
 
 def _is_sender(header: Mapping[str, str], said: _Said) -> bool:
-    """Whether a publisher sent the message that a record is about."""
     sender = _sender(header)
     return (header["topic"], sender.host, sender.node) == (
         said.resource,
@@ -289,7 +284,6 @@ def _is_sender(header: Mapping[str, str], said: _Said) -> bool:
 
 
 def _of_nodes(reader: BagReader) -> Iterator[int]:
-    """Yield the connections of publishers; omit those of the recorder itself."""
     for number, header in reader.connections.items():
         if header["topic"] not in (RECORDS, LOG) or "host" in header:
             yield number

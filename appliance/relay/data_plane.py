@@ -248,7 +248,6 @@ class DataPlane:
         relayed.limit(own, together)
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
-        """Apply a grant's rate limit to its present connections."""
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
         grant = ("topic", message.key, message.topic, message.host, message.caller_id)
         for subscriber in self._by_grant.get(grant, ()):
@@ -267,7 +266,6 @@ class DataPlane:
             largest.give_up_latched()
 
     def _attach_monitors(self, relayed: RelayedTopic) -> None:
-        """Send a topic's messages through its monitors, if it has any."""
         interceptor, topic = self.interceptor, relayed.topic
         wanted = interceptor.wants(topic)
         if interceptor.intercepts(topic):
@@ -535,7 +533,6 @@ class DataPlane:
             self._pending.enter(farewell, host)
 
     def _rows(self) -> list[messages.TopicTraffic]:
-        """Return the traffic since the last call."""
         rows = [row for topic, _publisher in self.topics.values() if (row := topic.traffic()) is not None]
         rows += [
             row
@@ -546,7 +543,6 @@ class DataPlane:
         return rows
 
     def _tick(self) -> None:
-        """Start the tasks that are due once a second."""
         self._tidying = self._tidy()
         self._go_on_tidying()
 

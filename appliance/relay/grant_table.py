@@ -159,7 +159,6 @@ class GrantTable:
         return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
     def _name(self, message: Statement) -> None:
-        """Note whether the policy names the host of a statement."""
         if isinstance(message, messages.NodePlaced | messages.ServicePlaced):
             return
         if isinstance(message, messages.PublicationPlaced):
@@ -197,7 +196,6 @@ class GrantTable:
 
 
 def _fact(message: messages.Message) -> _Fact:
-    """Return the fact that a statement or withdrawal concerns. Raises `TypeError` for other messages."""
     kind = _KINDS.get(type(message))
     if kind is None:
         raise TypeError(f"{type(message).__name__} is not a withdrawal")
@@ -205,5 +203,4 @@ def _fact(message: messages.Message) -> _Fact:
 
 
 def _host(fact: _Fact, message: messages.Message) -> str:
-    """Return the host of a statement; empty if it has none."""
     return message.host if isinstance(message, messages.NodePlaced) else fact[3] if len(fact) > 3 else ""

@@ -262,7 +262,6 @@ class EventLoop:
         return payer
 
     def _crowd(self, payer: _Payer) -> select.epoll:
-        """Return the payer's own epoll."""
         if payer.crowd is None:
             payer.crowd = select.epoll()
             self._crowds[payer.crowd.fileno()] = payer
@@ -271,7 +270,6 @@ class EventLoop:
         return payer.crowd
 
     def _forget_idle(self) -> None:
-        """Forget payers that have no descriptors and owe nothing."""
         for payer in list(self._payers.values()):
             if not payer.watched and not payer.later and payer.spent <= self._floor:
                 del self._payers[payer.name]

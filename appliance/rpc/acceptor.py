@@ -100,7 +100,6 @@ class Acceptor:
                 self._time.end(host)
 
     def _wait(self, error: OSError) -> None:
-        """Log the error, and stop accepting for `_PAUSE_SECONDS`."""
         _log.error("no connection can be accepted", reason=str(error))
         self._loop.remove_reader(self._sock)
         self._pause = self._loop.call_later(_PAUSE_SECONDS, self._loop.add_reader, self._sock, self._readable)

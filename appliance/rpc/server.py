@@ -270,7 +270,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
 
     @property
     def waiting(self) -> int:
-        """Return the number of requests that wait while another request is served."""
         return len(self._pending)
 
     def pause_writing(self) -> None:
@@ -425,7 +424,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
         return True
 
     def _serve_next(self) -> None:
-        """Serve the next request, if there is one and no other is being served."""
         if not (self._pending and self.is_quiet):
             return
         request, keep = self._pending.popleft()
@@ -451,7 +449,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self._sent(status, body, keep=keep)
 
     def _sent(self, status: bytes, body: bytes, *, keep: bool) -> None:
-        """Send an answer. Continue with the next request once the peer has read the answer."""
         self._write(status, body, keep=keep)
         if keep and self._writable:
             self._go_on()
@@ -517,7 +514,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self.transport.close()
 
     def reject(self, status: bytes, what: str) -> None:
-        """Refuse the request with a fault that names the exceeded limit."""
         self._refuse(status, f"{self.peer.text} {what}")
 
     def _refuse(self, status: bytes, why: str) -> None:
@@ -525,7 +521,6 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._write(status, build_fault(int(status[:3]), why), keep=False, unread=True)
 
     def expire(self) -> None:
-        """Handle a passed deadline."""
         if self._unparsed or not self.is_open:  # the appliance causes the delay, not the peer
             self.allow(self.limits.stall_seconds)
             return

@@ -167,7 +167,6 @@ class _Connection(asyncio.Protocol):
         return self._answer
 
     def give_up(self) -> None:
-        """End the pending request with `TimeoutError`, and close the connection."""
         self._fail(TimeoutError())
 
     def close(self) -> None:

@@ -110,7 +110,6 @@ class Allocation:
         return plan
 
     def _homes(self, groups: Sequence[FileGroup], carried: Collection[Resource]) -> list[int]:
-        """Return the cheapest relay for each group."""
         homes: list[int] = []
         loads = [0] * self.relays
         for group in groups:
@@ -143,7 +142,6 @@ class Allocation:
     def _planned(
         self, groups: Sequence[FileGroup], homes: Sequence[int], carried: set[Resource]
     ) -> AllocationPlan:
-        """Return the plan with these groups on these relays."""
         before = self._plan
         files: dict[str, int] = {}
         resources: dict[Resource, int] = {}
@@ -175,7 +173,6 @@ class Allocation:
         self._save(json.dumps(kept))
 
     def _cost(self, group: FileGroup, relay: int, carried: Collection[Resource]) -> tuple[int, int]:
-        """Return how many monitors of a group, and how many carried topics and services, would move to a relay."""
         here = self._plan.files
         return sum(count for name, count in group.files.items() if here.get(name, relay) != relay), sum(
             resource in carried and self._of(self._plan.resources, resource) != relay

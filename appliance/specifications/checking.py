@@ -92,7 +92,6 @@ def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
 
 
 def _bounded(data: bytes) -> bytes:
-    """Return the data if a channel can carry it. Raises `SpecificationsRefusedError`."""
     if len(data) > _LONGEST:
         text = f"the compiled specifications take {len(data) >> 20} MiB; the limit is {_LONGEST >> 20} MiB: load fewer"
         raise SpecificationsRefusedError([text])

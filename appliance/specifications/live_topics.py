@@ -90,5 +90,4 @@ _DEFINITION = "add the robot's definition to the specifications: in msg/ beside 
 
 
 def _heard(checked: CheckedSpecifications, names: Iterable[str]) -> set[str]:
-    """Return the topics on which these monitors have events."""
     return {topic for name in names for topic in checked.topics[name]}

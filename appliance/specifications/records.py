@@ -93,6 +93,5 @@ class MonitorRecords:
 
 
 def _monitors(event: MonitorEvent) -> set[str]:
-    """Return the monitors of an event."""
     together = event.detail.get("changed_by", ())
     return {event.monitor, *(str(other).partition(".")[0] for other in together)}

@@ -257,7 +257,6 @@ class Rollout:
         statement: messages.SpecificationsStated,
         answers: dict[int, asyncio.Future[list[str]]],
     ) -> None:
-        """Send a statement to a connected relay, and add a future for its answer."""
         if self.relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
             self._waiting[relay, statement.statement] = answers[relay]
@@ -292,7 +291,6 @@ class Rollout:
         return moved
 
     def _merge_rows(self) -> None:
-        """Set `rows` from the relay that has each monitor."""
         self.rows = {
             row.name: row
             for relay, rows in self._rows.items()
@@ -330,7 +328,6 @@ class Rollout:
             self.compiled_parts[compiled, names] = part
 
     def _forget(self) -> None:
-        """Drop all parts except those in force."""
         compiled, relays = self._now.checked.compiled, range(self.allocation.relays)
         names = [_names(self._now, relay, self.allocation.of_file) for relay in relays]
         self.compiled_parts = {
@@ -447,7 +444,6 @@ class Rollout:
 
 
 def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
-    """Return the monitors of a relay, and those of them in shadow mode."""
     mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
     return messages.PartNames(mine, tuple(name for name in mine if name in revision.shadows))
 

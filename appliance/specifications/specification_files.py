@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from appliance.base.input_files import read_given_text
+from appliance.base.input_files import files_below, read_given_text
 from appliance.channel import messages
 from appliance.signing.site_keys import UnsignedError, read_signature, signer
 from roswire.definitions import Definitions
@@ -159,13 +159,15 @@ def read_folder(folder: Path) -> Sources:
 def _read_folder(folder: Path) -> Sources:
     if not folder.is_dir():
         raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
-    paths = {path.name: path for path in sorted(folder.glob("*.rv"))}
+    # `glob` would take a folder that may not be read for an empty one.
+    paths = {path.name: path for path in sorted(folder.iterdir()) if path.match("*.rv")}
     files = {name: _read(path) for name, path in paths.items()}
     definitions: dict[str, str] = {}
-    for path in sorted((folder / "msg").rglob("*")):
+    own = folder / "msg"
+    for path in files_below(own) if own.is_dir() else ():
         if path.suffix in {".msg", ".srv"} and path.is_file():
             package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
-            if package in {folder, folder / "msg"}:
+            if package in {folder, own}:
                 place = f"{folder}/msg/package/{path.name}"
                 raise SpecificationsRefusedError(
                     [f"{path}: a definition belongs in the folder of its package: {place}"]

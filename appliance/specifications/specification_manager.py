@@ -50,10 +50,11 @@ from appliance.specifications.specification_revisions import (
     NOTHING,
     Check,
     StoredSpecifications,
-    check_kept,
     kept_in,
     sources_of,
+    specifications_at_start,
     text_of,
+    unknown_monitors,
 )
 from appliance.specifications.switches import Switches, require_whole
 from appliance.specifications.timed_disables import LONGEST, TimedDisables
@@ -163,26 +164,22 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         settings = self.store.settings()
         self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
-        if self._find_last(restarted=restarted or taken_over):
-            last = self.in_force
-            self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys))
+        last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
+        named = () if restarted else self.switches.named
+        sources, checked = await specifications_at_start(
+            last, self._folder, self._check, self.site_keys, named=named
+        )
+        if last is not None or (self.revision and sources_of(self.in_force) == sources):
+            self._enforce(sources, checked)
             self._resume()
         else:
-            sources = self._folder.read()
-            checked = await self._check(sources, self.site_keys)
-            if self.revision and sources_of(self.in_force) == sources:
-                self._enforce(sources, checked)
-                self._resume()
-            else:
-                self._end_limit()
-                if sources.files or self.revision:
-                    self._keep(sources, checked, who=DISK, note="read at start")
+            self._end_limit()
+            if sources.files or self.revision:
+                self._keep(sources, checked, who=DISK, note="read at start")
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         self.returns.start(self._disabled())
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
-        if unknown and self.in_force.who == DISK and not restarted:
-            raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
         if unknown:  # the monitors were removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
 
@@ -393,10 +390,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             names = await self._switch(request.names, SHADOW if request.shadow else True, who)
             return self._switched(names, self.rollout.began(names))
 
-    async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
-        """Do the same as `shadow`; earlier versions used this name."""
-        return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
-
     async def _come_back(self, back: Mapping[str, Switch]) -> None:
         """Switch monitors back when their disabled period is over. Raises `SpecificationsRefusedError`."""
         async with self._one_change:
@@ -508,7 +501,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     # --- internals ---
 
     def _revision(self, number: int, sources: Sources, checked: CheckedSpecifications) -> Revision:
-        """Return these specifications as a revision, with the present switches."""
         states = self.switches.states_of(checked)
         shadows = frozenset(name for name, state in states.items() if state == SHADOW)
         return Revision(number, sources, checked, shadows)
@@ -521,8 +513,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         return super()._described(row) | {"names": list(sources_of(row).files)}
 
     def _unknown(self, names: list[str]) -> str:
-        known = ", ".join(self.checked.monitors) or "none is loaded"
-        return f"no monitor is named {', '.join(names)}; there are: {known}"
+        return unknown_monitors(names, self.checked)
 
     def _all_known(self, names: list[str]) -> None:
         unknown = [name for name in names if name not in self.checked.monitors]
@@ -632,7 +623,6 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         began: Sequence[str] = (),
         kept: Sequence[str] = (),
     ) -> Replacement:
-        """Describe a change; `files` are the added, changed and removed files."""
         warnings = list(self.checked.warnings)
         return Replacement(
             self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by

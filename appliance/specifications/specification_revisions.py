@@ -1,6 +1,6 @@
-"""Encode and decode stored revisions of the specifications, with the last switches of their monitors."""
+"""Stored revisions of the specifications: their form, the last switches of their monitors, and those of a start."""
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 
 import msgspec
 
@@ -9,6 +9,7 @@ from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
+    SpecificationFolder,
     SpecificationsRefusedError,
 )
 from appliance.store.state_file import MonitorRevisionRow, StateStore
@@ -41,7 +42,37 @@ def sources_of(row: MonitorRevisionRow) -> Sources:
     return msgspec.json.decode(row.sources, type=Sources)
 
 
-async def check_kept(
+async def specifications_at_start(
+    last: MonitorRevisionRow | None,
+    folder: SpecificationFolder,
+    check: Check,
+    site_keys: Sequence[str],
+    *,
+    named: Collection[str],
+) -> tuple[Sources, CheckedSpecifications]:
+    """Return the specifications that a start brings into force: of the stored revision `last`, or the folder's (None).
+
+    Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is `named` to be
+    enabled.
+    """
+    if last is None:
+        sources = folder.read()
+        checked = await check(sources, site_keys)
+    else:
+        sources, checked = sources_of(last), await _check_kept(check, last, site_keys)
+    unknown = sorted(set(named) - checked.monitors.keys())
+    if unknown and (last is None or last.who == DISK):
+        raise SpecificationsRefusedError([f"--enable: {unknown_monitors(unknown, checked)}"])
+    return sources, checked
+
+
+def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> str:
+    """Return the text of an error about names that no monitor has."""
+    known = ", ".join(checked.monitors) or "none is loaded"
+    return f"no monitor is named {', '.join(names)}; there are: {known}"
+
+
+async def _check_kept(
     check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]
 ) -> CheckedSpecifications:
     """Compile a stored revision; if it is refused (by a newer version), the error has the command that discards it."""

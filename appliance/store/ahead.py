@@ -76,7 +76,7 @@ class WriteAhead:
     def left(self, stored: int) -> LeftBehind:
         """Return what an earlier process did not write to the database, which has all changes up to `stored`.
 
-        Raises `msgspec.MsgspecError` for an intact change that this release does not know.
+        Raises `ValueError` for an intact change that this release does not know.
         """
         with self._descriptor() as descriptor:
             data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)

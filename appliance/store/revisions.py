@@ -102,7 +102,6 @@ class Revisions(ABC, Generic[R]):
         return self.revision > 0 and (restarted or self.in_force.who != DISK)
 
     def _resume(self) -> None:
-        """Resume the time limit after a start."""
         kept = self.store.settings().get(self._setting, "")
         if kept:
             back_to, deadline, length = (*kept.split(), "inf")[:3]  # version 0.1.0 did not store the length
@@ -113,11 +112,9 @@ class Revisions(ABC, Generic[R]):
     # --- reading ---
 
     async def _kept(self) -> list[R]:
-        """Return all stored revisions, the newest first."""
         return await asyncio.to_thread(self._rows)
 
     def _described(self, row: R) -> dict[str, Any]:
-        """Return the fields of a revision for an answer."""
         return row._asdict() | {"in_force": row.revision == self.revision}
 
     async def _find(self, revision: int) -> R | None:
@@ -162,7 +159,6 @@ class Revisions(ABC, Generic[R]):
             self._end_limit()
 
     def _end_limit(self) -> None:
-        """Keep the revision in force permanently."""
         self._stop_waiting()
         self.store.save_setting(self._setting, "")
 

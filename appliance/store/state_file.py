@@ -54,6 +54,9 @@ CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) 
 {host_tables.SCHEMA}"""
 
 
+REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_revision"})
+"""The tables of the policy and the specifications."""
+
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
 
 
@@ -124,8 +127,10 @@ class MonitorRevisionRow(NamedTuple):
 class StateStore:
     """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
 
-    def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
-        self.database = Database(directory / "state.db", SCHEMA, failed=failed)
+    def __init__(
+        self, directory: Path, *, failed: Callable[[str], None], kind: type[Database] = Database
+    ) -> None:
+        self.database = kind(directory / "state.db", SCHEMA, failed=failed)
         self.hosts = host_tables.HostTables(self.database)
         self._parameter_changes = 0  # the number of the last change
         self._largest_change: int | None = LARGEST_CHANGE

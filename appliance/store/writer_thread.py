@@ -101,7 +101,7 @@ class Database:
             self._number = self._catch_up()  # of the last change
         except sqlite3.Error as error:
             raise StoreError(f"{path}: {error}; {_advice(error)}") from error
-        except (OSError, msgspec.MsgspecError, ChangeError) as error:
+        except (OSError, ValueError, ChangeError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._feeds: tuple[ChangeFeed, ...] = ()
         self._gathered: _Gathered | None = None
@@ -110,7 +110,7 @@ class Database:
         self._closed = False
         self._closing = threading.Event()
         self._hurry = threading.Event()
-        self._thread = threading.Thread(target=self._write, name="store", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="store", daemon=True)
         self._thread.start()
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
@@ -276,6 +276,15 @@ class Database:
         self._connection.close()
         self._ahead.close()
 
+    def _run(self) -> None:
+        try:
+            self._write()
+        except BaseException as error:
+            # A defect: callers that wait get the error, and orders are refused. The next start applies the changes.
+            self._failing = f"{self._path}: writing ended: {type(error).__name__}: {error}"
+            self._fail(self._failing)
+            raise
+
     def _write(self) -> None:
         while True:
             group = [self._queue.get()]
@@ -307,11 +316,15 @@ class Database:
                     self._fail(f"{self._failing}; {_LEFT}")
                     return
             else:
+                self._failing = ""
+                try:
+                    self._ahead.stored(last)
+                except OSError as error:  # the database has these changes, so the next start skips them
+                    self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
+                    return
                 if self._told:
                     _log.warning("state is written again", file=str(self._path))
                     self._told.clear()
-                self._failing = ""
-                self._ahead.stored(last)
                 return
 
     def _sync(self) -> None:

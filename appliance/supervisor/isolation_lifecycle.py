@@ -320,7 +320,6 @@ class ContainerIsolation(NoIsolation):
         )
 
     def _api_networks(self) -> tuple[str, ...]:
-        """Return the networks that may reach REST: the configured ones, and the tunnels' pool for renewals."""
         return (*self._ports.api_networks, *([self._tunnels[0]] if self._tunnels else []))
 
     def _neighbours(self) -> tuple[str, ...]:
@@ -328,7 +327,6 @@ class ContainerIsolation(NoIsolation):
         return ()
 
     def _collector_clients(self) -> tuple[ForwarderAccess, ...]:
-        """Return the users that may reach the fleet's collector, and nothing else."""
         if self._ports.collector is None:
             return ()
         return tuple(

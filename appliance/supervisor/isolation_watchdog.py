@@ -59,7 +59,6 @@ class IsolationWatchdog:
         return reason
 
     def _found(self, reason: str | None) -> None:
-        """Keep a finding, and report it to control."""
         if reason is not None:
             log.critical("the appliance must not serve", reason=reason)
             self._probe = messages.ProbeFailed(reason)

@@ -93,13 +93,12 @@ class MonitorMemory:
         self._own, self._earlier = [], []
 
     def _take_ended(self) -> _Ended:
-        """Return the last orderly end, and remove its file."""
         path = self._folder / _ENDED
         try:
             ended = msgspec.json.decode(path.read_bytes(), type=_Ended)
         except FileNotFoundError:
             return _Ended("", 0)
-        except msgspec.MsgspecError:
+        except ValueError:
             ended = _Ended("", 0)
         path.unlink()
         _sync(self._folder)
@@ -136,7 +135,6 @@ def _is_written(path: Path) -> bool:
 
 
 def _made(path: Path) -> int:
-    """Create a file with all its blocks allocated. Raises `OSError`."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
     descriptor = os.open(path, flags, 0o600)
     try:

@@ -151,7 +151,6 @@ def prctl(option: int, first: int, second: int = 0) -> None:
 
 
 def _call(what: str, *arguments: Any) -> None:
-    """Call a function of the C library; `what` is its name and option for the error text. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

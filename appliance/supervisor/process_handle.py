@@ -185,9 +185,12 @@ class ProcessHandle:
         if self._channel is not None:
             # The process's last message may be unread; it gives the reason of a failed start.
             channel, self._channel = self._channel, None
-            with suppress(ChannelClosedError, msgspec.DecodeError):
-                for message, descriptors in channel.receive():
-                    self._reports.received(self, message, descriptors)
+            try:
+                messages = channel.receive()
+            except (ChannelClosedError, ValueError):
+                messages = []
+            for message, descriptors in messages:
+                self._reports.received(self, message, descriptors)
             channel.close()
         code = self._process.wait()
         os.close(self._pidfd)

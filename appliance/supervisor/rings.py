@@ -60,7 +60,6 @@ class RecorderRings:
 
 
 def _left() -> ByteSize:
-    """Return the machine's available memory."""
     [row] = [
         row
         for row in Path("/proc/meminfo").read_text("ascii").splitlines()

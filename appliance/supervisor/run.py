@@ -89,7 +89,6 @@ def _run(
     node_ports: range,
     standby: StandbyStart | None,
 ) -> None:
-    """Lock the state directory, run the appliance, and clean up even if signals arrive."""
     manager = ServiceManager.of(os.environ)
     manager.starting("locks its state, builds its firewall")
     state = StateDirectory(settings.state)
@@ -196,7 +195,6 @@ def _shown(host: str, port: int) -> str:
 
 
 def _listener(settings: Settings) -> socket.socket | None:
-    """Return the socket of REST. In a separate namespace it listens on all addresses; the firewall limits access."""
     if settings.api_address is None:
         return None
     host, port = settings.api_address

@@ -485,7 +485,6 @@ class Supervisor:
         process.send(answer)
 
     def _demand(self, role: str) -> None:
-        """Start a role on demand; if its process is shutting down, start it again once that has ended."""
         for slot in self.slots:
             if slot.role.name == role:
                 slot.wanted = slot.process is not None
@@ -620,7 +619,6 @@ def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
 
 
 def _about(slot: ProcessSlot) -> messages.ProcessInfo:
-    """Return a process's row for control, whether the process runs or keeps failing."""
     failing, output = (slot.reason, list(slot.output)) if slot.is_failing else ("", [])
     process, restarts = slot.process, slot.starts - 1
     if process is None:
@@ -636,7 +634,6 @@ def _about(slot: ProcessSlot) -> messages.ProcessInfo:
         process.congestion,
         failing,
         output,
-        walls=sandbox,
     )
 
 

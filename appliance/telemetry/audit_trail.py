@@ -173,7 +173,7 @@ class AuditTrail:
         """Whether an unknown host is denied; if so, set the mark in `detail`."""
         if host is None or decision != "deny" or self._log.budget.quota_class(host) is not QuotaClass.UNKNOWN:
             return False
-        detail["unknown_host"] = detail["stranger"] = True  # `stranger` is the deprecated key of 0.1.0
+        detail["unknown_host"] = True
         return True
 
 

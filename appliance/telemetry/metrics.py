@@ -148,7 +148,8 @@ METRICS = (
         "role",
     ),
     _gauge("rosrv_standby_connected", "1 while the replication between the two appliances is open"),
-    _gauge("rosrv_standby_in_sync", "1 while the standby may take over; only on the active appliance"),
+    _gauge("rosrv_standby_in_sync", "1 while the standby has all changes; only on the active appliance"),
+    _gauge("rosrv_standby_obstacle", "1 while the standby follows, but could not start if it took over"),
     _gauge("rosrv_standby_behind_changes", "changes that the standby lacks; only on the active appliance"),
     _gauge("rosrv_standby_behind_bytes", "bytes of these changes in memory; only on the active appliance"),
     _gauge(

@@ -94,6 +94,16 @@ def refused(appliance: Appliance, path: object) -> str:
     return eventually(found, lambda: f"{bundles_of(appliance)}\n{appliance.story()}")
 
 
+def refusal(appliance: Appliance, path: object) -> dict[str, Any]:
+    """Wait for the record of a refused bundle; return its detail."""
+
+    def found() -> dict[str, Any] | None:
+        details = [record["detail"] for record in appliance.audit(event="bundle refused")]
+        return next((detail for detail in details if detail["bundle"] == str(path)), None)
+
+    return eventually(found, appliance.story)
+
+
 @pytest.fixture(scope="module")
 def appliance(site: tuple[BundleSite, str]) -> Iterator[Appliance]:
     """Run an appliance that has taken a good bundle."""
@@ -118,7 +128,7 @@ def test_bad_bundles_are_refused_with_the_reason(site: tuple[BundleSite, str], a
     for word, files in bad.items():
         path = served.add(files)
         assert word in refused(appliance, path)
-        assert word in str(appliance.recorded(event="bundle refused")[0]["detail"]["findings"])
+        assert word in str(refusal(appliance, path)["findings"])
         assert bundles_of(appliance)["in_force"] == before
         assert appliance.status()["policy"]["revision"] == revision
     assert appliance.rosrv("status", check=False).returncode == 1

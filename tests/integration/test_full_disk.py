@@ -29,7 +29,6 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.MonitorConfirm(),
     admin.MonitorSwitch(["silent"], False),
     admin.MonitorShadow(["silent"], True),
-    admin.MonitorTrial(["silent"], True),
     admin.MonitorResume(["silent"]),
     admin.TokenAdd("late", "viewer", 3600.0),
     admin.TokenRotate("guest"),

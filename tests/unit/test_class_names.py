@@ -5,11 +5,11 @@ from collections import defaultdict
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("appliance", "rosmop", "roswire")
+PACKAGES = ("appliance", "rosmop", "roswire", "fleet/rosrv_fleet")
 
 
 def test_no_public_class_name_is_used_twice() -> None:
-    """A name without an underscore has one definition in `appliance`, `rosmop` and `roswire`."""
+    """A name without an underscore has one definition in the appliance, the language and the collector."""
     places = defaultdict(list)
     for path in (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))):
         relative = path.relative_to(ROOT)

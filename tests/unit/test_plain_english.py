@@ -5,9 +5,7 @@ tests. Code, quoted output and generated pages are left out.
 """
 
 import ast
-import io
 import re
-import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -17,9 +15,14 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROOTS = (
     "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "appliance", "rosmop", "roswire", "examples",
-    "benchmarks", "distribution", "tests",
+    "benchmarks", "distribution", "fleet", "tests",
 )  # fmt: skip
 GENERATED = ("metrics.md", "audit-events.md")
+STRING_OR_COMMENT = re.compile(
+    r'''"""(?:\\.|[^\\])*?"""|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[#][^\n]*''',
+    re.DOTALL,
+)
+"""A string of Python, or a comment. It is much faster than `tokenize`."""
 
 
 class Habit(NamedTuple):
@@ -116,9 +119,12 @@ def _said_in(source: str) -> str:
         ):
             for offset, line in enumerate(node.value.value.split("\n")):
                 lines[node.lineno + offset] += line.strip()
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            lines[token.start[0]] += f" {token.string.lstrip('# ')}"
+    number = position = 0
+    for token in STRING_OR_COMMENT.finditer(source):
+        if token[0][0] == "#":
+            number += source.count("\n", position, token.start())
+            position = token.start()
+            lines[number + 1] += f" {token[0].lstrip('# ')}"
     return "\n".join(lines[1:])
 
 

@@ -14,7 +14,9 @@ BUDGETS = {
 }
 
 
-@pytest.mark.parametrize("folder", ["appliance", "rosmop", "roswire", "distribution", "examples", "tests"])
+@pytest.mark.parametrize(
+    "folder", ["appliance", "rosmop", "roswire", "distribution", "examples", "fleet", "tests"]
+)
 def test_a_folder_stays_within_its_budget(folder: str) -> None:
     """Its budget is at most 3 % above its size, so lower it when code goes; raise it only with a reason."""
     files = [path for path in (ROOT / folder).rglob("*.py") if not path.is_relative_to(LANGUAGE_TESTS)]

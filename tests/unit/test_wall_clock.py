@@ -25,6 +25,7 @@ READERS = {
         "control/passive_rest.py", "control/token_orders.py", "hosts/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
+        "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
         "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",

@@ -23,7 +23,6 @@ class InUse(msgspec.Struct, frozen=True):
     esp: Annotated[Literal["kernel", "user space"] | None, doc("where ESP runs; null: no tunnels are open")]
     sandbox: Annotated[dict[str, str], doc("by process: limits of its system calls, files and ports")]
     lacks: Annotated[list[str], doc("parts of the sandbox that this kernel does not support")]
-    walls: Annotated[dict[str, str], doc("the same as `sandbox`; deprecated")] = {}
 
 
 class Inventory(msgspec.Struct, frozen=True):

@@ -32,7 +32,6 @@ class MonitorState(msgspec.Struct, frozen=True):
         list[str],
         doc("for each property: whether its automaton is proved equal to the formula, or why not"),
     ]
-    trial: Annotated[bool, doc("the same as `shadow`; deprecated")] = False
     would_drop: Annotated[int, doc("messages that it would have dropped since shadow mode began")] = 0
     would_change: Annotated[int, doc("messages that it would have changed since shadow mode began")] = 0
     missed: Annotated[

@@ -13,7 +13,7 @@ class OtherAppliance(msgspec.Struct, frozen=True):
     name: str
     address: str
     connected: Annotated[bool, doc("whether the replication between both is open")]
-    in_sync: Annotated[bool, doc("whether it has all acknowledged changes, so that it may take over")]
+    in_sync: Annotated[bool, doc("whether it has all acknowledged changes")]
     behind_changes: Annotated[int, doc("changes of the state that it lacks; on a standby always 0")]
     behind_bytes: Annotated[int, doc("bytes of these changes that are kept in memory")]
     waiting_seconds: Annotated[
@@ -56,3 +56,7 @@ class StandbyState(msgspec.Struct, frozen=True):
     ]
     other: OtherAppliance
     witness: WitnessSeen
+    obstacle: Annotated[
+        str,
+        doc("why the standby cannot take over, although it follows; empty: its last check found no reason"),
+    ]

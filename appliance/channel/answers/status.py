@@ -24,7 +24,6 @@ class ProcessInfo(msgspec.Struct, frozen=True):
     congestion: Annotated[str, doc("the TCP congestion control of a relay's connections")] = ""
     failing: Annotated[str, doc("why it ends soon after every start; empty: it is not failing")] = ""
     output: Annotated[list[str], doc("the last lines that the program of a failing process printed")] = []
-    walls: Annotated[str, doc("the same as `sandbox`; deprecated")] = ""
 
 
 class FirewallRule(msgspec.Struct, frozen=True):

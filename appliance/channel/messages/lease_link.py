@@ -63,8 +63,20 @@ class ControlPresent(Message):
     """Control stands by or serves, so this appliance may be active. A new link begins without this."""
 
 
+class ControlUnready(Message):
+    """Control stands by, but could not serve: this appliance does not claim until the next `ControlPresent`."""
+
+
 class HandOverWanted(Message):
     """Control has stored everything on the standby, and wants it to take over."""
 
 
-LeaseLink = LeaseState | HandOverAnswered | ReplicationReported | EpochSeen | ControlPresent | HandOverWanted
+LeaseLink = (
+    LeaseState
+    | HandOverAnswered
+    | ReplicationReported
+    | EpochSeen
+    | ControlPresent
+    | ControlUnready
+    | HandOverWanted
+)

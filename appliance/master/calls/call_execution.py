@@ -251,7 +251,6 @@ class Execution:
             return self._failed(attempt, error)
 
     def _failed(self, attempt: Attempt, error: Exception) -> Answer:
-        """Return the answer to an allowed call that could not be carried out."""
         caller, call = attempt.caller, attempt.call
         match error:
             case NoPortError() | LimitReachedError():

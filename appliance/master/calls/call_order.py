@@ -2,9 +2,8 @@
 
 A registering call may wait after its decision: for its record, for its ports, for earlier changes that the ROS master
 gets. If two hosts registered a free name at the same time, both would be allowed, and the later host would take the
-name away. So registering calls of a name wait for each
-other, and are decided in their turn. A call that need not wait enters without a switch of tasks, so its decision is
-still valid.
+name away. So registering calls of a name wait for each other, and are decided in their turn. A call that need not wait
+enters without a switch of tasks, so its decision is still valid.
 
 The decision on a write depends on the present tree, because the write may overwrite a plain value above its key.
 Another write could set such a value after the decision and before the ROS master's answer. Also, two writes of one key

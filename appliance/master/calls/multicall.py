@@ -116,7 +116,6 @@ class Multicall:
         return self._fault(visit, PARSE_FAULT, "malformed", why)
 
     def _fault(self, visit: ServedRequest, code: int, event: str, why: str) -> Value:
-        """Record an event, and return a fault in place of a part's answer."""
         record = self.trail.happened(
             event,
             why,
@@ -139,11 +138,9 @@ class _Run:
 
     @property
     def longest(self) -> int:
-        """Return the largest number of parts."""
         return _LONGEST_READING if self.reads else _LONGEST_RUN
 
     def answered(self, attempts: Iterable[Value]) -> list[Value]:
-        """Return the answers to all parts. `attempts` has the answers to the attempts among them."""
         given = iter(attempts)
         return [[next(given)] if answer is None else answer for answer in self.answers]
 

@@ -207,7 +207,6 @@ class ParameterCalls:
             self.enactor.carry_out(self.graph.parameter_deleted(write.key))
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
-        """Make calls and return their outcomes. Several calls are sent as one multicall."""
         if not calls:
             return []
         try:

@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
@@ -11,7 +12,7 @@ from appliance.audit.record import Severity
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
-from appliance.master.graph.registry import Kind, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.policy.rate_limits import LimitRule
 from appliance.store.state_file import PermissionRow
 from appliance.telemetry.audit_trail import AuditTrail
@@ -62,10 +63,20 @@ class Traffic:
 
 
 class RelayTraffic:
-    """The connections and traffic of all relays; `relays` is their number."""
+    """The connections and traffic of all relays; `relays` is their number.
 
-    def __init__(self, trail: AuditTrail, registry: Registry, relays: int) -> None:
+    `cut_off(subscriber, topic)` is called for a connection that ended although both of its nodes are registered.
+    """
+
+    def __init__(
+        self,
+        trail: AuditTrail,
+        registry: Registry,
+        relays: int,
+        cut_off: Callable[[Incarnation, str], None],
+    ) -> None:
         self._trail = trail
+        self._cut_off = cut_off
         self._registry = registry
         self._relays = relays
         self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
@@ -156,7 +167,7 @@ class RelayTraffic:
         )
 
     def closed(self, relay: int, message: messages.ConnectionClosed) -> None:
-        """Record that a connection has ended."""
+        """Record that a connection has ended, and report a subscriber that lost its connection."""
         connection = self.connections.pop((relay, message.number), None)
         if connection is None:
             return
@@ -169,6 +180,22 @@ class RelayTraffic:
             resource=connection.resource,
             node=self._name(connection.key),
         )
+        subscriber = self._subscriber(connection)
+        if subscriber is not None:
+            self._cut_off(subscriber, connection.resource)
+
+    def _subscriber(self, connection: messages.ConnectionOpened) -> Incarnation | None:
+        """Return the subscriber of a connection; None if it or the publisher is no longer registered, or lost."""
+        topic, subscriber = connection.resource, self._registry.holder(connection.caller_id)
+        publishers = self._registry.registered(Kind.PUBLICATION, topic)
+        if (
+            subscriber is None
+            or str(subscriber.host) != connection.host
+            or (Kind.SUBSCRIPTION, topic) not in subscriber.registrations
+            or all(publisher.key != connection.key for publisher in publishers)
+        ):
+            return None
+        return subscriber
 
     def refused(self, message: messages.ConnectionRefused) -> None:
         """Record a refused peer. If the appliance's own node connects too late, this is not recorded as an attack."""

@@ -204,7 +204,6 @@ class RosGraph:
         return [*effects, *self._close(incarnation), DropCalls(incarnation)]
 
     def _close(self, incarnation: Incarnation) -> Effects:
-        """Close an incarnation to all other nodes."""
         return [WithdrawNode(incarnation), *self.grants.forget(incarnation.key), CloseNode(incarnation)]
 
     # --- grants ---

@@ -47,7 +47,6 @@ def _upwards(key: str) -> Iterator[str]:
 
 
 def _member(value: Value, path: str) -> Value:
-    """Return the value at the path in a namespace, or `{}`."""
     for part in path.split("/"):
         if not isinstance(value, dict) or part not in value:
             return {}

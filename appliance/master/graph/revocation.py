@@ -106,7 +106,6 @@ class Revocation:
         return effects
 
     def _registrations(self) -> list[tuple[Incarnation, NodeRegistration]]:
-        """Return all registrations of live and lost nodes, in the order in which they were made."""
         pairs = [
             (incarnation, registration)
             for incarnation in self.registry.all()

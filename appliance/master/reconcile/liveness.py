@@ -3,7 +3,8 @@
 A node is *lost* in three cases: its API refuses connections twice in a row, another process answers at its address, or
 there is no answer for `silent` seconds. A lost node is unregistered at the ROS master, as `rosnode cleanup` does, and
 becomes a shadow that keeps its registrations. If its API answers again, the registrations are restored, because a ROS 1
-node never registers twice.
+node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a host look lost, so
+a lost node is checked more often at first.
 """
 
 import asyncio
@@ -19,7 +20,7 @@ from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RELAY_NAME
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.graph import RosGraph
-from appliance.master.graph.registry import Incarnation, Life, Registry
+from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.graph.revocation import Revocation
 from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Address
@@ -56,6 +57,10 @@ _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0
 _IDLE_SECONDS = 30.0  # longer than any registering call takes
 _LOOK_AGAIN_SECONDS = 0.3
+_RECENT_SECONDS = 30.0  # after a loss, during which the node is checked every `_RECENTLY_LOST_SECONDS`
+_RECENTLY_LOST_SECONDS = 0.5
+_MADE_UP_SECONDS = 1.0  # between two repetitions for a node that keeps failing
+_APART_SECONDS = 0.3  # rospy uses only the last of the lists that arrive together
 
 
 @dataclass(slots=True)
@@ -89,6 +94,15 @@ class Watchlist:
         missed.parameters |= call.method == "paramUpdate"
         self.look_at(node)
 
+    def cut_off(self, subscriber: Incarnation, topic: str) -> None:
+        """Note that a subscriber lost its connection. Once it answers, it gets the list of publishers again."""
+        self._missed.setdefault(subscriber.key, MissedUpdates()).topics.add(topic)
+        self.look_at(subscriber)
+
+    def returned(self, node: Incarnation) -> None:
+        """Note that a lost node may hold connections that have ended here, for all its topics."""
+        self._missed[node.key] = MissedUpdates(set(node.resources(Kind.SUBSCRIPTION)))
+
     async def filled(self) -> None:
         """Wait until there is a node to check."""
         await self._filled.wait()
@@ -99,13 +113,13 @@ class Watchlist:
         nodes, self._nodes = self._nodes, {}
         return list(nodes.values())
 
-    def to_make_up(self, node: Incarnation, interval: float) -> MissedUpdates | None:
+    def to_make_up(self, node: Incarnation) -> MissedUpdates | None:
         """Return and clear the missed updates of a node.
 
-        Return None if there are none, or if the last repetition was less than `interval` seconds ago.
+        Return None if there are none, or if the last repetition was less than `_MADE_UP_SECONDS` ago.
         """
         missed, now = self._missed.get(node.key), time.monotonic()
-        if missed is None or (missed.made_up is not None and now - missed.made_up < interval):
+        if missed is None or (missed.made_up is not None and now - missed.made_up < _MADE_UP_SECONDS):
             return None
         self._missed[node.key] = MissedUpdates(made_up=now)
         return missed
@@ -134,12 +148,14 @@ class Liveness:
         # For each node: the time of its last registration, and the process id that first answered afterwards.
         self._processes: dict[str, tuple[float, int]] = {}
         self._checks: dict[str, asyncio.Task[None]] = {}
+        self._reminding: set[asyncio.Task[None]] = set()
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
         """Check all incarnations every `interval` seconds, and nodes on the watchlist at once. Run until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._look_at_all())
+            tasks.create_task(self._look_at_lost())
             tasks.create_task(self._watch())
 
     async def _look_at_all(self) -> None:
@@ -154,6 +170,14 @@ class Liveness:
             self.watchlist.keep_only(keys)
             for incarnation in known:
                 self.look_at(incarnation)
+
+    async def _look_at_lost(self) -> None:
+        while True:
+            await asyncio.sleep(_RECENTLY_LOST_SECONDS)
+            now = time.monotonic()
+            for incarnation in self.registry.all():
+                if incarnation.life is Life.SHADOW and now - incarnation.changed < _RECENT_SECONDS:
+                    self.look_at(incarnation)
 
     async def _watch(self) -> None:
         while True:
@@ -202,6 +226,9 @@ class Liveness:
     def _bring_back(self, incarnation: Incarnation) -> None:
         self.enactor.carry_out(self.graph.returned(incarnation))
         self.enactor.carry_out(self.revocation.returned(incarnation))
+        self.watchlist.returned(incarnation)
+        # Its publishers may return with it, so the lists follow a little later.
+        asyncio.get_running_loop().call_later(_RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     async def look(self, incarnation: Incarnation) -> None:
         """Check a node, and carry out the consequences."""
@@ -220,21 +247,37 @@ class Liveness:
             refused = there is None
             if refused or (not there and now - since >= self.settings.silent):
                 self._lose(incarnation, why)
+            elif there:
+                self._make_up(incarnation)
         else:
             self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
-        if there and incarnation.life is Life.LIVE:
-            self._make_up(incarnation)
 
     def _make_up(self, incarnation: Incarnation) -> None:
-        """Send a node the updates that it missed."""
-        missed = self.watchlist.to_make_up(incarnation, self.settings.interval)
+        """Send a node the updates that it missed. It drops the publishers first to which it is not connected."""
+        missed = self.watchlist.to_make_up(incarnation)
         if missed is None:
             return
         absent = {topic: publishers for _, topic, publishers in self.graph.absent([incarnation])}
-        for topic in sorted(missed.topics):
-            self.enactor.carry_out(self.graph.renew(incarnation, topic, absent.get(topic, ())))
+        # The first effect of a renewal is the list without the absent publishers.
+        dropped = [
+            self.graph.renew(incarnation, topic, absent[topic])[0]
+            for topic in sorted(missed.topics & absent.keys())
+        ]
+        self.enactor.carry_out(dropped)
+        reminding = asyncio.get_running_loop().create_task(
+            self._remind(incarnation, missed.topics, _APART_SECONDS if dropped else 0.0)
+        )
+        self._reminding.add(reminding)
+        reminding.add_done_callback(self._reminding.discard)
         if missed.parameters:
             self.enactor.carry_out(self.graph.tell_parameters(incarnation))
+
+    async def _remind(self, incarnation: Incarnation, topics: Collection[str], seconds: float) -> None:
+        """Send a node its lists of publishers after some seconds, unless it is lost again."""
+        await asyncio.sleep(seconds)
+        if self.registry.by_key(incarnation.key) is incarnation and incarnation.life is Life.LIVE:
+            for topic in sorted(topics):
+                self.enactor.carry_out(self.graph.remind(incarnation, topic))
 
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""

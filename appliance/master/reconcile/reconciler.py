@@ -159,7 +159,6 @@ class Reconciler:
         }
 
     async def _addresses(self, method: str, names: set[str]) -> dict[str, str]:
-        """Return the URIs of nodes, or of services, at the ROS master."""
         asked = sorted(names)
         answers = await self.rosmaster.all_now([(method, (NAME, name)) for name in asked])
         return {name: str(answer[2]) for name, answer in zip(asked, answers, strict=True) if answer[0] == 1}

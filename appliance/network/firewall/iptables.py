@@ -95,8 +95,6 @@ class IptablesBackend:
         return tuple(found)
 
     def _in_tables(self, work: "Callable[[_Table], None]") -> None:
-        """Run `work` with the table of each family, inside the namespace."""
-
         def inside() -> None:
             with _ONE_AT_A_TIME, _xtables_lock():
                 for family in _families():
@@ -209,7 +207,6 @@ def _matches(rule: PacketRule, family: Family) -> tuple[Extension, ...]:
 
 
 def _tracked(rule: PacketRule) -> list[Extension]:
-    """Return the matches of the connection tracker's state."""
     matches: list[Extension] = []
     if rule.new_connection:
         matches.append(("conntrack", (("ctstate", "NEW"),)))
@@ -260,7 +257,6 @@ class _Table:
         self._family = family
 
     def replace(self, all_rules: list[RenderedRule]) -> None:
-        """Replace all chains of the appliance in this family, in one commit."""
         rules = [rule for rule in all_rules if rule.family == self._family]
         present = {chain for chain in _CHAINS if self._table.is_chain(chain.value)}
         wanted = {chain for chain in _CHAINS if any(rule.chain == chain for rule in rules)}
@@ -280,7 +276,6 @@ class _Table:
             self._table.commit()
 
     def counters(self) -> list[RuleCounter]:
-        """Return the rules of the chains with all their hooks."""
         return [
             self._counter(chain, rule)
             for chain in _CHAINS
@@ -290,12 +285,10 @@ class _Table:
         ]
 
     def translating(self) -> list[str]:
-        """Return the chains with a target that translates sources."""
         chains = [str(chain.name) for chain in self._table.chains]
         return [self._named(name) for name in chains if self._targets(name) & SOURCE_TRANSLATIONS]
 
     def dropping(self, chain: str) -> list[str]:
-        """Return a built-in chain's name if its policy is DROP."""
         drops = self._library.Chain(self._table, chain).get_policy().name == "DROP"
         return [self._named(chain)] if drops else []
 
@@ -368,7 +361,6 @@ def _comment(rule: Any) -> str:
 
 @contextlib.contextmanager
 def _opened(family: Family, name: str = "filter") -> Iterator[_Table]:
-    """Open a table in the namespace of the calling thread."""
     library = _library()
     program = "ip6tables" if family == 6 else "iptables"
     table = None

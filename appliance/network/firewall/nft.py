@@ -88,7 +88,6 @@ class NftBackend:
         return tuple(dict.fromkeys(found))
 
     def _list(self, kind: str, *arguments: str) -> list[Json]:
-        """Return the entries of one kind that nft lists: `table`, `chain` or `rule`."""
         text = self._nft(list(arguments), "")
         try:
             return [entry[kind] for entry in json.loads(text)["nftables"] if kind in entry]
@@ -144,7 +143,6 @@ def render_rule(rule: PacketRule) -> list[Json]:
 
 
 def _transport(rule: PacketRule) -> list[Json]:
-    """Return the matches of a TCP or UDP header."""
     expressions: list[Json] = []
     for transport, ports in (("tcp", rule.tcp_ports), ("udp", rule.udp_ports)):
         if ports is not None:
@@ -180,7 +178,6 @@ def _body(rule: PacketRule, head: list[Json], family: int | None) -> Json:
 
 
 def _origin(rule: PacketRule, protocol: str) -> list[Json]:
-    """Return the matches of a packet's origin and destination: routes and interfaces."""
     expressions: list[Json] = []
     if rule.local_destination:
         expressions.append(_match({"fib": {"result": "type", "flags": ["daddr"]}}, "local"))
@@ -194,7 +191,6 @@ def _origin(rule: PacketRule, protocol: str) -> list[Json]:
 
 
 def _tracked(rule: PacketRule) -> list[Json]:
-    """Return the matches of the connection tracker's state."""
     expressions: list[Json] = []
     if rule.new_connection:
         expressions.append(_match({"ct": {"key": "state"}}, "new", "in"))
@@ -261,7 +257,6 @@ def _meter_set(name: str) -> Json:
 
 
 def _hook(chain: Chain, hook: Hook) -> list[Json]:
-    """Return a base chain at a hook of the kernel, with its jump to the chain with the rules."""
     base = {
         "name": f"{chain.value}-{hook.place}",
         "type": hook.kind,

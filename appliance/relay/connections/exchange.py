@@ -104,7 +104,6 @@ class ServiceExchange:
         self._to_service(data)
 
     def _refuse(self, reason: str) -> None:
-        """Send the client the reason in place of a reply."""
         self.done = not self._persistent
         data = encode_service_error(reason)
         self._count(len(data))

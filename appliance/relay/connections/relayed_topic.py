@@ -394,7 +394,6 @@ class RelayedTopic:
         return self._take(rest, rest, since)
 
     def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
-        """Record a batch, and pass its part `passing` on."""
         recording = self._recording
         if recording is None:
             return None if passing is None else self._admit(passing, since)
@@ -581,7 +580,6 @@ class RelayedTopic:
             self._header = None
 
     def _announce(self) -> None:
-        """Announce the served subscribers to the upstream."""
         if self.upstream is not None and self._header is not None:
             self.upstream.announce(self._names, self._header.get("type", ""))
 

@@ -143,7 +143,6 @@ class ServiceClient:
         self._weigh()
 
     def _reach(self) -> BufferedSocket | OwnServer:
-        """Return a new connection to the service. Raises `OSError` and `OverflowError`."""
         loop, service = self._context.loop, self.service
         if self._own is not None:
             called = service.service, self.host, self.caller_id
@@ -301,7 +300,6 @@ class ServiceClient:
             self.cut("" if self._exchange.may_read or self._exchange.done else reason)
 
     def _turn_away(self, reason: str) -> None:
-        """Send the client the reason in a header."""
         if self._live:
             self._release()
             self._refuse(self, self._client.take(), reason)

@@ -142,7 +142,6 @@ class Subscriber:
         self.topic.differs()
 
     def _queue_rest(self, batch: Batch, sent: int) -> None:
-        """Queue what the socket did not accept."""
         if sent:
             self._queue.append(batch.view, batch.messages, sent, batch.rest(sent))
         else:
@@ -229,7 +228,6 @@ class Subscriber:
             self.topic.relieve()
 
     def _write(self, on: bool) -> None:
-        """Start or stop waiting for space in the socket's buffer."""
         self._writing = on
         self.topic.differs()
         self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)

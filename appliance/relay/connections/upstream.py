@@ -366,7 +366,6 @@ class PublisherConnection(Upstream):
             self._loop.later(self._go_on, self._payer)
 
     def _go_on(self) -> None:
-        """Continue in the publisher's next turn."""
         self._scheduled = False
         if not self._left or self._pause is not None:
             return
@@ -381,7 +380,6 @@ class PublisherConnection(Upstream):
         self._continue(rest)
 
     def _read_on(self) -> None:
-        """Read again, because all received data is processed."""
         if self._left and self._socket is not None:
             self._left = False
             if self._pause is None:
@@ -389,7 +387,6 @@ class PublisherConnection(Upstream):
             self._take_early()
 
     def _take_early(self) -> None:
-        """Take the frames that came with the header."""
         while self._early and self._socket is not None and not self._left:
             buffer = self._buffer()
             count = min(len(self._early), len(buffer))

@@ -5,8 +5,6 @@ import gc
 import time
 from collections.abc import Callable, Hashable
 
-import msgspec
-
 from appliance.channel.messages import SpecificationsStated
 from rosmop.fast import load
 from rosmop.run.engine import MonitorSet
@@ -22,7 +20,7 @@ def monitor_set(
     """Return the set of monitors of these specifications, or the reasons why there is none."""
     try:
         compiled, fast = load.loaded(message.part)
-    except msgspec.MsgspecError as error:
+    except ValueError as error:
         return [f"control's specifications cannot be decoded: {error}"]
     return MonitorSet.of(
         compiled,

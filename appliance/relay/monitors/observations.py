@@ -61,7 +61,6 @@ class _Repeated:
     alike: bool = True
 
     def add(self, count: int, first_time: int, last_time: int, text: str) -> None:
-        """Count further events; `text` is that of the last one, empty if unknown."""
         if not self.count:
             self.first_time, self.first_text = first_time, text
         else:

@@ -111,7 +111,7 @@ class StateKeeper:
                 kept = read(memory)
                 if kept is not None:
                     yield _HEADS.decode(kept.head), kept.sections
-            except (ValueError, msgspec.MsgspecError) as error:
+            except ValueError as error:
                 found.lost[""] = f"{_UNREADABLE}: {error}"
 
     def _distrust(self, head: _Head) -> str:
@@ -265,7 +265,7 @@ def received_states(contents: Sequence[bytes], now: int) -> RecoveredState:
         try:
             kept = _CONTENTS.decode(content)
             head = _HEADS.decode(kept.head)
-        except msgspec.MsgspecError as error:
+        except ValueError as error:
             found.lost[""] = f"{_UNREADABLE}: {error}"
             continue
         if head.lost or head.written > now + _STEP:

@@ -95,7 +95,6 @@ class TopicPipeline:
         return self._called[1]
 
     def _account(self, walked: BatchResult, progress: BatchProgress, counts: FastPathCounts) -> None:
-        """Report and count the actions of the fast path."""
         if walked.output:
             self._report(walked, progress)
         progress.walked(walked.position, walked.run, counts.add(walked, progress.time))
@@ -157,7 +156,6 @@ class TopicPipeline:
         return walked.paused or progress.position == progress.end
 
     def _report(self, walked: BatchResult, progress: BatchProgress) -> None:
-        """Report the log lines of a walk."""
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._point[1]) else 0

@@ -276,7 +276,6 @@ class FrameReceiver:
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
 
     def _count(self, size: int) -> None:
-        """Count the bytes that are held for this connection."""
         if size != self._counted:
             self._share.add(size - self._counted)
             self._counted = size

@@ -5,8 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import msgspec
-
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Message
 from appliance.relay.loop import READ, WRITE, EventLoop, LoopTimer
@@ -95,7 +93,7 @@ class LoopLink:
         """Read the arrived messages. If the link has ended, carry them out before reporting the end."""
         try:
             self._arrived += self._channel.receive()
-        except (ChannelClosedError, msgspec.DecodeError) as error:
+        except (ChannelClosedError, ValueError) as error:
             self._end_of_link = str(error)
             self._loop.unwatch(self._channel.fileno())
             self._finish()

@@ -46,7 +46,6 @@ class _Store:
         self._common = self._most
 
     def set(self, rate: float) -> None:
-        """Set the limit; after a rate of 0 (no limit), all stores start full."""
         before, self.rate = self.rate, rate
         if not before:
             self._own, self._common = dict.fromkeys(self._own, self._room), self._most
@@ -54,7 +53,6 @@ class _Store:
         self._common = min(self._common, self._most_common)
 
     def hold(self, names: "WeakValueDictionary[str, RateAllowance]") -> None:
-        """Set the holders; fill the store of a new holder from the common store, as far as possible."""
         for name in [name for name in self._own if name not in names]:
             self._common += self._own.pop(name)
         new = [name for name in names if name not in self._own]
@@ -75,11 +73,9 @@ class _Store:
         self._common = min(self._common + left, self._most_common)
 
     def left(self, name: str) -> float:
-        """Return the amount that this holder may use now."""
         return self._own[name] + max(self._common, 0.0)
 
     def take(self, name: str, amount: float) -> None:
-        """Charge an amount to this holder."""
         own = min(amount, max(self._own[name], 0.0))
         common = min(amount - own, max(self._common, 0.0))
         self._common -= common
@@ -87,7 +83,6 @@ class _Store:
 
     @property
     def full(self) -> bool:
-        """Whether everything that was used has been refilled."""
         return not self.rate or (
             self._common >= self._most_common and all(own >= self._room for own in self._own.values())
         )

@@ -10,7 +10,9 @@ from appliance.relay.loop import HANGUP, READ, WRITE, EventLoop
 # Not every process may choose cubic, but every kernel allows reno to unprivileged processes. With bbr, the default of
 # some systems, large messages over loopback and a bridge are about half as fast as with cubic or reno.
 _CONGESTION = (b"cubic", b"reno")
-_KEEPALIVE = ((socket.TCP_KEEPIDLE, 60), (socket.TCP_KEEPINTVL, 10), (socket.TCP_KEEPCNT, 9))
+# A firewall that shuts out the appliance for a moment resets only the peer's end of a connection. A publisher's end is
+# then noticed by the next probe. Unanswered probes end a connection after more than two minutes.
+_KEEPALIVE = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 15), (socket.TCP_KEEPCNT, 9))
 _READ_SIZE = 64 << 10
 
 

@@ -74,7 +74,6 @@ def restrict(sandbox: SandboxPlan) -> int:
 
 
 def _rights_of_files(abi: int) -> int:
-    """Return all access rights that this ABI version knows."""
     rights = (1 << 13) - 1
     for since, right in ((2, 1 << 13), (3, _TRUNCATE), (5, _IOCTL)):
         rights |= right if abi >= since else 0
@@ -103,7 +102,6 @@ def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
 
 
 def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
-    """Open the paths that exist and can be reached."""
     for path in paths:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             descriptor = os.open(Path(path), os.O_PATH | os.O_CLOEXEC)
@@ -114,7 +112,6 @@ def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
 
 
 def _call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
-    """Return the result and the error number of a system call."""
     libc = ctypes.CDLL(None, use_errno=True)
     given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
     result: int = libc.syscall(ctypes.c_long(number), *given)

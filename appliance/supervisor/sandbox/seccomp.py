@@ -118,7 +118,6 @@ class _Filter:
                 raise SeccompError(f"no rule for {name}: {os.strerror(-result)}")
 
     def load(self) -> None:
-        """Apply the filter to this process and its children."""
         result = self._library.seccomp_load(self._context)
         self._library.seccomp_release(self._context)
         if result != 0:

@@ -253,9 +253,11 @@ def test_a_monitor_is_tried_and_promoted(appliance: Appliance) -> None:
     load(rest, {"speed.rv": LIMIT})
     made = appliance.rosrv("token", "add", "olga", "--role", "operator", "--json").stdout
     operator = rest.with_token(json.loads(made)["token"])
-    tried = send(operator, "PATCH", "/v1/monitors/speed", {"trial": True}, rest.get("/v1/monitors").etag)
+    tried = send(operator, "PATCH", "/v1/monitors/speed", {"shadow": True}, rest.get("/v1/monitors").etag)
     assert (tried.status, tried.json["names"], tried.json["began"]) == (200, ["speed"], [])
-    assert send(operator, "PATCH", "/v1/monitors/speed", {"trial": False, "enabled": True}, "*").status == 422
+    assert (
+        send(operator, "PATCH", "/v1/monitors/speed", {"shadow": False, "enabled": True}, "*").status == 422
+    )
     appliance.stop()
     appliance.start()
     rest = appliance.rest(rest.token)
@@ -265,7 +267,7 @@ def test_a_monitor_is_tried_and_promoted(appliance: Appliance) -> None:
     assert refused.status == 422
     assert "rosrv monitor promote" in str(refused.json)
     assert rest.get("/v1/status").json["monitors"]["shadow"] == ["speed"]
-    assert send(rest, "PATCH", "/v1/monitors", {"names": ["speed"], "trial": False}, "*").status == 200
+    assert send(rest, "PATCH", "/v1/monitors", {"names": ["speed"], "shadow": False}, "*").status == 200
     assert rest.get("/v1/monitors/speed").json["enabled"]
     for event in ("monitor in shadow mode", "monitor enabled"):
         assert appliance.recorded("--event", event, resource="speed")

@@ -864,7 +864,7 @@ def test_host_that_no_rule_names(field: Field) -> None:
     answer = field.call(field.unknown_host, "getPid", "/unknown")
     assert "no rule of the policy names 10.77.0.99" in answer.faultString
     record = field.recorded(host="10.77.0.99", decision="deny", resource="getPid", caller_id="/unknown")
-    assert record["detail"] == {"call": "getPid", "unknown_host": True, "stranger": True}
+    assert record["detail"] == {"call": "getPid", "unknown_host": True}
     field.call(field.unknown_host, "registerPublisher", "/evil", "/shared/x", "std_msgs/String", field.api)
     field.recorded(host="10.77.0.99", category="publish", resource="/shared/x", caller_id="/evil")
     wider = field.home / "wider.ini"

@@ -67,6 +67,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ),
         ("standby", PAIR | {"witness": {"answered_seconds": 5.0}}, "witness-silent", "warning", "system"),
         ("standby", PAIR | {"witness": {}}, "witness-silent", "warning", "system"),
+        ("standby", PAIR | {"obstacle": "other keys"}, "standby-unready", "alarm", "system"),
         (
             "standby",
             PAIR | {"witness": {"answered_seconds": 0.1, "holder": "b"}},

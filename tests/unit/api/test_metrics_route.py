@@ -198,7 +198,7 @@ def test_two_appliances_are_measured() -> None:
     assert standby_samples(rendered(body(), CALLS)) == {}
     other = {"name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400}
     state = example(
-        StandbyState, name="a", role="active", epoch=4, other=other,
+        StandbyState, name="a", role="active", epoch=4, other=other, obstacle="other keys",
         witness={"answered_seconds": 0.25, "holder": "b"},
     )  # fmt: skip
     answer = body()
@@ -208,6 +208,7 @@ def test_two_appliances_are_measured() -> None:
         'role{role="standby"}': 0,
         "connected": 1,
         "in_sync": 0,
+        "obstacle": 1,
         "behind_changes": 12,
         "behind_bytes": 3400,
         "witness_age_seconds": 0.25,
@@ -224,6 +225,7 @@ def test_a_standby_has_its_own_metrics() -> None:
         'role{role="active"}': 0,
         'role{role="standby"}': 1,
         "connected": 0,
+        "obstacle": 0,
         "witness_age_seconds": float("inf"),
         "takeovers_total": 4,
     }

@@ -201,7 +201,7 @@ def test_a_flood_of_denials_leaves_those_of_other_hosts() -> None:
     Unknown hosts count as one host.
     """
     flood = [denial(number, "10.0.0.66") for number in range(400)]
-    unknown = [denial(1000 + n, f"10.9.0.{n}", detail={"stranger": True}) for n in range(90)]
+    unknown = [denial(1000 + n, f"10.9.0.{n}", detail={"unknown_host": True}) for n in range(90)]
     few = [denial(2000 + number, "10.0.0.5") for number in range(10)]
     alarm = denial(3000, "10.0.0.66", severity=Severity.ALARM)
     kept = worth_keeping([*flood, *unknown, *few, alarm], 501)

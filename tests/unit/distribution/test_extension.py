@@ -73,17 +73,33 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path / "one")
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
+    """Provide a checkout in which the module is built; no test changes it."""
+    made = Checkout(tmp_path_factory.mktemp("original") / "with a longer name")
+    assert made.build() == BUILT
+    return made
+
+
+@pytest.fixture
+def built(original: Checkout, checkout: Checkout) -> Checkout:
+    """Provide a copy of a checkout in which the module is built."""
+    shutil.copytree(original.folder, checkout.folder, dirs_exist_ok=True)
+    return checkout
+
+
 BUILT = (0, f"extension: built {IN_PLACE.relative_to(ROOT)}\n")
 
 
-def test_it_is_built_when_something_changed(checkout: Checkout) -> None:
+def test_it_is_built_when_something_changed(built: Checkout) -> None:
     """The first build and one after a change write the file, without a warning; another build does nothing."""
-    assert (checkout.build(), checkout.answer()) == (BUILT, 1)
-    before = checkout.made.stat()
-    assert checkout.build() == (0, "")
-    assert checkout.made.stat() == before
-    checkout.write(_TEXT.format(2))
-    assert (checkout.build(), checkout.answer()) == (BUILT, 2)
+    before = built.made.stat()
+    assert built.answer() == 1
+    assert built.build() == (0, "")
+    after = built.made.stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    built.write(_TEXT.format(2))
+    assert (built.build(), built.answer()) == (BUILT, 2)
 
 
 def test_the_module_compiles_without_a_warning(checkout: Checkout) -> None:
@@ -92,23 +108,21 @@ def test_the_module_compiles_without_a_warning(checkout: Checkout) -> None:
     assert checkout.build() == BUILT
 
 
-def test_a_lost_or_damaged_file_is_replaced(checkout: Checkout) -> None:
+def test_a_lost_or_damaged_file_is_replaced(built: Checkout) -> None:
     """A file that differs from the built one is replaced, without being compiled again."""
-    checkout.build()
-    whole = checkout.made.read_bytes()
-    checkout.made.write_bytes(whole[:100])
-    assert (checkout.build(), checkout.made.read_bytes()) == (BUILT, whole)
-    checkout.made.unlink()
-    assert (checkout.build(), checkout.made.read_bytes()) == (BUILT, whole)
+    whole = built.made.read_bytes()
+    built.made.write_bytes(whole[:100])
+    assert (built.build(), built.made.read_bytes()) == (BUILT, whole)
+    built.made.unlink()
+    assert (built.build(), built.made.read_bytes()) == (BUILT, whole)
 
 
-def test_a_wrong_source_leaves_the_last_module(checkout: Checkout) -> None:
+def test_a_wrong_source_leaves_the_last_module(built: Checkout) -> None:
     """The message names the line and the command; the last module stays, and the next build tries again."""
-    checkout.build()
-    checkout.write("def answer(:\n")
+    built.write("def answer(:\n")
     for _ in range(2):
-        status, output = checkout.build()
-        assert (status, checkout.answer()) == (1, 1)
+        status, output = built.build()
+        assert (status, built.answer()) == (1, 1)
         assert f"{SOURCE}:1:11" in output
         assert re.search(
             rf"^extension: {SOURCE}: this command ended with status 1: \S+ -m cython", output, re.M
@@ -132,27 +146,24 @@ def test_many_builds_at_once(checkout: Checkout) -> None:
     assert checkout.answer() == 1
 
 
-def test_two_folders_have_the_same_module(checkout: Checkout, tmp_path: Path) -> None:
+def test_two_folders_have_the_same_module(checkout: Checkout, original: Checkout) -> None:
     """The file is equal byte by byte wherever it is built, and does not contain the folder."""
-    other = Checkout(tmp_path / "another, with a longer name")
-    checkout.build()
-    other.build()
-    assert checkout.made.read_bytes() == other.made.read_bytes()
-    assert str(tmp_path).encode() not in checkout.made.read_bytes()
+    assert checkout.build() == BUILT
+    assert checkout.made.read_bytes() == original.made.read_bytes()
+    assert str(checkout.folder).encode() not in checkout.made.read_bytes()
 
 
-def test_it_is_hardened(checkout: Checkout) -> None:
+def test_it_is_hardened(original: Checkout) -> None:
     """The addresses of functions are read-only after loading; an overflow of a buffer ends the process."""
-    checkout.build()
     shown = subprocess.run(
-        ["readelf", "--wide", "--dynamic", "--program-headers", "--symbols", str(checkout.made)],
+        ["readelf", "--wide", "--dynamic", "--program-headers", "--symbols", str(original.made)],
         capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     assert all(word in shown for word in ("BIND_NOW", "GNU_RELRO", "__stack_chk_fail", "__memcpy_chk"))
     assert re.search(r"GNU_STACK.* RW ", shown)
     process = subprocess.Popen(
         [sys.executable, "-c", "import pump; pump.answer(bytearray(5))"],
-        cwd=checkout.made.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        cwd=original.made.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     assert b"buffer overflow detected" in process.communicate(timeout=60)[1]
 

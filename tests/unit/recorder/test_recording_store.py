@@ -69,9 +69,12 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
     store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     second, first = put(store, recording(2)), put(store, recording(1))
     store.part("f" * 20).mkdir()
-    spoilt = tmp_path / ("e" * 20)
-    spoilt.mkdir()
-    (spoilt / ABOUT).write_text("{")
+    about = (tmp_path / first.id / ABOUT).read_bytes()
+    for letter, damaged in (("d", about.replace(first.id.encode(), b"\xff" * 20)), ("e", b"{")):
+        assert damaged != about
+        spoilt = tmp_path / (letter * 20)
+        spoilt.mkdir()
+        (spoilt / ABOUT).write_bytes(damaged)
     again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     assert again.recordings == [first, second]
     assert again.parts() == [again.part("f" * 20)]
@@ -82,7 +85,7 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
     assert list(again.removed()) == [(first, "eve", "")]
     again.note(first.id)
     assert not list(again.removed())
-    assert {path.name for path in tmp_path.iterdir()} == {second.id, f".{'f' * 20}.part", "e" * 20}
+    assert {path.name for path in tmp_path.iterdir()} == {second.id, f".{'f' * 20}.part", "d" * 20, "e" * 20}
 
 
 def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:

@@ -174,8 +174,6 @@ _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
     "disable": ("switch", admin.MonitorSwitch, {"enabled": False}),
     "shadow": ("shadow", admin.MonitorShadow, {"shadow": True}),
     "promote": ("shadow", admin.MonitorShadow, {"shadow": False}),
-    "trial": ("trial", admin.MonitorTrial, {"trial": True}),
-    "end-trial": ("trial", admin.MonitorTrial, {"trial": False}),
     "resume": ("resume", admin.MonitorResume, {}),
 }
 _FLAGS = {"shadow", "force", "prune"}

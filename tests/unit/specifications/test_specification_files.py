@@ -12,6 +12,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
     read_folder,
 )
+from tests.support.unreadable_folders import make_unreadable
 
 SPEC = "a() { event said() /chatter std_msgs/String '{}' { } }"
 OWN = "b() { event trigger() /trigger own_msgs/Trigger '{}' { } }"
@@ -63,6 +64,17 @@ def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     (tmp_path / "msg").mkdir()
     (tmp_path / "msg" / "Trigger.msg").write_text("int32 data\n")
     with pytest.raises(SpecificationsRefusedError, match="folder of its package"):
+        read_folder(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["", "msg", "msg/own_msgs"])
+def test_an_unreadable_folder_is_not_an_empty_one(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A start without the specifications or definitions of a folder would go unnoticed."""
+    (tmp_path / "msg" / "own_msgs").mkdir(parents=True)
+    make_unreadable(tmp_path / name, monkeypatch)
+    with pytest.raises(SpecificationsRefusedError, match="cannot be read: Permission denied"):
         read_folder(tmp_path)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import signal
 import sqlite3
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NoReturn
 
 import msgspec
 import pytest
@@ -148,6 +150,47 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
         database.close()
     finally:
         subprocess.run(["umount", "--lazy", place], check=True)
+
+
+async def test_callers_learn_that_writing_has_ended(
+    tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a defect of the writer, waiting callers and orders get an error; the next start applies the changes."""
+    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
+    monkeypatch.setattr(threading, "excepthook", lambda _arguments: None)
+
+    def defect(_tables: Tables, _change: Change) -> NoReturn:
+        raise RuntimeError("unforeseen")
+
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    with monkeypatch.context() as broken:
+        broken.setattr(Tables, "statement", defect)
+        database.put("thing", "a", 1)
+        with pytest.raises(StoreError, match="writing ended: RuntimeError: unforeseen"):
+            await database.settled()
+        with pytest.raises(StoreError, match="nothing was changed"):
+            database.require_room()
+        database.close()
+    assert failures == [f"{tmp_path / 'state.db'}: writing ended: RuntimeError: unforeseen"]
+    again = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    assert again.query("SELECT name FROM thing") == [("a",)]
+    again.close()
+
+
+async def test_writing_continues_without_the_file_of_changes(
+    database: Database, tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the disk fails while the file of changes is emptied, the database is written; the owner gets a message."""
+
+    def broken(_descriptor: int, _length: int) -> NoReturn:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "ftruncate", broken)
+    for number in range(2):
+        database.put("thing", f"row {number}", number)
+        await database.settled()
+    assert database.query("SELECT name FROM thing") == [("row 0",), ("row 1",)]
+    assert failures == [f"{tmp_path / 'state.ahead'}: [Errno 5] Input/output error"]
 
 
 async def test_settled_statements_survive_a_power_failure(

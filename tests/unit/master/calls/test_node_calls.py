@@ -40,7 +40,7 @@ async def test_each_connection_is_read_once() -> None:
     for number in range(TOPICS):
         for kind in (Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SERVICE):
             registry.register(node, kind, f"/{kind}_{number}", "std_msgs/String")
-    carried = RelayTraffic(idle(AuditTrail), registry, 1)
+    carried = RelayTraffic(idle(AuditTrail), registry, 1, lambda _node, _topic: None)
     topic = f"/{Kind.PUBLICATION}_7"
     carried.connections = connections = Counted(
         {

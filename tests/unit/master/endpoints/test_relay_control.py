@@ -101,12 +101,18 @@ class World:
     def __init__(self, grants: Bounds = GRANTS.bounds) -> None:
         self.records: list[tuple[str, str, dict[str, Any]]] = []
         self.lost: list[int] = []
+        self.cut_off: list[tuple[str, str]] = []
         self.registry = Registry()
         self.allocation = Allocation(2)
         self.policy = policy()
         self.put(left=0, right=1)
         self.ports = Ports()
-        carried = RelayTraffic(cast(AuditTrail, self), self.registry, 2)
+        carried = RelayTraffic(
+            cast(AuditTrail, self),
+            self.registry,
+            2,
+            lambda node, topic: self.cut_off.append((node.name, topic)),
+        )
         self.grants = Grants(carried.used, grants)
         self.relay = RelayControl(
             self.registry,
@@ -302,6 +308,26 @@ async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world:
     world.put()
     relay.place_moved(back)
     assert first.heard() == [messages.ServicePlaced("key", "/serve", "10.0.0.5", 4001)]
+
+
+@pytest.mark.parametrize(
+    ("ended", "cut_off"), [(None, [("/ear", "/left")]), (Kind.PUBLICATION, []), (Kind.SUBSCRIPTION, [])]
+)
+async def test_a_subscriber_that_lost_its_connection(
+    world: World, ended: Kind | None, cut_off: list[tuple[str, str]]
+) -> None:
+    """It counts as cut off only while it and the publisher are still registered."""
+    uri = "http://10.0.0.5:4001/"
+    ear = Incarnation("ear", "/ear", HOST, parse_node_uri(uri), uri, "10.0.0.1", 4, 5, more_relay_ports=(6,))
+    world.registry.add(ear)
+    world.registry.register(ear, Kind.SUBSCRIPTION, "/left", "std_msgs/String")
+    link = world.links[0]
+    link.say(messages.ConnectionOpened(7, "key", "/left", "topic", "10.0.0.5", "/ear"), ())
+    if ended is not None:
+        leaving = {Kind.PUBLICATION: world.node, Kind.SUBSCRIPTION: ear}[ended]
+        world.registry.unregister(leaving, ended, "/left")
+    link.say(messages.ConnectionClosed(7, "broken"), ())
+    assert world.cut_off == cut_off
 
 
 async def test_a_lost_relay_loses_its_connections(world: World) -> None:

@@ -38,7 +38,7 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
         registry.add(node)
         if own:
             registry.register(node, Kind.SUBSCRIPTION, "/rosout", "rosgraph_msgs/Log")
-    told = RelayTraffic(cast(Any, kept), registry, 1)
+    told = RelayTraffic(cast(Any, kept), registry, 1, lambda _node, _topic: None)
     told.refused(ConnectionRefused("k", "topic", topic, host, "/rosout", "[/talker] is not a publisher", 1))
     (record,) = kept.records
     assert record["decision"] == ("deny" if attack else None)
@@ -49,6 +49,6 @@ def test_a_late_connection_of_our_own_node_is_not_an_attack(host: str, topic: st
 def test_a_refusal_without_a_name_has_no_category() -> None:
     """A host that is refused before it sends a header has not yet requested a topic or a service."""
     kept = Kept()
-    told = RelayTraffic(cast(Any, kept), Registry(), 1)
+    told = RelayTraffic(cast(Any, kept), Registry(), 1, lambda _node, _topic: None)
     told.refused(ConnectionRefused("k", "", "", "10.0.0.66", "", "said nothing", 2))
     assert (kept.records[0]["category"], kept.records[0]["count"]) == (None, 2)

@@ -55,6 +55,39 @@ async def test_a_missed_list_is_sent_again_when_the_node_answers() -> None:
     assert world.deliveries.told == [("/ear", "publisherUpdate", each) for each in lists]
 
 
+async def test_a_subscriber_that_was_cut_off_gets_its_list_again() -> None:
+    """A subscriber whose connection broke drops the publisher and connects again, once it answers."""
+    world = await ControlParts.begun()
+    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/t")
+    await world.register(mouth, Kind.PUBLICATION, "/t")
+    world.deliveries.told.clear()
+    world.watchlist.cut_off(ear, "/t")
+    for watched in world.watchlist.take():
+        await world.look(watched)
+    lists: list[tuple[str, list[str]]] = [("/t", []), ("/t", [mouth.outer_uri("10.0.0.1")])]
+    assert world.deliveries.told == [("/ear", "publisherUpdate", each) for each in lists]
+
+
+async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost node is checked long before the next check of all nodes."""
+    monkeypatch.setattr(liveness, "_RECENTLY_LOST_SECONDS", 0.0)
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    assert world.lives == [Life.SHADOW]
+    world.clients.silent = set()
+    running = asyncio.create_task(world.liveness.run())
+    try:
+        async with asyncio.timeout(world.liveness.settings.interval / 2):
+            while world.lives != [Life.LIVE]:
+                await asyncio.sleep(0)
+    finally:
+        running.cancel()
+
+
 async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """An absent node without registrations is kept; when they are granted again, they are restored."""
     monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)

@@ -11,17 +11,17 @@ import { useStore } from "../store.js";
 import { SwitchOver } from "./switch.js";
 
 const SILENT = 5; // seconds, as in channel/standby_summary.py
-const GRAVE = ["both-active", "standby-away", "standby-behind", "witness-silent"];
+const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent"];
 
 /** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */
 export function Pair({ state, orders = false }) {
-  const { other, witness } = state;
+  const { other, witness, obstacle } = state;
   const active = state.role === "active";
   return html`<section class="panel" aria-labelledby="pair"><div class="panel-head"><h2 id="pair">Two appliances</h2>
       ${orders && html`<span class="end"><${SwitchOver} state=${state} /></span>`}</div>
     <div class="table-wrap"><table class="table"><thead><tr><th>Appliance</th><th>State</th></tr></thead><tbody>
-      <tr><${Name} name=${state.name} address=${state.address} more="this one" /><td><${Badge} word=${state.role} tone=${active ? "allow" : "note"} /><div class="muted small">since <${Moment} at=${state.since} />, epoch ${state.epoch}</div></td></tr>
-      <tr><${Name} name=${other.name} address=${other.address} /><td>${active ? html`<${Follower} other=${other} />` : html`<${Leader} other=${other} />`}</td></tr>
+      <tr><${Name} name=${state.name} address=${state.address} more="this one" /><td><${Badge} word=${state.role} tone=${active ? "allow" : "note"} /><div class="muted small">since <${Moment} at=${state.since} />, epoch ${state.epoch}</div>${active ? null : html`<${Obstacle} text=${obstacle} />`}</td></tr>
+      <tr><${Name} name=${other.name} address=${other.address} /><td>${active ? html`<${Follower} other=${other} obstacle=${obstacle} />` : html`<${Leader} other=${other} />`}</td></tr>
       <tr><${Name} name="Witness" address=${witness.address} more="on the robot" /><td><${Witness} witness=${witness} name=${state.name} active=${active} /></td></tr>
     </tbody></table></div>
     <div class="panel-body small muted">Nodes reach the active appliance at <${Given} value=${state.fixed} mono />.${active ? ` ${waits(state)}` : ""}</div></section>`;
@@ -38,11 +38,17 @@ function Name(/** @type {{name: string, address: string, more?: string}} */ { na
 }
 
 /** The standby, as the active appliance sees it. */
-function Follower(/** @type {{other: any}} */ { other }) {
+function Follower(/** @type {{other: any, obstacle: string}} */ { other, obstacle }) {
   if (!other.connected) return html`<${Away} other=${other} />`;
+  if (obstacle) return html`<${Obstacle} text=${obstacle} />`;
   if (other.in_sync) return html`<${Badge} word="in sync" tone="allow" /><div class="muted small">can take over</div>`;
   const lag = other.behind_changes ? `${counted(other.behind_changes, "change")}, ${counted(other.behind_bytes, "byte")}` : "the last changes";
   return html`<${Badge} word="behind" tone="warn" /><div class="muted small">lacks ${lag}; cannot take over</div>`;
+}
+
+/** Why the standby cannot take over, although it follows. */
+function Obstacle(/** @type {{text: string}} */ { text }) {
+  return text ? html`<${Badge} word="cannot take over" tone="deny" /><div class="muted small"><${Given} value=${text} most=${200} /></div>` : null;
 }
 
 /** The active appliance, as the standby sees it. */

@@ -12,9 +12,9 @@ import { ask } from "../rest.js";
 /** The button that opens the dialog. @param {{state: any}} given */
 export function SwitchOver({ state }) {
   const [open, setOpen] = useState(false);
-  const { other } = state;
-  const ready = other.connected && other.in_sync;
-  return html`<${Button} small role="admin" disabled=${!ready} why=${`${other.name} does not have all changes`} onClick=${() => setOpen(true)}>Switch over…</${Button}>
+  const { other, obstacle } = state;
+  const ready = other.connected && other.in_sync && !obstacle;
+  return html`<${Button} small role="admin" disabled=${!ready} why=${obstacle ? `${other.name} cannot take over: ${obstacle}` : `${other.name} does not have all changes`} onClick=${() => setOpen(true)}>Switch over…</${Button}>
     ${open && html`<${Confirm} name=${state.name} other=${other} close=${() => setOpen(false)} />`}`;
 }
 
