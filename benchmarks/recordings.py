@@ -1,20 +1,23 @@
 """Throughput and memory of `rosmop run` over many recordings: one process against two, and short against long.
 
-    python -m benchmarks.recordings --pairs 5
+    python -m benchmarks.recordings
 
 Each pair runs both numbers of workers, in alternating order, on the same recordings; the efficiency of a pair is the
-ratio of their throughputs divided by the number of workers.
+ratio of their throughputs divided by the number of workers. Two commands with half of the recordings each, at the same
+time and without a pool, show the efficiency that the machine allows. Processor time does not depend on other programs.
 """
 
 import argparse
 import os
 import random
+import resource
 import statistics
 import struct
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from rosbags.rosbag1 import Writer
@@ -55,6 +58,12 @@ def make(path: Path, seed: int, seconds: int, payload: int) -> None:
             writer.write(rows[1], now, struct.pack("<I", payload) + bytes(payload))
 
 
+def processor_time() -> float:
+    """Return the seconds of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def run(folder: Path, recordings: str, workers: int) -> tuple[float, int]:
     """Return the seconds of a run, and the largest memory of its first process in bytes."""
     command = [
@@ -77,9 +86,9 @@ def run(folder: Path, recordings: str, workers: int) -> tuple[float, int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--recordings", type=int, default=16)
-    parser.add_argument("--seconds", type=int, default=600)
+    parser.add_argument("--seconds", type=int, default=3000, help="length of a recording")
     parser.add_argument("--payload", type=int, default=1000)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -93,13 +102,25 @@ def main() -> None:
         efficiencies = []
         for pair in range(options.pairs):
             order = (1, 2) if pair % 2 == 0 else (2, 1)
-            seconds = {workers: run(folder, "many", workers)[0] for workers in order}
+            seconds, used = {}, {}
+            for workers in order:
+                before = processor_time()
+                seconds[workers] = run(folder, "many", workers)[0]
+                used[workers] = processor_time() - before
+            with ThreadPoolExecutor(2) as both:
+                begin = time.perf_counter()
+                list(both.map(lambda half: run(folder, f"many/*[{half}].bag", 1), ("02468", "13579")))
+                apart = time.perf_counter() - begin
             efficiencies.append(seconds[1] / seconds[2] / 2)
             rates = ", ".join(
                 f"{workers}: {options.recordings / taken:.2f} recordings/s, {size / taken / 1e6:.1f} MB/s"
                 for workers, taken in sorted(seconds.items())
             )
-            print(f"{rates}; efficiency {efficiencies[-1]:.2f}; load {os.getloadavg()[0]:.1f}", flush=True)
+            print(
+                f"{rates}; efficiency {efficiencies[-1]:.2f} (apart {seconds[1] / apart / 2:.2f}); "
+                f"processor {used[1]:.1f} s, {used[2]:.1f} s; load {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
         print(f"median efficiency {statistics.median(efficiencies):.2f}")
         for seconds_long in (60, 600, 6000):
             make(folder / f"{seconds_long}.bag", 1, seconds_long, options.payload)
