@@ -75,7 +75,9 @@ class Mistakes:
         around = self._reach(ASIDE)
         self._result("it drives on after turning away", around["there"], _nearest(around))
         held = self._reach(OUTSIDE_ASIDE)
-        self._result("with the monitor it stays in its zone", held["farthest"] < FAR_OUT, _farthest(held))
+        self._result(
+            "with the monitor it stops at the zone's border", held["farthest"] < FAR_OUT, _farthest(held)
+        )
         self._recorded("message dropped", "safeZone", "the dropped command")
         return [*stopped["way"], *around["way"], *held["way"]]
 
