@@ -10,18 +10,20 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
-LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
-# What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.
+# Rules on the source run with `make check`, however long they take.
+LONG_UNIT := $(filter-out tests/unit/test_%,$(shell grep '^tests/unit\|^rosmop' tests/long.txt))
+# What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own. A
+# cluster of Ray needs processors: its tests run here, where only containers run in parallel.
 CONTAINERS := tests/system/containers
-FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
+FETCHING := tests/system/vm $(addprefix tests/system/test_,clickhouse.py examples.py generated_client.py recordings_cluster.py)
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
 # What takes longest runs with `make test-system` only: attacks, crashes and stock tools; searches.
 LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integration/*/test_floods.py tests/integration/*/test_crashes.py tests/integration/*/test_robustness.py tests/integration/test_stock_tools.py tests/integration/*/test_stock_tools.py)
-LONGEST_UNITS := $(addprefix rosmop/tests/,certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py) \
-	tests/unit/recorder/test_killed.py tests/unit/relay/transport/test_pump_fuzzer.py
+LONGEST_UNITS := $(addprefix rosmop/tests/,batch/test_hostile_recordings.py certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py) \
+	$(addprefix tests/unit/,distribution/test_extension.py recorder/test_killed.py relay/transport/test_pump_fuzzer.py standby/test_replication_kills.py)
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
-.PHONY: help setup demo check static unit test units nodes test-system test-fleet system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site release bench clean
+.PHONY: help setup demo check static unit test units nodes test-system test-fleet system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site fleet release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -108,9 +110,16 @@ image: setup ## the container image and the list of its parts: dist/rosrv-image_
 site: setup ## all that a site without a network needs, in one archive: dist/rosrv-site_VERSION_ARCH.tar
 	$(BIN)/python -m distribution.site $(ARGS)
 
+fleet: setup ## the collector: its images dist/rosrv-fleet-images_VERSION_ARCH.tar, its wheel dist/rosrv_fleet-VERSION-….whl
+	mkdir -p dist
+	cd fleet && ../$(BIN)/python -m hatchling build --target wheel --directory ../dist
+	docker build --file fleet/Dockerfile --target postgres --tag rosrv/fleet-postgres $(ARGS) .
+	docker build --file fleet/Dockerfile --target collector --tag rosrv/fleet $(ARGS) .
+	docker save --output dist/rosrv-fleet-images_$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')_$$(dpkg --print-architecture).tar rosrv/fleet rosrv/fleet-postgres
+
 release: ## everything anew, with provenance and checksums that KEY=FILE signs
 	rm -rf dist
-	$(MAKE) wheel package site ARCH="amd64 arm64"
+	$(MAKE) wheel package site fleet ARCH="amd64 arm64"
 	$(BIN)/python -m distribution.release "$(KEY)"
 
 bench: setup ## measure: every program in benchmarks/

@@ -55,7 +55,7 @@ _MONITOR = (
 _LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
-    "decision": ("call", "key", "node", "subgraph", "needs", "parts", "unknown_host", "stranger"),
+    "decision": ("call", "key", "node", "subgraph", "needs", "parts", "unknown_host"),
     "revoked": ("call", "needs"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,

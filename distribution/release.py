@@ -23,7 +23,14 @@ from appliance import __version__
 from distribution.checkout import ROOT, revision, time_of_commit
 
 _OWN = ("provenance.json", "SHA256SUMS", "SHA256SUMS.sig")
-_MATERIALS = ("requirements.lock", "requirements-dev.lock", "distribution/image-packages.lock", "Dockerfile")
+_MATERIALS = (
+    "requirements.lock",
+    "requirements-dev.lock",
+    "distribution/image-packages.lock",
+    "Dockerfile",
+    "fleet/requirements.lock",
+    "fleet/Dockerfile",
+)
 
 
 def release(folder: Path, key: Path) -> None:
