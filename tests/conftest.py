@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from appliance.network import interfaces
-from appliance.network.namespaces import Namespace, has_privileges
+from appliance.network.namespaces import has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.examples import examples
 from tests.support.nodes import RosSession, has_ros
+from tests.support.own_namespace import own_loopback
 from tests.support.processes import ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.site import Masters, Site
@@ -123,12 +123,9 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput") or not has_privileges():
         return
-    namespace = Namespace(f"rosrv-test-worker.{os.getpid()}").create()
     inside = contextlib.ExitStack()
-    inside.enter_context(namespace.entered())
+    inside.enter_context(own_loopback())
     config.add_cleanup(inside.close)
-    interfaces.set_link(Namespace.own(), "lo", up=True)
-    namespace.delete()  # only the name: it ends with the worker's last process
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist

@@ -19,9 +19,9 @@ from rosrv_fleet.bundles.keys import KeyFolder, load_online_key
 from rosrv_fleet.bundles.publication import next_timestamp, read_publication
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY, BundleRepository
 
-from appliance.bundles.collector_connection import CollectorConnection, robot_context
 from appliance.bundles.terms import BundlePath, Ring, Terms
 from appliance.bundles.verified_bundles import VerifiedBundles
+from appliance.collector.connection import CollectorConnection, robot_connection
 from tests.support.fleet_certificates import FleetAuthority
 
 PASSPHRASE = "a passphrase for tests"  # noqa: S105  of keys that a test makes
@@ -113,7 +113,7 @@ class BundleSite:
     def connection(self, url: str, robot: str = ROBOT) -> CollectorConnection:
         """Return a robot's connection."""
         certificate, key = self.authority.issue(robot)
-        made = CollectorConnection(url, robot_context(self.authority.ca, certificate, key), None)
+        made = robot_connection(url, self.authority.ca, certificate, key)
         self.connections.append(made)
         return made
 

@@ -38,7 +38,7 @@ def make_certificates(
             keys[name].public_key(),
             x509.random_serial_number(),
             now - datetime.timedelta(hours=1),
-            now + datetime.timedelta(days=1),
+            now + datetime.timedelta(days=90),
         )
         for extension, critical in extensions:
             builder = builder.add_extension(extension, critical)

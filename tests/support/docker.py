@@ -322,6 +322,17 @@ class Compose:
         return self("--profile", "demo", "logs", "--no-color", "--tail", "40", check=False).stdout
 
 
+def build_fleet() -> None:
+    """Build the images of the collector and of its PostgreSQL with the command of docs/fleet.md."""
+    with builder() as engine, tempfile.TemporaryDirectory() as folder:
+        network_and_base = {"network": "host", "args": {"BASE": BASE}}
+        services = {name: {"build": network_and_base} for name in ("collector", "postgres")}
+        override = Path(folder) / "override.json"
+        override.write_text(json.dumps({"services": services}))
+        compose = engine.compose(ROOT, "fleet", "fleet/compose.yaml", str(override))
+        compose("build", timeout=BUILD_SECONDS)
+
+
 def build_images() -> None:
     """Build the images of the appliance and of the demonstration from this checkout."""
     with builder() as engine:

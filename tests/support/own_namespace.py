@@ -1,10 +1,14 @@
-"""Isolation netns has one namespace and one lock per machine: tests that use it take turns."""
+"""Network namespaces of tests: turns for the one of `rosrv up`, and loopbacks that nothing else shares."""
 
 import contextlib
 import fcntl
+import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+from appliance.network import interfaces
+from appliance.network.namespaces import Namespace
 
 _TURN = Path(tempfile.gettempdir()) / "rosrv-test-netns.lock"
 
@@ -14,4 +18,14 @@ def own_namespace() -> Iterator[None]:
     """Wait until no other test runs an appliance with isolation netns, the default of `rosrv up`."""
     with _TURN.open("w") as turn:
         fcntl.flock(turn, fcntl.LOCK_EX)
+        yield
+
+
+@contextlib.contextmanager
+def own_loopback() -> Iterator[None]:
+    """Run a block, and the processes that it starts, with a network that is only a loopback. Needs root."""
+    namespace = Namespace(f"rosrv-test-loopback.{os.getpid()}").create()
+    with namespace.entered():
+        interfaces.set_link(Namespace.own(), "lo", up=True)
+        namespace.delete()  # only the name: it ends with the last process in it
         yield

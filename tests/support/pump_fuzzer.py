@@ -49,6 +49,9 @@ _EVENTS = (
     select.EPOLLIN, select.EPOLLIN | select.EPOLLOUT, select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLPRI,
     select.EPOLLIN | select.EPOLLET, select.EPOLLOUT, select.EPOLLIN | select.EPOLLONESHOT,
 )  # fmt: skip
+OUTCOMES = frozenset({"left: judged", "left: received", "left: sent", "left: unarmed", "module"})
+"""Outcomes that a run must have caused at least once."""
+
 _INVOKE = ctypes.CFUNCTYPE(
     ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p, ctypes.POINTER(ctypes.c_int64), ctypes.c_size_t,
     ctypes.POINTER(ctypes.c_void_p),
@@ -422,12 +425,15 @@ class PumpFuzzer:
 
 
 def fuzz(seed: int, size: int) -> str:
-    """Perform actions until `size` bytes are sent; return what was done. Runs in the process with the sanitizers."""
+    """Perform actions until `size` bytes are sent and all `OUTCOMES` are seen, at most for ten times `size` bytes.
+
+    Return what was done. Runs in the process with the sanitizers.
+    """
     appliance.relay.transport.__path__.insert(0, str(build(SANITIZED).parent))
     pump = importlib.import_module("appliance.relay.transport.pump")
     assert SANITIZED in str(pump.__file__), pump.__file__
     fuzzer = PumpFuzzer(pump, seed)
-    while fuzzer.sent < size:
+    while fuzzer.sent < size or (fuzzer.sent < 10 * size and not fuzzer.done.keys() >= OUTCOMES):
         fuzzer.step()
     fuzzer.close()
     counts = "\n".join(f"{number:>9}  {name}" for name, number in sorted(fuzzer.done.items()))

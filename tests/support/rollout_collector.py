@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 from collections.abc import Coroutine, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -12,7 +13,8 @@ import uvicorn
 from fastapi import FastAPI, HTTPException, Request
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from rosrv_fleet.bundles.robot_routes import robot_routes
-from rosrv_fleet.database import Database, migrate
+from rosrv_fleet.database import IndexDatabase, migrate
+from rosrv_fleet.robots import Robot, RobotGroup
 from rosrv_fleet.rollouts.operator_routes import operator_routes
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore
@@ -33,13 +35,6 @@ class _Protocol(HttpToolsProtocol):
         self.scope.setdefault("state", {})["robot"] = names.get("commonName", "")
 
 
-def _robot(request: Request) -> str:
-    name = str(request.state.robot)
-    if not name:
-        raise HTTPException(401, "a robot proves who it is with its certificate")
-    return name
-
-
 def _operator(request: Request) -> str:
     if request.state.robot != "operator":
         raise HTTPException(403, "for operators")
@@ -47,10 +42,12 @@ def _operator(request: Request) -> str:
 
 
 class RolloutCollector:
-    """A running collector; `call` runs a coroutine in its event loop."""
+    """A running collector; `call` runs a coroutine in its event loop. Its clock is `ahead` seconds ahead."""
 
-    def __init__(self, folder: Path, authority: FleetAuthority, address: str) -> None:
+    def __init__(self, folder: Path, authority: FleetAuthority, address: str, ahead: float = 0) -> None:
         self._address = address
+        self._ahead = ahead
+        self.groups: dict[str, RobotGroup] = {}
         self._authority = authority
         self.folder = folder
         self.loop = asyncio.new_event_loop()
@@ -58,6 +55,17 @@ class RolloutCollector:
         self.url = ""
         self._started = threading.Event()
         self._thread = threading.Thread(target=self.loop.run_until_complete, args=(self._run(),), daemon=True)
+
+    def enrol(self, group: RobotGroup, *names: str) -> None:
+        """Enrol robots, whose certificates have these names, in a group."""
+        self.groups |= dict.fromkeys(names, group)
+
+    def _robot(self, request: Request) -> Robot:
+        name = str(request.state.robot)
+        if not name:
+            raise HTTPException(401, "a robot proves who it is with its certificate")
+        group = str(self.groups.get(name, ""))
+        return Robot(name=name, group=group, key="", certificate="", added=0)
 
     def call(self, work: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the collector's loop and return its result."""
@@ -77,12 +85,15 @@ class RolloutCollector:
     async def _run(self) -> None:
         with psycopg.connect(self._address) as connection:
             migrate(connection)
-        database = Database(self._address, connections=8, statement_seconds=30)
+        database = IndexDatabase(self._address, connections=8, statement_seconds=30)
         database.open()
         with closing(database):
-            self.service = BundleService(self.folder, self.folder / TIMESTAMP_KEY, RolloutStore(database))
+            self.service = BundleService(
+                self.folder, self.folder / TIMESTAMP_KEY, RolloutStore(database), lambda: self.groups,
+                lambda: time.time() + self._ahead,
+            )  # fmt: skip
             app = FastAPI()
-            app.include_router(robot_routes(self.service, _robot))
+            app.include_router(robot_routes(self.service, self._robot))
             app.include_router(operator_routes(self.service, _operator, _operator))
             config = uvicorn.Config(
                 app, host="127.0.0.1", port=0, http=_Protocol, log_level="warning", lifespan="off", backlog=2048,
@@ -110,11 +121,17 @@ class RolloutCollector:
 
 
 @contextmanager
-def collector(folder: Path, authority: FleetAuthority, address: str) -> Iterator[RolloutCollector]:
-    """Run a collector that publishes a folder."""
-    made = RolloutCollector(folder, authority, address)
+def serving(made: RolloutCollector) -> Iterator[RolloutCollector]:
+    """Run a collector in a `with` block."""
     made.start()
     try:
         yield made
     finally:
         made.stop()
+
+
+@contextmanager
+def collector(folder: Path, authority: FleetAuthority, address: str) -> Iterator[RolloutCollector]:
+    """Run a collector that publishes a folder."""
+    with serving(RolloutCollector(folder, authority, address)) as made:
+        yield made

@@ -17,13 +17,12 @@ from typing import Any, Self
 from appliance.ipsec.strongswan import plugins
 from appliance.network.esp import choose_esp
 from examples.landshark.lab import Host
-from tests.support.processes import LIMIT, Process
+from tests.support.processes import LIMIT, Event, Process
 from tests.support.requirements import need_program
 
 _CONFIGURATION = """\
 charon-systemd {{
   load = {plugins}
-  {retransmission}
   plugins {{
     vici {{
       socket = unix://{directory}/vici.sock
@@ -40,28 +39,33 @@ charon-systemd {{
 }}
 """
 
-_QUICK = "retransmit_tries = 2\n  retransmit_timeout = 1.0\n  retransmit_base = 1.2"
-
 
 def need_strongswan() -> None:
-    """Require charon and swanctl."""
+    """Require charon, swanctl and the ping of `keep.sh`."""
     need_program("charon-systemd", "charon-systemd libcharon-extra-plugins")
     need_program("swanctl", "strongswan-swanctl")
+    need_program("ping", "iputils-ping")
 
 
 class JoinedHost:
     """A host of the lab behind its tunnel; `address` is its virtual one, as `RosSession` needs it."""
 
     def __init__(
-        self, host: Host, kit: Path, directory: Path, *, log: str = "", retransmission: str = _QUICK
+        self,
+        host: Host,
+        kit: Path,
+        directory: Path,
+        *,
+        log: str = "",
+        programs: Path | None = None,
     ) -> None:
         """Unpack the kit into `directory`, which must be new; `log` is added to charon's log settings (`chd = 4`).
 
-        With an empty `retransmission`, charon has strongSwan's own settings.
+        Programs in `programs` are found first.
         """
         self.outer = host
         self.log = log
-        self.retransmission = retransmission
+        self.path = os.environ["PATH"] if programs is None else f"{programs}:{os.environ['PATH']}"
         self.directory = directory
         directory.mkdir()
         subprocess.run(["tar", "-xzf", str(kit), "-C", str(directory)], check=True)
@@ -83,10 +87,9 @@ class JoinedHost:
             plugins=plugins(choose_esp(self.outer.namespace)),
             directory=self.directory,
             log=self.log,
-            retransmission=self.retransmission,
         )
         conf.write_text(text)
-        environment = {"STRONGSWAN_CONF": str(conf), "PATH": os.environ["PATH"]}
+        environment = {"STRONGSWAN_CONF": str(conf), "PATH": self.path}
         self.charon = Process(
             self.outer, ["charon-systemd"], env=environment, label=f"charon of {self.outer.name}"
         )
@@ -113,6 +116,12 @@ class JoinedHost:
             ),
             since=since,
         )
+
+    def wait_until_replaced(self) -> None:
+        """Wait until `keep.sh` has ended the first tunnel."""
+        assert self.charon is not None
+        first = self.charon.wait_for(lambda event: _established(event) is not None)
+        self.charon.wait_for_text(f"vici terminate IKE_SA #{_established(first)}")
 
     def events(self) -> int:
         """Return the number of lines that charon has printed."""
@@ -146,3 +155,9 @@ class JoinedHost:
 
     def __exit__(self, *exc: object) -> None:
         self.stop()
+
+
+def _established(event: Event) -> str | None:
+    """Return the number of the IKE_SA that a line of charon reports as established."""
+    found = re.search(r"IKE_SA rosrv\S*\[(\d+)\] established", str(event.get("text")))
+    return found and found[1]

@@ -64,7 +64,7 @@ def test_demo(tmp_path: Path, before: set[str]) -> None:
         "without a monitor it runs into the obstacle",
         "without a monitor it leaves its zone",
         "with the monitor it stops before the obstacle",
-        "with the monitor it stays in its zone",
+        "with the monitor it stops at the zone's border",
         "console:           https://127.0.0.1:",
     ):
         assert line in said

@@ -1,5 +1,6 @@
 """Many recordings on a Ray cluster: the report of one process, also if a node of the cluster is killed."""
 
+import contextlib
 import os
 import secrets
 import signal
@@ -16,12 +17,16 @@ import pytest
 
 from rosmop.tests.batch.test_many_recordings import SPECIFICATION, make_bag
 from rosmop.tool.batch_session import SOME_FAILED
-from tests.support.requirements import needs
+from tests.support.own_namespace import own_loopback
+from tests.support.requirements import need_root, needs
 from tests.support.waiting import eventually
 
 BIN = Path(sys.executable).parent
 PORT, CLIENTS, AGENT = 26379, 26380, 26381
-PATIENCE = 60
+PATIENCE = 180
+RECORDINGS = 50
+MESSAGES = 100
+COMMANDS = ("run limit.rv", "learn", "coverage limit.rv", "replay limit.rv")
 
 
 @dataclass
@@ -36,6 +41,9 @@ class Cluster:
         """Return the environment of a node's processes, or of a command."""
         own = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": self.token, "RAY_USAGE_STATS_ENABLED": "0"}
         own["RAY_health_check_period_ms"] = "500"  # a dead node is noticed after five checks
+        own["RAY_worker_niceness"] = "0"  # Ray's own is 15, so that other tests would take the processors
+        # Ray's own is 30 s. After it, the command still has time to say so.
+        own["RAY_CLIENT_SERVER_CHECK_CHANNEL_TIMEOUT_S"] = str(PATIENCE // 2)
         own |= {"PATH": f"{BIN}:{os.environ['PATH']}", "RAY_ADDRESS": f"127.0.0.1:{PORT}"}
         if node is None:
             return os.environ | own
@@ -52,6 +60,7 @@ class Cluster:
             str(BIN / "ray"),
             "start",
             "--num-cpus=1",
+            "--object-store-memory=100000000",
             "--disable-usage-stats",
             "--node-ip-address=127.0.0.1",
         ]
@@ -61,16 +70,31 @@ class Cluster:
         )
         assert done.returncode == 0, done.stdout + done.stderr
 
-    def kill(self, node: str = "") -> int:
-        """Kill the processes of a node, or of all; return their number."""
+    def processes(self, node: str = "") -> list[int]:
+        """Return the processes of a node, or of all, with their children: some overwrite their environment."""
         mark = f"TEST_NODE={self.mark}.{node}".encode()
-        count = 0
+        found, parents = set[int](), dict[int, int]()
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
+                parents[int(process.name)] = int((process / "stat").read_text().rpartition(")")[2].split()[1])
                 if any(text.startswith(mark) for text in (process / "environ").read_bytes().split(b"\0")):
-                    os.kill(int(process.name), signal.SIGKILL)
-                    count += 1
-        return count
+                    found.add(int(process.name))
+        while more := {pid for pid, parent in parents.items() if parent in found} - found:
+            found |= more
+        return sorted(found)
+
+    def kill(self, node: str = "") -> int:
+        """Kill the processes of a node, or of all; return their number."""
+        found = self.processes(node)
+        for pid in found:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        return len(found)
+
+    def log(self) -> str:
+        """Return the ends of the logs of the servers that start a client's work."""
+        files = sorted(self.folder.glob("session_2*/logs/ray_client_server*"))
+        return "".join(f"\n{file.name}:\n{file.read_text()[-2000:]}" for file in files)
 
     def start_rosrv(self, *words: str, **environment: str) -> "subprocess.Popen[str]":
         """Start a command on the cluster."""
@@ -88,9 +112,13 @@ class Cluster:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
-    """Return a cluster with its head. Its folder has a short name, because its sockets have long ones."""
+    """Return a cluster with its head. Its folder has a short name, because its sockets have long ones.
+
+    Some of Ray's processes listen on all addresses, whatever is asked: here there is only a loopback.
+    """
     needs(find_spec("ray"), "Ray: pip install 'rosmop[ray]'")
-    with tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp") as folder:
+    need_root()
+    with own_loopback(), tempfile.TemporaryDirectory(prefix="ray-", dir="/tmp") as folder:
         cluster = Cluster(Path(folder))
         try:
             cluster.start(0)
@@ -99,77 +127,82 @@ def cluster() -> Iterator[Cluster]:
             cluster.kill()
 
 
+@dataclass(frozen=True)
+class Finished:
+    """The command, its standard output, and its report."""
+
+    command: str
+    out: str
+    report: bytes
+
+
+def words_of(command: str, place: str, report: Path) -> list[str]:
+    """Return the words of a command on all recordings, in a place (options of the executor)."""
+    return [*command.split(), "--bags", "bags", "--report", str(report), *place.split()]
+
+
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with recordings, and the report of one process and of two, which are equal."""
-    folder = tmp_path_factory.mktemp("recordings")
-    (folder / "limit.rv").write_text(SPECIFICATION)
-    (folder / "bags").mkdir()
-    for seed in range(12):
-        make_bag(folder / "bags" / f"{seed}.bag", seed, 1500)
-    (folder / "bags/broken.bag").write_text("nonsense")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Make a folder with recordings the current one."""
+    with contextlib.chdir(tmp_path_factory.mktemp("recordings")):
+        Path("limit.rv").write_text(SPECIFICATION)
+        Path("bags").mkdir()
+        for seed in range(RECORDINGS - 1):
+            make_bag(Path("bags", f"{seed}.bag"), seed, MESSAGES)
+        Path("bags/broken.bag").write_text("nonsense")
+        yield
+
+
+@pytest.fixture(scope="module", params=COMMANDS)
+def expected(request: pytest.FixtureRequest, recordings: None) -> Finished:
+    """Return the results of a command in one process, which are equal to those of two."""
+    command, results = str(request.param), []
     for workers in ("1", "2"):
-        words = ["run", "limit.rv", "--bags", "bags", "--report", workers, "--workers", workers]
+        words = words_of(command, f"--workers {workers}", Path(workers))
         done = subprocess.run(
-            [BIN / "rosrv", "monitor", *words], cwd=folder, capture_output=True, check=False
+            [str(BIN / "rosrv"), "monitor", *words], capture_output=True, text=True, check=False
         )
-        assert done.returncode == SOME_FAILED
-    assert (folder / "1").read_bytes() == (folder / "2").read_bytes()
-    return folder
+        assert done.returncode == SOME_FAILED, done.stderr
+        results.append(Finished(command, done.stdout, Path(workers).read_bytes()))
+    assert results[0] == results[1]
+    return results[0]
 
 
-@pytest.fixture
-def expected(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> bytes:
-    """Make the recordings' folder the current one, and return the report of one process."""
-    monkeypatch.chdir(recordings)
-    return Path("1").read_bytes()
+def finished(command: str, process: "subprocess.Popen[str]", report: Path, cluster: Cluster) -> Finished:
+    """Wait for a command of which a recording fails."""
+    out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == SOME_FAILED, err + cluster.log()
+    return Finished(command, out, report.read_bytes())
 
 
-def test_a_node_gives_the_report_of_a_process(cluster: Cluster, expected: bytes, tmp_path: Path) -> None:
-    """A client from outside, and learning on the node, have the results of a process."""
-    report, words = tmp_path / "report", ("--bags", "bags", "--on")
-    status, _out, err = cluster.rosrv(
-        "run", "limit.rv", *words, f"ray://127.0.0.1:{CLIENTS}", "--report", str(report)
-    )
-    assert status == SOME_FAILED, err
-    assert report.read_bytes() == expected
-    here, there = tmp_path / "here.rv", tmp_path / "there.rv"
-    assert cluster.rosrv("learn", "--bags", "bags", "--out", str(here))[0] == SOME_FAILED
-    assert cluster.rosrv("learn", *words, "auto", "--out", str(there))[0] == SOME_FAILED
-    assert here.read_bytes() == there.read_bytes()
+def test_a_node_gives_the_results_of_a_process(cluster: Cluster, expected: Finished, tmp_path: Path) -> None:
+    """On one node, a client from outside has the output and the report of a process, for each command."""
+    report = tmp_path / "report"
+    with cluster.start_rosrv(
+        *words_of(expected.command, f"--on ray://127.0.0.1:{CLIENTS}", report)
+    ) as process:
+        assert finished(expected.command, process, report, cluster) == expected
 
 
-def test_a_wrong_token_is_refused(cluster: Cluster, expected: bytes) -> None:
+def test_a_node_that_is_killed_changes_nothing(cluster: Cluster, expected: Finished, tmp_path: Path) -> None:
+    """Three nodes, of which one is killed while it works, give the same, for each command."""
+    for node in (1, 2):
+        if not cluster.processes(str(node)):
+            cluster.start(node)
+    journal, report = tmp_path / "journal", tmp_path / "report"
+    with cluster.start_rosrv(*words_of(expected.command, f"--on auto --resume {journal}", report)) as process:
+        eventually(
+            lambda: journal.exists() and journal.read_bytes().count(b"\n") > RECORDINGS // 5,
+            "a fifth is finished",
+        )
+        assert process.poll() is None
+        assert cluster.kill("2") > 1
+        assert finished(expected.command, process, report, cluster) == expected
+
+
+def test_a_wrong_token_is_refused(cluster: Cluster, recordings: None) -> None:
     """The cluster executes nothing for a command without its token."""
     words = ("run", "limit.rv", "--bags", "bags", "--on", "auto")
     status, out, err = cluster.rosrv(*words, RAY_AUTH_TOKEN=secrets.token_hex(32))
     assert (status, out) == (2, "")
     assert "cannot use the cluster" in err
-
-
-def test_a_node_that_is_killed_changes_nothing(cluster: Cluster, expected: bytes, tmp_path: Path) -> None:
-    """Three nodes, of which one is killed while it works, give the same report."""
-    cluster.start(1)
-    cluster.start(2)
-    journal, report = tmp_path / "journal", tmp_path / "report"
-    words = (
-        "run",
-        "limit.rv",
-        "--bags",
-        "bags",
-        "--on",
-        "auto",
-        "--report",
-        str(report),
-        "--resume",
-        str(journal),
-    )
-    with cluster.start_rosrv(*words) as command:
-        eventually(
-            lambda: journal.exists() and journal.read_bytes().count(b"\n") >= 1, "a recording is finished"
-        )
-        assert command.poll() is None
-        assert cluster.kill("2") > 1
-        _out, err = command.communicate(timeout=PATIENCE)
-    assert command.returncode == SOME_FAILED, err
-    assert report.read_bytes() == expected

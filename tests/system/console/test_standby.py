@@ -3,6 +3,7 @@
 import functools
 import json
 import re
+import socket
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -145,6 +146,25 @@ def test_a_silent_witness_is_a_banner_on_every_view(pair: PairConsoles) -> None:
     pair.site.start_witness()
     expect(banner).to_have_count(0)
     expect(panel(page).get_by_role("row").nth(3)).to_contain_text("answers")
+
+
+def test_a_standby_that_could_not_start_is_shown_on_both(pair: PairConsoles) -> None:
+    """Another program has its port: banner, panel and the disabled switchover give the reason until it ends."""
+    page = pair.open("a", "admin").go("now")
+    other = pair.open("b", "viewer").go("now", heading="Standby")
+    row, button = (
+        panel(page).get_by_role("row").nth(2),
+        panel(page).get_by_role("button", name="Switch over…"),
+    )
+    expect(row).to_contain_text("can take over", timeout=2 * LIMIT)
+    reason = re.compile(r"cannot take over.*0\.0\.0\.0:11311 cannot be listened on")
+    with pair.site.lab.hosts["b"].run(lambda: socket.create_server(("0.0.0.0", 11311))):
+        expect(row).to_have_text(reason, timeout=2 * LIMIT)
+        expect(page.locator(".banner")).to_have_text(reason)
+        expect(button).to_have_attribute("title", reason)
+        expect(panel(other).get_by_role("row").nth(1)).to_have_text(reason, timeout=2 * LIMIT)
+    expect(row).to_contain_text("in sync", timeout=2 * LIMIT)
+    expect(page.locator(".banner")).to_have_count(0)
 
 
 def test_only_admins_switch_over(pair: PairConsoles) -> None:
