@@ -20,6 +20,7 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 T = TypeVar("T")
 _NICE = 5
+_END_SECONDS = 10.0
 
 
 class OutOfTimeError(BaseException):
@@ -54,12 +55,15 @@ class Workers:
         return self._pool
 
     def close(self) -> None:
-        """End the workers at once; unfinished work is lost."""
+        """End the workers at once, and wait until they have ended; unfinished work is lost."""
         with self._lock:
             if self._pool is not None:
                 self._pool.shutdown(wait=False, cancel_futures=True)
-                for child in multiprocessing.active_children():
+                children = multiprocessing.active_children()
+                for child in children:
                     child.kill()
+                for child in children:
+                    child.join(_END_SECONDS)
 
 
 def _begin() -> None:

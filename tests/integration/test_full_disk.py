@@ -1,6 +1,5 @@
 """If the disk of the state is full, each change is stored, or refused before it has any effect."""
 
-import subprocess
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +10,7 @@ from appliance.channel import admin
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.control.administration import KEPT
 from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 
 RULE = "silent() { event said() /chatter std_msgs/String '{}' { } }\n"
@@ -79,19 +79,16 @@ class SmallDisk:
 def small() -> Iterator[SmallDisk]:
     """Run an appliance with a disk of 32 MiB, a token `guest` and a monitor."""
     appliance = Appliance()
-    appliance.state.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=32m,mode=755", "rosrv-state-test", str(appliance.state)]
-    subprocess.run(mount, check=True)
     try:
-        appliance.start()
-        disk = SmallDisk(appliance)
-        assert disk.ask(admin.TokenAdd("guest", "viewer", 3600.0)).ok
-        loaded = disk.ask(admin.MonitorLoad({"silent.rv": RULE}))
-        assert loaded.ok, loaded.findings
-        yield disk
+        with small_disk(appliance.state, "32m", "mode=755"):
+            appliance.start()
+            disk = SmallDisk(appliance)
+            assert disk.ask(admin.TokenAdd("guest", "viewer", 3600.0)).ok
+            loaded = disk.ask(admin.MonitorLoad({"silent.rv": RULE}))
+            assert loaded.ok, loaded.findings
+            yield disk
+            appliance.stop()
     finally:
-        appliance.stop()
-        subprocess.run(["umount", "--lazy", appliance.state], check=True)
         appliance.close()
 
 

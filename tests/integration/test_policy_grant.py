@@ -1,7 +1,6 @@
 """Grant a denied call of the running appliance from its record, by command and over REST."""
 
 import re
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from xmlrpc.client import ServerProxy
@@ -9,6 +8,7 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from tests.support.appliance import Appliance
+from tests.support.small_disk import small_disk
 
 POLICY = """
 [Groups]
@@ -55,8 +55,7 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
 def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path: Path) -> None:
     """If `--write` to the file in force finds no disk space, the file stays complete, and the error says so."""
     record = refused(appliance, "registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "rosrv-grant-test", tmp_path], check=True)
-    try:
+    with small_disk(tmp_path, "8k"):
         policy = tmp_path / "policy.ini"
         policy.write_text(POLICY)
         policy.chmod(0o640)
@@ -68,8 +67,6 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
         appliance.rosrv("policy", "grant", record, "--write", str(policy))
         assert "/cmd_vel = ocu robot" in policy.read_text()
         assert policy.stat().st_mode & 0o777 == 0o640
-    finally:
-        subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
 def test_a_denied_call_is_granted_with_commit_confirm(appliance: Appliance, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import os
 import shutil
 import socket
 import ssl
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ import pytest
 from appliance.audit.segments import SegmentSummary, write_segment
 from appliance.collector.connection import CollectorConnection, CollectorError
 from tests.support.certificates import Certificates, make_certificates
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 
@@ -260,10 +260,7 @@ def test_a_robot_has_one_upload_at_a_time(strict: FleetSite) -> None:
 
 def test_a_full_disk_refuses_and_recovers(database: str, tmp_path: Path) -> None:
     """On a full disk uploads are refused with 503, never receipted; they are accepted when there is room again."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", disk], check=True)
-    try:
+    with small_disk(tmp_path / "disk", "2m") as disk:
         limits = {"reserve_bytes": 500_000}
         with running(FleetSite(tmp_path / "site", database, limits, disk / "data")) as site:
             robot = FleetRobot(site, "arm1")
@@ -282,8 +279,6 @@ def test_a_full_disk_refuses_and_recovers(database: str, tmp_path: Path) -> None
             site.indexed()
             assert json.loads(site.run("verify", "--json").stdout)["missing"] == 0
             robot.close()
-    finally:
-        subprocess.run(["umount", disk], check=True)
 
 
 def test_a_collector_with_another_key_is_not_believed(site: FleetSite, make_robot: MakeRobot) -> None:

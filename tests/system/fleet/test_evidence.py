@@ -5,7 +5,6 @@ import secrets
 import shutil
 import socket
 import ssl
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import pytest
 from rosrv_fleet.access import COOKIE
 
 from appliance.evidence import bundle_verifier
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.incidents import incident
@@ -312,25 +312,20 @@ def test_a_kill_leaves_nothing_half_stored(
 
 def test_a_full_disk_refuses_evidence_before_segments(database: str, tmp_path: Path) -> None:
     """Evidence leaves the last space of the disk to segments; when there is room again, it is accepted."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", disk], check=True)
-    try:
-        with running(
-            FleetSite(tmp_path / "site", database, {"reserve_bytes": 500_000}, disk / "data")
-        ) as site:
-            carrier, robot = Carrier(site), FleetRobot(site, "arm1")
-            bundle = incident(robot, tmp_path / "incident.zip").read_bytes()
-            (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free - 900_000))
-            answer = carrier.add(bundle)
-            assert (answer.status_code, answer.headers["Retry-After"]) == (503, "60")
-            assert "evidence needs twice limits.reserve_bytes" in answer.json()["detail"]
-            assert carrier.stored() == []
-            assert acts_of(carrier.site) == []
-            robot.push()
-            (disk / "filler").unlink()
-            assert carrier.add(bundle).status_code == 201
-            assert len(carrier.stored()) == 1
-            robot.close()
-    finally:
-        subprocess.run(["umount", disk], check=True)
+    with (
+        small_disk(tmp_path / "disk", "4m") as disk,
+        running(FleetSite(tmp_path / "site", database, {"reserve_bytes": 500_000}, disk / "data")) as site,
+    ):
+        carrier, robot = Carrier(site), FleetRobot(site, "arm1")
+        bundle = incident(robot, tmp_path / "incident.zip").read_bytes()
+        (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free - 900_000))
+        answer = carrier.add(bundle)
+        assert (answer.status_code, answer.headers["Retry-After"]) == (503, "60")
+        assert "evidence needs twice limits.reserve_bytes" in answer.json()["detail"]
+        assert carrier.stored() == []
+        assert acts_of(carrier.site) == []
+        robot.push()
+        (disk / "filler").unlink()
+        assert carrier.add(bundle).status_code == 201
+        assert len(carrier.stored()) == 1
+        robot.close()

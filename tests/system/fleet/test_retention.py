@@ -5,7 +5,6 @@ import json
 import os
 import secrets
 import shutil
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.indexer import index, make_partition
 from rosrv_fleet.retention import drop_partitions
 
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.postgres import PostgresCluster, postgres
@@ -254,10 +254,7 @@ def own_cluster() -> Iterator[PostgresCluster]:
 
 def test_a_full_disk_of_postgresql_loses_nothing(own_cluster: PostgresCluster, tmp_path: Path) -> None:
     """While PostgreSQL's disk is full, segments get receipts, and the trouble is reported; later all are indexed."""
-    disk = own_cluster.folder / "small"
-    disk.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24m,mode=777", "tmpfs", disk], check=True)
-    try:
+    with small_disk(own_cluster.folder / "small", "24m", "mode=777") as disk:
         shutil.chown(disk, "postgres", "postgres")
         database = own_cluster.create(f"test_{secrets.token_hex(6)}")
         with psycopg.connect(own_cluster.database("postgres"), autocommit=True) as connection:
@@ -281,6 +278,4 @@ def test_a_full_disk_of_postgresql_loses_nothing(own_cluster: PostgresCluster, t
             site.indexed()
             assert len([one for one in site.all() if one["event"] == "decision"]) == 120
             robot.close()
-    finally:
         own_cluster.stop()
-        subprocess.run(["umount", disk], check=True)

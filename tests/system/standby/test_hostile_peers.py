@@ -23,6 +23,7 @@ from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import PORT, load_membership, path_of
 from appliance.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored
 from examples.landshark.lab import INTERFACE, Host
+from tests.support.small_disk import small_disk
 from tests.support.standby_robot import StandbyRobot
 from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
@@ -52,27 +53,24 @@ def test_a_full_disk_of_the_standby(site: StandbySite, robot: StandbyRobot) -> N
     one.stop()
     moved = one.directory / "moved"
     one.state.rename(moved)
-    one.state.mkdir(mode=0o711)
-    subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=96m,mode=711", "rosrv-standby", one.state], check=True
-    )
     try:
-        subprocess.run(["cp", "-a", f"{moved}/.", str(one.state)], check=True)
-        site.start(passive)
-        site.until_both_in_sync()
-        filler = one.state / "filler"
-        with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
-            while True:
-                file.write(bytes(1 << 16))
-        began = time.monotonic()
-        grow(robot, site, lambda: site.in_sync() == {active})
-        robot.lost_nothing()
-        assert slowest_answer(robot, began) < 2.0
-        filler.unlink()
-        site.until_both_in_sync()
+        with small_disk(one.state, "96m", "mode=711"):
+            subprocess.run(["cp", "-a", f"{moved}/.", str(one.state)], check=True)
+            site.start(passive)
+            site.until_both_in_sync()
+            filler = one.state / "filler"
+            with filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
+                while True:
+                    file.write(bytes(1 << 16))
+            began = time.monotonic()
+            grow(robot, site, lambda: site.in_sync() == {active})
+            robot.lost_nothing()
+            assert slowest_answer(robot, began) < 2.0
+            filler.unlink()
+            site.until_both_in_sync()
+            one.stop()
     finally:
         one.stop()
-        subprocess.run(["umount", "--lazy", one.state], check=True)
         one.state.rmdir()
         moved.rename(one.state)
         site.start(passive)

@@ -1,6 +1,5 @@
 """Tests of free space for the log: alarms before the disk is full, and recovery without a restart."""
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.quotas.pool import QuotaClass
 from tests.support.audit import decision, settle
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 
 _LIMIT_SECONDS = 30
@@ -23,12 +22,8 @@ _RESERVE = 4 << 20
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """Mount a file system of 8 MiB."""
-    need_root()
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "rosrv-audit-test", place], check=True)
-    yield place
-    subprocess.run(["umount", "--lazy", place], check=True)
+    with small_disk(tmp_path / "disk", "8m") as place:
+        yield place
 
 
 def await_degraded(log: AuditLog, *, degraded: bool) -> None:

@@ -21,7 +21,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import export, search, show
 from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog
 
@@ -188,20 +188,16 @@ def fill(path: Path) -> None:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def disk(tmp_path: Path) -> Iterator[Path]:
     """Mount a file system of 2 MiB."""
-    need_root()
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "rosrv-audit-test", place], check=True)
-    yield place
-    subprocess.run(["umount", "--lazy", place], check=True)
+    with small_disk(tmp_path / "disk", "2m") as place:
+        yield place
 
 
-def test_full_disk(small_disk: Path) -> None:
+def test_full_disk(disk: Path) -> None:
     """With a full disk the log reports the failure, keeps its queue, and writes the queue once there is space."""
-    path = small_disk / "audit.db"
-    filler = small_disk / "filler"
+    path = disk / "audit.db"
+    filler = disk / "filler"
     log = AuditLog(path)
     log.record(decision(log))
     assert settle(log) is None
@@ -228,11 +224,11 @@ def test_full_disk(small_disk: Path) -> None:
     assert verify(path).ok
 
 
-def test_failure_and_recovery_are_printed_once(small_disk: Path) -> None:
+def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
     """Standard error names the failure with file and reason, and later the recovery."""
-    filler = small_disk / "filler"
+    filler = disk / "filler"
     with structlog.testing.capture_logs() as said:
-        log = AuditLog(small_disk / "audit.db", reserve=0)
+        log = AuditLog(disk / "audit.db", reserve=0)
         assert settle(log) is None
         fill(filler)
         while log.failed is None:
@@ -246,16 +242,16 @@ def test_failure_and_recovery_are_printed_once(small_disk: Path) -> None:
         "the audit log cannot be written",
         "the audit log is written again",
     ]
-    assert str(small_disk / "audit.db") in said[0]["reason"]
+    assert str(disk / "audit.db") in said[0]["reason"]
     assert "full" in said[0]["reason"]
 
 
-def test_the_queue_is_bounded_and_losses_are_counted(small_disk: Path) -> None:
+def test_the_queue_is_bounded_and_losses_are_counted(disk: Path) -> None:
     """Records that do not fit in the queue while the disk is full are counted, and the count is recorded."""
-    path = small_disk / "audit.db"
+    path = disk / "audit.db"
     log = AuditLog(path, queue_limit=100)
     assert settle(log) is None
-    filler = small_disk / "filler"
+    filler = disk / "filler"
     fill(filler)
     sent = 0
     while log.failed is None:

@@ -25,6 +25,7 @@ from appliance.backup.restore import restore
 from appliance.ipsec.signed_checkpoints import CheckpointMemory
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 
 
 @pytest.fixture
@@ -126,18 +127,12 @@ def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", ["8k", "64k"])
 def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None:
     """The error says to free space, not to change permissions."""
-    need_root()
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "rosrv-backup-test", place], check=True)
-    try:
+    with small_disk(tmp_path / "disk", size) as place:
         (state / "api" / "key.pem").write_bytes(os.urandom(200_000))
         with pytest.raises(BackupError, match=f"{place}: the disk is full; free space") as caught:
             back_up(state, place / "backup.tar.gz")
         assert "as root" not in str(caught.value)
         assert list(place.iterdir()) == []
-    finally:
-        subprocess.run(["umount", "--lazy", place], check=True)
 
 
 def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:

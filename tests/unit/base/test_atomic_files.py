@@ -20,6 +20,7 @@ from appliance.base.atomic_files import (
 )
 from appliance.cli.output import write_told
 from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 
 
 def test_a_file_is_replaced_with_the_given_mode(tmp_path: Path) -> None:
@@ -135,14 +136,10 @@ def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
 
 def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
     """The system's error names no file; our error names the place where space is needed."""
-    need_root()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-files-test", tmp_path], check=True)
-    try:
+    with small_disk(tmp_path, "4k"):
         with pytest.raises(OSError, match=r"No space left.*audit\.pub"):
             write_whole(tmp_path / "audit.pub", bytes(8192), 0o644)
         assert not list(tmp_path.iterdir())  # the unfinished file uses no space
-    finally:
-        subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
 def test_links_and_pipes_are_written_through(tmp_path: Path) -> None:

@@ -1,7 +1,6 @@
 """When the disk fills, the recorder reports it and continues, and each named recording is complete."""
 
 import hashlib
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,20 +9,15 @@ import pytest
 
 from appliance.channel import messages
 from appliance.channel.answers.recording_answers import Recording, Trigger
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 from tests.unit.recorder.test_recorder import SECOND, TEXT, Scene
 
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 4 MiB and a few files, in the folder of recordings."""
-    need_root()
-    place = tmp_path / "recordings"
-    place.mkdir()
-    order = ["mount", "-t", "tmpfs", "-o", "size=4m,nr_inodes=64", "rosrv-recordings-test", str(place)]
-    subprocess.run(order, check=True)
-    yield place
-    subprocess.run(["umount", "--lazy", place], check=True)
+    with small_disk(tmp_path / "recordings", "4m", "nr_inodes=64") as place:
+        yield place
 
 
 @pytest.mark.parametrize("what", ["bytes", "files"])

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import sqlite3
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from appliance.store.state_file import SCHEMA as WHOLE_SCHEMA
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.replication import SCHEMA, tables_of
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 
 BEGIN = SnapshotBegin(3, "h", 7)
 
@@ -198,11 +197,7 @@ def test_repeated_rows_of_a_snapshot_need_no_further_space(replica: Replica, tmp
 
 def test_a_full_disk_keeps_the_last_good_state(tmp_path: Path) -> None:
     """The error names the file; once there is space, the same changes are stored."""
-    need_root()
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "rosrv-replica-test", place], check=True)
-    try:
+    with small_disk(tmp_path / "disk", "1m") as place:
         replica = Replica(place / "state.db", SCHEMA, failed=pytest.fail)
         for message in (BEGIN, SnapshotRows([thing("old")]), SnapshotEnd(1)):
             replica.take(message)
@@ -219,8 +214,6 @@ def test_a_full_disk_keeps_the_last_good_state(tmp_path: Path) -> None:
         replica.take(changes(thing("later"), first=stored + 1))
         assert "later" in names(place)
         replica.close()
-    finally:
-        subprocess.run(["umount", "--lazy", place], check=True)
 
 
 def test_an_appliance_that_was_active_needs_a_snapshot(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
 from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Delete, Put, Tables, joined
 from appliance.store.writer_thread import Database, StoreError
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 
 pytestmark = pytest.mark.anyio
 
@@ -124,12 +124,8 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An operator who waits gets an error; once the disk has space again, all queued statements are written."""
-    need_root()
     monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
-    place = tmp_path / "disk"
-    place.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "rosrv-store-test", place], check=True)
-    try:
+    with small_disk(tmp_path / "disk", "1m") as place:
         failures: list[str] = []
         database = Database(place / "state.db", SCHEMA, failed=failures.append)
         filler = place / "filler"
@@ -148,8 +144,6 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
         asyncio.run(scene())
         assert database.query("SELECT name FROM thing") == [("late",)]
         database.close()
-    finally:
-        subprocess.run(["umount", "--lazy", place], check=True)
 
 
 async def test_callers_learn_that_writing_has_ended(

@@ -20,7 +20,7 @@ from appliance.policy.model import Category
 from appliance.specifications.allocation import SERVICE, TOPIC
 from tests.support.audit import decision, settle
 from tests.support.command import rosrv
-from tests.support.requirements import need_root
+from tests.support.small_disk import small_disk
 
 _EVIL = "/evil\x1b[31m\u202e\r\n[bold]x[/bold]"
 _LIMIT_SECONDS = 60
@@ -71,17 +71,11 @@ def test_search_on_a_terminal_is_a_table(state: Path) -> None:
 @pytest.mark.parametrize("what", [[], ["--deny"]], ids=["amid it", "when its only piece is written"])
 def test_an_export_to_a_full_disk_leaves_no_file(state: Path, tmp_path: Path, what: list[str]) -> None:
     """A partial file would look complete, and block the next export."""
-    need_root()
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-export-test", disk], check=True)
-    try:
+    with small_disk(tmp_path / "disk", "4k") as disk:
         (disk / "full").write_bytes(bytes(4096))
         done = rosrv("audit", "export", *what, "--output", str(disk / "out.ndjson"), "--state", str(state))
         assert (done.returncode != 0, "out.ndjson: No space left" in done.stderr) == (True, True), done.stderr
         assert [one.name for one in disk.iterdir()] == ["full"]
-    finally:
-        subprocess.run(["umount", "--lazy", disk], check=True)
 
 
 def test_tail_follows(state: Path) -> None:

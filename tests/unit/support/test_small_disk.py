@@ -1,0 +1,19 @@
+"""Tests mount file systems with `small_disk` alone, which no late process keeps from ending."""
+
+from tests.support.sources import ROOT
+
+ELSEWHERE = {
+    "tests/support/small_disk.py",
+    "tests/integration/standby/test_robot_kit.py",  # in the mount namespace of a host, which ends with the host
+    "tests/unit/support/test_small_disk.py",
+}
+
+
+def test_only_small_disk_mounts() -> None:
+    """An `umount` of a test's own fails when a process that was killed a moment ago has a file open."""
+    found = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "tests").rglob("*.py")
+        if '"mount"' in path.read_text()
+    }
+    assert found == ELSEWHERE
