@@ -156,7 +156,7 @@ def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]
 def test_a_kill_during_the_trial_goes_back_and_tries_again(site: tuple[BundleSite, str]) -> None:
     """If control dies during a trial, the robot goes back to what it had, and then tries the bundle again."""
     served, url = site
-    with robot(served, url, confirm_seconds=4) as appliance:
+    with robot(served, url, confirm_seconds=10) as appliance:
         path = served.add(bundle_files(OPEN_POLICY + "# tried\n", monitors__quiet_dot_rv=MONITOR))
         eventually(lambda: bundles_of(appliance)["trying"] == str(path), appliance.story)
         eventually(lambda: "# tried" in appliance.rosrv("policy", "show").stdout, appliance.story)

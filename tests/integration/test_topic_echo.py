@@ -44,7 +44,8 @@ def test_echo_shows_the_subscribers_messages_and_is_recorded(
 
 def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
     """The message is shown once, even if more are requested; a later message counts as new."""
-    ros.talker("rospy", "/map", "--latch", "--count", "1", name="server").wait_for(event="ready")
+    ros.talker("rospy", "/map", "--latch", "--count", "1", name="server")
+    ros.listener("rospy", "/map", name="reader").wait_for(event="received")  # now the relay has it
     done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
     assert (done.returncode, len(done.stdout.splitlines())) == (1, 1)
 

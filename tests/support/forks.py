@@ -106,7 +106,8 @@ class Fork(subprocess.Popen[Any]):
     def send_signal(self, sig: int) -> None:
         """Send a signal, unless the fork has ended."""
         if self.poll() is None:
-            os.kill(self.pid, sig)
+            with contextlib.suppress(ProcessLookupError):  # its server may have seen its end first
+                os.kill(self.pid, sig)
 
     def __del__(self) -> None:
         self._report.close()

@@ -12,6 +12,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 Event = dict[str, Any]
@@ -38,6 +39,14 @@ class ThisMachine:
     def popen(self, args: Sequence[str | os.PathLike[str]], **options: Any) -> "subprocess.Popen[Any]":
         """Start a process on this machine."""
         return subprocess.Popen(list(args), **options)
+
+
+def runs(pid: int | str) -> bool:
+    """Return whether a process has not ended; one that only waits to be reaped has."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):  # the second if it is reaped while it is read
+        return False
 
 
 class Process:
@@ -245,6 +254,7 @@ class Process:
             with self._changed:
                 self.events.append(_event(line.rstrip("\n")))
                 self._changed.notify_all()
+        self._readers[1].join(5)  # the reason for the end is on standard error
         with self._changed:
             self._ended = True
             self._changed.notify_all()

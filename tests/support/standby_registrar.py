@@ -43,10 +43,13 @@ class Registrar:
         self.master, self.own = master, own
         self.parameters: dict[str, int] = {}
         self.topics: set[str] = set()
+        self.longest = 0.0
+        """The longest time of a call, in seconds, since it was last reported."""
         self._proxy = xmlrpc.client.ServerProxy(master, Transport())
 
     def call(self, method: str, *arguments: Any) -> Any:
         """Call until there is an answer; return its value."""
+        began = time.monotonic()
         while True:
             try:
                 status, text, value = getattr(self._proxy, method)(NAME, *arguments)
@@ -56,6 +59,7 @@ class Registrar:
                 continue
             if status != 1:
                 raise RuntimeError(f"{method}{arguments}: {text}")
+            self.longest = max(self.longest, time.monotonic() - began)
             return value
 
     def change(self, number: int) -> None:
@@ -113,7 +117,8 @@ def main() -> None:
         if number == 1:
             report("ready", name=NAME)
         if each or number % 20 == 0:
-            report("acknowledged", number=number, at=time.monotonic())
+            report("acknowledged", number=number, at=time.monotonic(), longest=registrar.longest)
+            registrar.longest = 0.0
         if select.select([sys.stdin], [], [], _PAUSE)[0]:
             line = sys.stdin.readline().strip()
             if not line:

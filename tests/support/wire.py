@@ -14,6 +14,7 @@ _EVERYTHING = 0x0003  # ETH_P_ALL
 _OWN = 4  # PACKET_OUTGOING
 _UDP = 17
 _UNREACHABLE = 3  # of ICMP
+_RCVBUFFORCE = 33  # SO_RCVBUFFORCE: beyond the limit of the system, for root
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,9 @@ class Capture:
         self._ended = False
         with namespace.entered():
             self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(_EVERYTHING))
+        self._socket.setsockopt(
+            socket.SOL_SOCKET, _RCVBUFFORCE, 32 << 20
+        )  # bytes; a busy machine reads it late
         self._socket.bind((interface, 0))
         self._socket.settimeout(0.1)
         self._thread = threading.Thread(target=self._read, name="capture", daemon=True)

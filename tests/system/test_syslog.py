@@ -66,8 +66,9 @@ class Keeper:
             process.stop(with_signal=signal.SIGTERM)  # rsyslog ignores SIGINT
 
     def lines(self) -> list[str]:
-        """Return the lines of its file."""
-        return self.file.read_text(errors="replace").splitlines() if self.file.exists() else []
+        """Return the complete lines of its file; rsyslog may be in the middle of one."""
+        text = self.file.read_text(errors="replace") if self.file.exists() else ""
+        return text.rpartition("\n")[0].splitlines()
 
     def sequences(self) -> set[int]:
         """Return the sequence numbers of its records."""

@@ -38,7 +38,7 @@ def drives_on(compose: Compose) -> None:
 
 
 def test_a_stop_is_clean_and_quick(alone: Compose) -> None:
-    """`docker stop` ends it cleanly within five seconds; on a busy machine a second attempt is allowed."""
+    """`docker stop` ends it cleanly, on an idle machine within five seconds."""
     container = alone.container("appliance")
     eventually(
         lambda: all(row["sandbox"] for row in alone.status()["processes"] if row["role"] != "supervisor"),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import psycopg
 
+from tests.support.processes import runs
 from tests.support.waiting import eventually
 
 _PROGRAMS = Path("/usr/lib/postgresql/15/bin")
@@ -97,7 +98,7 @@ class PostgresCluster:
             self._process.kill()
             self._process.wait()
             self._process = None
-            eventually(lambda: not any(map(_runs, children)), "all processes of PostgreSQL have ended")
+            eventually(lambda: not any(map(runs, children)), "all processes of PostgreSQL have ended")
             (self.data / "postmaster.pid").unlink(missing_ok=True)
 
     def create(self, name: str) -> str:
@@ -105,13 +106,6 @@ class PostgresCluster:
         with psycopg.connect(self.database("postgres"), autocommit=True) as connection:
             connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(name)))
         return self.database(name)
-
-
-def _runs(pid: str) -> bool:
-    try:
-        return ") Z " not in Path(f"/proc/{pid}/stat").read_text()
-    except FileNotFoundError:
-        return False
 
 
 @contextmanager

@@ -238,22 +238,22 @@ def test_a_slow_robot_is_cut_off(strict: FleetSite) -> None:
     other.close()
 
 
-def test_a_robot_has_one_upload_at_a_time(strict: FleetSite) -> None:
+def test_a_robot_has_one_upload_at_a_time(site: FleetSite) -> None:
     """A second upload of the same robot is asked to wait."""
-    robot = FleetRobot(strict, "arm1")
+    robot = FleetRobot(site, "arm1")
     robot.record(5)
-    context = ssl.create_default_context(cafile=strict.server.ca)
+    context = ssl.create_default_context(cafile=site.server.ca)
     context.load_cert_chain(robot.certificates.certificate, robot.certificates.key)
-    plain = socket.create_connection(("127.0.0.1", strict.port), 30)
+    plain = socket.create_connection(("127.0.0.1", site.port), 30)
     with context.wrap_socket(plain, server_hostname="127.0.0.1") as first:
         path = f"/v1/logs/{'0' * 32}/segments/1/{'0' * 64}"
         head = f"PUT {path} HTTP/1.1\r\nHost: x\r\nContent-Encoding: gzip\r\nContent-Length: 9\r\n\r\nx"
         first.sendall(head.encode())
-        assert strict.data is not None
-        incoming = strict.data / "incoming"
+        assert site.data is not None
+        incoming = site.data / "incoming"
         eventually(lambda: list(incoming.iterdir()), "the first upload has begun")
         summary, body = segment(robot, 1)
-        answer = put(strict, robot.certificates, summary, gzip.compress(body))
+        answer = put(site, robot.certificates, summary, gzip.compress(body))
         assert (answer.status_code, answer.headers["Retry-After"]) == (429, "2")
     robot.close()
 

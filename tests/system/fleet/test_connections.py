@@ -20,7 +20,7 @@ MakeRobot = Callable[..., FleetRobot]
 @pytest.fixture
 def narrow(database: str, tmp_path: Path) -> Iterator[FleetSite]:
     """Return a collector that permits few connections."""
-    limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": 4.0}
+    limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": 10.0}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
 

@@ -22,6 +22,7 @@ from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 PLACE = "site-a/arms"
 MakeRobot = Callable[..., FleetRobot]
 _LIMIT = 1000 * LIMIT  # milliseconds to wait for an answer
+expect.set_options(timeout=_LIMIT)
 _MARKUP = "<script>document.title='owned'</script><b id=owned>"
 
 
@@ -51,7 +52,7 @@ def opened_page(width: int = 1280, theme: Literal["light", "dark"] = "light") ->
 def log_in(page: Page, site: FleetSite, token: str) -> None:
     """Log in, with the keyboard."""
     page.goto(f"https://127.0.0.1:{site.port}/login")
-    expect(page.get_by_label("Token")).to_be_focused(timeout=_LIMIT)
+    expect(page.get_by_label("Token")).to_be_focused()
     page.keyboard.type(token)
     page.keyboard.press("Enter")
     page.get_by_role("heading", name="Robots", exact=True).wait_for()
@@ -74,13 +75,13 @@ def _look_around(site: FleetSite, page: Page) -> None:
     page.wait_for_url("**/login")
     page.get_by_label("Token").fill(site.token)
     page.get_by_role("button", name="Log in").click()
-    assert page.get_by_role("row", name="arm1").get_by_role("cell").nth(1).inner_text() == "complete"
-    assert "never" in page.get_by_role("row", name="arm2").inner_text()
+    expect(page.get_by_role("row", name="arm1").get_by_role("cell").nth(1)).to_have_text("complete")
+    expect(page.get_by_role("row", name="arm2")).to_contain_text("never")
     page.get_by_role("link", name="Search").click()
     page.get_by_label("text", exact=True).fill("owned")
     page.get_by_role("button", name="Search").click()
     records = page.get_by_role("table", name="Records").get_by_role("row")
-    assert records.count() == 11
+    expect(records).to_have_count(11)
     assert _MARKUP in records.nth(1).inner_text()
     assert "\\u202e" in records.nth(1).inner_text()
     assert page.locator("#owned").count() == 0
@@ -88,7 +89,7 @@ def _look_around(site: FleetSite, page: Page) -> None:
     page.screenshot(path=site.folder / "console.png", full_page=True)
     page.get_by_label("since").fill("soon")
     page.get_by_role("button", name="Search").click()
-    assert page.get_by_text("'soon' is not a valid time").is_visible()
+    expect(page.get_by_text("'soon' is not a valid time")).to_be_visible()
     page.get_by_role("button", name="Log out").click()
     page.wait_for_url("**/login")
     page.goto(f"https://127.0.0.1:{site.port}/")
@@ -169,12 +170,12 @@ def test_an_operator_stops_a_rollout_with_the_keyboard(rollouts: RolloutSite) ->
         for name in ("Rollouts", PLACE, "Stop…"):
             _follow(page, name)
         assert rollouts.rollout()["state"] == "running"
-        assert page.get_by_text("No further robot gets this bundle").is_visible()
+        expect(page.get_by_text("No further robot gets this bundle")).to_be_visible()
         _follow(page, "Stop the rollout")
-        assert "stop by olga" in page.get_by_role("table", name="History").inner_text()
-        assert "stopped by olga" in page.locator("main").inner_text()
+        expect(page.get_by_role("table", name="History")).to_contain_text("stop by olga")
+        expect(page.locator("main")).to_contain_text("stopped by olga")
         robots = page.get_by_role("table", name="Robots").get_by_role("row")
-        assert "never seen" in robots.nth(1).inner_text()  # the problem is first
+        expect(robots.nth(1)).to_contain_text("never seen")  # the problem is first
         assert page.get_by_role("link", name="Stop…").count() == 0
     assert rollouts.rollout()["state"] == "stopped"
 
@@ -186,7 +187,7 @@ def test_only_an_operator_on_this_site_stops_a_rollout(rollouts: RolloutSite) ->
     with opened_page() as page:
         log_in(page, rollouts.site, viewer)
         page.goto(f"{own}/rollouts/{PLACE}")
-        assert page.get_by_role("table", name="Rings").is_visible()
+        expect(page.get_by_role("table", name="Rings")).to_be_visible()
         assert page.get_by_role("link", name="Stop…").count() == 0
         answer = page.goto(f"{own}/rollouts/{PLACE}/stop")
         assert answer is not None
@@ -277,18 +278,16 @@ def test_hundreds_of_robots_are_usable(site: FleetSite) -> None:
     with opened_page() as page:
         log_in(page, site, site.token)
         rows = page.get_by_role("table", name="Robots").get_by_role("row")
-        assert rows.count() == 101
+        expect(rows).to_have_count(101)
         assert "arm200" in rows.nth(1).inner_text()
         assert "arm000" in rows.nth(2).inner_text()
         page.get_by_role("link", name="Next").click()
         page.get_by_role("link", name="Next").click()
-        assert page.get_by_text("201 to 250 of 250").is_visible()
+        expect(page.get_by_text("201 to 250 of 250")).to_be_visible()
         page.get_by_role("link", name="1 with problems").click()
-        assert rows.count() == 2
+        expect(rows).to_have_count(2)
         page.get_by_label("state").select_option("")
         page.get_by_label("name").fill("M04")
         page.get_by_label("group").select_option("site-1/arms")
         page.get_by_role("button", name="Show").click()
-        assert [rows.nth(number).get_by_role("rowheader").inner_text() for number in range(1, rows.count())] == [
-            "arm041", "arm043", "arm045", "arm047", "arm049",
-        ]  # fmt: skip
+        expect(rows.get_by_role("rowheader")).to_have_text(["arm041", "arm043", "arm045", "arm047", "arm049"])

@@ -18,6 +18,7 @@ from rosrv_fleet.collector import make_collector
 from rosrv_fleet.config import load_config
 
 from appliance.audit.segments import SegmentSummary
+from tests.support.processes import runs
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.forged_segments import forged
@@ -128,7 +129,7 @@ def test_workers_end_with_the_collector(site: FleetSite, make_robot: MakeRobot) 
         workers = _descendants(site.pid)
         assert workers
         end()
-        eventually(lambda: not any(map(_runs, workers)), "all workers have ended")  # noqa: B023  called here
+        eventually(lambda: not any(map(runs, workers)), "all workers have ended")  # noqa: B023  called here
         site.start()
 
 
@@ -138,13 +139,6 @@ def _descendants(process: int) -> list[int]:
         for child in map(int, (task / "children").read_text().split()):
             found += [child, *_descendants(child)]
     return found
-
-
-def _runs(process: int) -> bool:
-    try:
-        return ") Z " not in Path(f"/proc/{process}/stat").read_text()
-    except FileNotFoundError:
-        return False
 
 
 def test_no_content_of_a_segment_stops_the_index(site: FleetSite, make_robot: MakeRobot) -> None:
@@ -190,7 +184,7 @@ def test_a_damaged_segment_stops_no_other(site: FleetSite, make_robot: MakeRobot
     good.push()
     eventually(lambda: _found(site, "good", good.sealed()), "the other robot is searchable")
     eventually(lambda: "verify bad" in (site.health()["trouble"] or ""), "the damage is reported")
-    assert site.health()["waiting"] == 1
+    eventually(lambda: site.health()["waiting"] == 1, "only the damaged segment waits")
     every_hour(site)
     tried = site.data / "large" / "bad"
     eventually(lambda: not tried.exists(), "it was tried again")

@@ -389,6 +389,7 @@ def test_a_restarted_collector_does_not_take_its_own_absence_for_silence(fleet: 
     fleet.until(lambda state: state["why"] == "healthy")
     made = RolloutCollector(fleet.site.repository.folder, fleet.site.authority, database, ahead=3600)
     made.enrol(RobotGroup(SITE, GROUP), *fleet.robots)
+    fleet.collector.stop()
     with serving(made) as later:
         service = later.service
         stored = eventually(lambda: service.rollouts.get(RobotGroup(SITE, GROUP)), "the rollout is read")

@@ -56,6 +56,9 @@ def others_kit(site: TunnelSite) -> Path:
     return site.kit("add", "ocu-2")
 
 
+_LONG = b"second" * 150  # bytes
+
+
 class Datagrams:
     """Datagrams that arrive at a UDP port of the appliance's address in the tunnels: data and sender."""
 
@@ -134,13 +137,15 @@ def test_replayed_packets_are_refused(site: TunnelSite, kit: Path, datagrams: Da
         send(joined, datagrams.port, b"first")
         assert datagrams.next() == (b"first", joined.address)
         with deaf(lab_host(site)):
-            mark = len(wire.frames)
-            send(joined, datagrams.port, b"second")
-            taken = wire.wait_for(lambda frame: frame.esp and frame.source == OCU, since=mark)
+            # Only this packet is so long; the host's own pings are short.
+            send(joined, datagrams.port, _LONG)
+            taken = wire.wait_for(
+                lambda frame: frame.esp and frame.source == OCU and len(frame.udp_payload) > len(_LONG)
+            )
         # A packet that has not arrived yet shows that the attacker's packets can arrive.
         again = taken.with_payload(taken.udp_payload)
         send_frames(site.attacker, [again])
-        assert datagrams.next() == (b"second", joined.address)
+        assert datagrams.next() == (_LONG, joined.address)
         sealed = taken.udp_payload
         changed = taken.with_payload(sealed[:-1] + bytes([sealed[-1] ^ 1]))
         newer = taken.with_payload(sealed[:4] + (int.from_bytes(sealed[4:8]) + 9).to_bytes(4) + sealed[8:])

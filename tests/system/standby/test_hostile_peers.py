@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import itertools
 import os
 import secrets
 import signal
@@ -85,8 +84,8 @@ def grow(robot: StandbyRobot, site: StandbySite, until: Callable[[], bool]) -> N
 
 def slowest_answer(robot: StandbyRobot, since: float) -> float:
     """Return the longest time that the registrar waited for an answer since then."""
-    times = [event["at"] for event in robot.registrar.seen(event="acknowledged") if event["at"] >= since]
-    return float(max(after - before for before, after in itertools.pairwise(times)))
+    events = robot.registrar.seen(event="acknowledged")
+    return float(max(event["longest"] for event in events if event["at"] >= since))
 
 
 # ---- A standby that lies

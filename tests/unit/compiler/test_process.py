@@ -41,14 +41,20 @@ pytestmark = pytest.mark.anyio
 
 
 async def conversation(*wanted: messages.Message) -> list[Any]:
-    """Return the compiler's answers to these questions; the process has ended on return."""
+    """Return the compiler's answers to these questions; then the supervisor has stopped the process."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
     supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
     answers: list[Any] = []
     loop = asyncio.get_running_loop()
+
+    def answered(message: Any) -> None:
+        answers.append(message)
+        if len(answers) == len(wanted):
+            supervisor.send(messages.Stop())
+
     supervisor.attach(loop, lambda _message, _descriptors: None, lambda: None)
-    control.attach(loop, lambda message, _descriptors: answers.append(message), lambda: None)
+    control.attach(loop, lambda message, _descriptors: answered(message), lambda: None)
     supervisor.send(messages.LinkOpened("control", 0), (theirs.fileno(),))
     theirs.close()
     for one in wanted:
@@ -63,9 +69,8 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
         its_lifeline.close()
 
 
-async def test_it_answers_each_question_and_ends_with_its_link(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_it_answers_each_question_and_ends_when_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiler's findings and errors equal those of `check`."""
-    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # the test's own process continues
     bad = GOOD.replace("shared + 1", "shred + 1")
     found, refused = await conversation(
@@ -80,7 +85,6 @@ async def test_it_answers_each_question_and_ends_with_its_link(monkeypatch: pyte
 
 async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The question gets an error; later questions are answered."""
-    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     monkeypatch.setattr("appliance.specifications.checking._standard", lambda: 1 // 0)
     wanted = messages.ContentsWanted(1, {"a.rv": GOOD}, {})
@@ -91,7 +95,6 @@ async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyP
 
 async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each relay gets its own build, in the order of the question."""
-    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     text = GOOD + GOOD.replace("a()", "c()").replace("b()", "d()").replace("shared", "another")
     compiled = check(Sources({"a.rv": text}, DEFINITIONS), ()).compiled
@@ -103,7 +106,6 @@ async def test_it_builds_what_relays_run(monkeypatch: pytest.MonkeyPatch) -> Non
 
 async def test_large_specifications_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit holds for the whole set and for each relay's part, so that no link breaks."""
-    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
     compiled = check(Sources({"a.rv": GOOD}, DEFINITIONS), ()).compiled
     monkeypatch.setattr("appliance.specifications.checking._LONGEST", 1000)

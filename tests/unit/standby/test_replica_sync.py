@@ -10,6 +10,7 @@ from appliance.standby import replica_sync
 from appliance.standby.replica import Replica
 from appliance.standby.replica_sync import ReplicaSync
 from appliance.store.state_file import SCHEMA
+from tests.support.processes import LIMIT
 
 pytestmark = pytest.mark.anyio
 
@@ -39,22 +40,22 @@ async def complete(replica: Replica, folder: Path, boot: str, *, followed: bool,
 async def test_a_restarted_process_may_take_over_at_once(replica: Replica, tmp_path: Path) -> None:
     """The kernel has what a killed process stored; a new standby has nothing to lose."""
     for _ in range(2):
-        assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=5)
+        assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
 
 
 async def test_after_a_reboot_it_waits_for_the_active_appliance(replica: Replica, tmp_path: Path) -> None:
     """Until it has followed the active one, or none has appeared for long, the last changes may be missing."""
-    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=5)
+    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
     assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
-    assert await complete(replica, tmp_path, "boot 2", followed=True, seconds=5)
-    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=5)
+    assert await complete(replica, tmp_path, "boot 2", followed=True, seconds=LIMIT)
+    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)
 
 
 async def test_two_appliances_without_power_start_again(
     replica: Replica, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If no active appliance appears, both lost their power, and one of them must serve the robot."""
-    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=5)
+    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
     monkeypatch.setattr(replica_sync, "WAIT_SECONDS", 0.2)
-    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=5)
+    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)
