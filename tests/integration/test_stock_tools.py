@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from tests.support.nodes import HERE, PYTHON, Client, RosSession, roscpp_program
+from tests.support.processes import Event
 from tests.support.site import Site
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -65,8 +66,15 @@ def test_rostopic_hz(ros: RosSession) -> None:
     """`rostopic hz` measures the publishing rate of the node."""
     ros.talker("roscpp", "/chatter")
     hz = ros.start(["rostopic", "hz", "/chatter"])
-    rate = float(hz.wait_for_text("average rate").removeprefix("average rate: "))
+    hz.wait_for(lambda event: _window(event) >= 20)
+    rate = float(hz.wait_for_text("average rate", since=hz.mark()).removeprefix("average rate: "))
     assert 5 < rate < 20
+
+
+def _window(event: Event) -> int:
+    """Return of how many messages `rostopic hz` has taken the average; 0 for other lines."""
+    _, found, count = event.get("text", "").rpartition("window: ")
+    return int(count) if found else 0
 
 
 def test_rostopic_pub(ros: RosSession) -> None:
@@ -158,7 +166,7 @@ def test_rosbag(ros: RosSession, tmp_path: Path) -> None:
     talker.stop()
     assert "5 msgs" in ros.run("rosbag", "info", str(bag)).stdout
     listener = ros.listener("rospy", "/chatter")
-    ros.run("rosbag", "play", "--wait-for-subscribers", str(bag))
+    ros.start(["rosbag", "play", "--wait-for-subscribers", "--keep-alive", str(bag)])
     assert len(listener.wait_for_count(5, event="received")) == 5
 
 

@@ -211,9 +211,11 @@ class Engine:
             raise
 
     def __exit__(self, *exc: object) -> None:
-        with contextlib.suppress(DockerError):
-            self.clear()
-        self.stop()
+        try:
+            with contextlib.suppress(DockerError, subprocess.TimeoutExpired):
+                self.clear()
+        finally:
+            self.stop()
 
 
 class MachineInside:

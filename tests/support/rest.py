@@ -81,10 +81,15 @@ class Rest:
         return known | (given or {})
 
     def request(
-        self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
+        self,
+        method: str,
+        path: str,
+        body: bytes | None = None,
+        headers: dict[str, str] | None = None,
+        timeout: float = 30,
     ) -> Answer:
         """Make one request and return its last answer."""
-        with self._asked(method, path, body, headers) as response:
+        with self._asked(method, path, body, headers, timeout) as response:
             names = {name.lower(): value for name, value in response.getheaders()}
             return Answer(response.status, names, response.read())
 

@@ -189,10 +189,12 @@ def test_rosmaster_stopped_for_three_seconds(working: Field) -> None:
     pid = working.appliance.pids("rosmaster")[0]
     with Burst(working, "/burst_stopped") as burst:
         os.kill(pid, signal.SIGSTOP)
-        working.listener.wait_for_count(
-            len(working.listener.seen(event="received")) + 150, event="received"
-        )  # three seconds of messages, which do not need `rosmaster`
-        os.kill(pid, signal.SIGCONT)
+        goes_on = threading.Timer(3, os.kill, (pid, signal.SIGCONT))
+        goes_on.start()
+        working.listener.wait_for_count(  # messages do not need `rosmaster`
+            len(working.listener.seen(event="received")) + 50, event="received"
+        )
+        goes_on.join()
         burst.finish()
         burst.all_there()
     assert working.appliance.pids("rosmaster") == [pid]

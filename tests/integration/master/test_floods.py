@@ -134,7 +134,10 @@ def test_calls(calm: Field) -> None:
                 sock.sendall(data)
                 received = b""
                 while not whole(received):
-                    received += sock.recv(65536)
+                    more = sock.recv(65536)
+                    if not more:
+                        return
+                    received += more
 
     with Flood(calm, 16, act) as flood:
         assert bystander(calm) < allowed(SLOW)
