@@ -98,6 +98,6 @@ def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> N
         for one in siege.appliance.audit("--deny", "--limit", "10000")
         if one["detail"].get("unknown_host")
     ]
-    # Kinds that were forgotten begin anew.
+    # Kinds that were forgotten are recorded in full again.
     periods = (time.monotonic() - began) // FoldSettings().seconds
     assert 0 < len(of_unknown_hosts) <= (2 + periods) * (AUDIT_KINDS.bounds.unknown + 1)

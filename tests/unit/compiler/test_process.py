@@ -69,7 +69,7 @@ async def conversation(*wanted: messages.Message) -> list[Any]:
         its_lifeline.close()
 
 
-async def test_it_answers_each_question_and_ends_when_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_it_answers_each_question_and_ends_when_it_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The compiler's findings and errors equal those of `check`."""
     monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # the test's own process continues
     bad = GOOD.replace("shared + 1", "shred + 1")
