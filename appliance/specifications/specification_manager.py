@@ -427,16 +427,18 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             except (SpecificationsRefusedError, WithdrawnError):
                 switches.said = before
                 raise
+        # Killed between the two, control leaves a limit without a disabled monitor, never the reverse.
         if seconds is None:
+            self.store.save_setting(_SWITCHES, json.dumps(switches.said))
             self.returns.end(changed)
         else:
             self.returns.begin({name: switches.states[name] or True for name in changed}, seconds)
+            self.store.save_setting(_SWITCHES, json.dumps(switches.said))
         for name in changed:
             switches.states[name] = to
             if not switched_shadow:
                 self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, to, who)
-        self.store.save_setting(_SWITCHES, json.dumps(switches.said))
         await self.store.settled()
         await self.rollout.carried_out()
         return changed

@@ -83,7 +83,7 @@ class Process:
             threading.Thread(target=self._read_events, name=f"{label} stdout", daemon=True),
             threading.Thread(target=self._read_errors, name=f"{label} stderr", daemon=True),
         ]
-        for reader in self._readers:
+        for reader in reversed(self._readers):  # the first one waits for the second at the end
             reader.start()
 
     @property

@@ -66,6 +66,35 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
     ]  # fmt: skip
 
 
+def killed() -> None:
+    """End the time limits of earlier controls, as the death of their process does."""
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        if "TimedDisables" in str(task.get_coro()):
+            task.cancel()
+
+
+async def test_a_kill_between_two_writes_disables_no_monitor_forever(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whichever write of an enabling is the last one, a later control enables the monitor."""
+    monitors = await desk.monitors()
+    for writes in range(3):
+        await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
+        killed()
+        with monkeypatch.context() as context:
+            context.setattr(desk.store, "save_setting", first(writes, desk.store.save_setting))
+            await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
+        monitors = await desk.monitors(restarted=True)
+        assert monitors.switches.enabled("a") or monitors.returns.until("a") is not None, writes
+        killed()
+
+
+def first(count: int, write: Callable[[str, str], None]) -> Callable[[str, str], None]:
+    """Return a function that writes `count` times, and then nothing."""
+    left = iter(range(count))
+    return lambda name, value: write(name, value) if next(left, None) is not None else None
+
+
 async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -> None:
     """After a restart the monitor comes back; an operator's switch, or a removal, ends the time."""
     monitors = await desk.monitors()
@@ -77,6 +106,7 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
     await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")  # shorter than before
     await again.remove(admin.MonitorRemove(["b"]), "eve")
     assert again.returns.until("b") is None
+    killed()
     later = await desk.monitors(restarted=True)
     async with asyncio.timeout(30):
         while not later.switches.enabled("a"):
