@@ -42,7 +42,7 @@ class ThisMachine:
 
 
 def runs(pid: int | str) -> bool:
-    """Return whether a process has not ended; one that only waits to be reaped has."""
+    """Return whether a process is running. A process that has ended and waits for its parent is not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):  # the second if it is reaped while it is read

@@ -116,7 +116,7 @@ class Watchlist:
     def to_make_up(self, node: Incarnation) -> MissedUpdates | None:
         """Return and clear the missed updates of a node.
 
-        Return None if there are none, or if the last repetition was less than `_MADE_UP_SECONDS` ago.
+        Return None if the node missed no update, or if its updates were repeated in the last `_MADE_UP_SECONDS`.
         """
         missed, now = self._missed.get(node.key), time.monotonic()
         if missed is None or (missed.made_up is not None and now - missed.made_up < _MADE_UP_SECONDS):

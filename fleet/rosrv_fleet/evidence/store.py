@@ -92,7 +92,10 @@ class EvidenceStore:
             sync(self._folder)
 
     def remove(self, evidence: str) -> StoredEvidence | None:
-        """Remove a bundle and record the act; return what it was, or None if there is none. Raises like `get`."""
+        """Remove a bundle and record the act; return the bundle's description, or None for an unknown ID.
+
+        Raises the errors of `get`.
+        """
         about = self.get(evidence) if _ID.fullmatch(evidence) else None
         if about is not None:
             removed = self.incoming()  # a killed command leaves it there

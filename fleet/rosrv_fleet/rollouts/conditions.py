@@ -8,7 +8,7 @@ from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, RobotSeen, 
 
 
 class ConditionKind(enum.StrEnum):
-    """The condition of a robot: the first one that applies, in order of severity."""
+    """The conditions that a robot can have, the most severe one first. A robot has one of them."""
 
     UNHEALTHY = "unhealthy"
     SILENT = "silent"
@@ -28,7 +28,7 @@ class RobotCondition(NamedTuple):
 def conditions(
     rollout: BundleRollout | None, robots: Mapping[str, RobotSeen], now: float
 ) -> dict[str, RobotCondition]:
-    """Return the condition of each robot of a group, whose last rollout is given (None: there was none)."""
+    """Return the condition of each robot of a group; `rollout` is the group's last one, or None."""
     sick = {} if rollout is None else unhealthy(rollout, robots, now)
     silent = (HealthGates() if rollout is None else rollout.gates).silent_seconds
     found = {}
