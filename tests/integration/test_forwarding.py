@@ -62,8 +62,7 @@ def all_sequences(appliance: Appliance) -> set[int]:
 
 def forwarding_status(appliance: Appliance) -> dict[str, Any]:
     """Return the state of forwarding in `rosrv status`."""
-    status = json.loads(appliance.rosrv("status", "--json", check=False).stdout)
-    return dict(status["audit"]["forwarding"])
+    return dict(appliance.status()["audit"]["forwarding"])
 
 
 def test_every_record_arrives_and_verifies(

@@ -56,16 +56,15 @@ def appliance(recording: Appliance) -> Iterator[Appliance]:
     """Provide the appliance without recordings; its memory has messages of other tests, on other topics."""
     recording.ignore_earlier_records()
     yield recording
-    for line in recording.rosrv("record", "list", "--json", check=False).stdout.splitlines():
-        recording.rosrv("record", "remove", json.loads(line)["id"])
+    for row in recording.rows("record", "list"):
+        recording.rosrv("record", "remove", row["id"])
 
 
 def recordings(appliance: Appliance, count: int = 1) -> list[dict[str, Any]]:
     """Return the recordings, once there are `count` of them."""
 
     def found() -> list[dict[str, Any]] | None:
-        listed = appliance.rosrv("record", "list", "--json", check=False)
-        rows = [json.loads(line) for line in listed.stdout.splitlines()] if not listed.returncode else []
+        rows = appliance.rows("record", "list")
         return rows if len(rows) >= count else None
 
     return eventually(found, appliance.story)

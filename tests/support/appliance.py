@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from appliance.channel.admin import A, AdminRequest
-from appliance.cli.connection.admin_client import AdminSocket
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from tests.support.command import ROSRV, rosrv
 from tests.support.own_namespace import own_namespace
+from tests.support.printed import row_of, rows_of
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
 from tests.support.rest import Rest
-from tests.support.waiting import eventually
+from tests.support.waiting import NoAnswerError, eventually
 
 OPEN_POLICY = """\
 [Nodes]
@@ -127,25 +128,39 @@ class Appliance:
     def rosrv(
         self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
-        """Run another verb of the command with `--state` of this appliance (unless the verb does not accept it)."""
+        """Run another verb of the command with `--state` of this appliance (unless the verb does not accept it).
+
+        With `check`, raises `NoAnswerError` if it fails.
+        """
         done = rosrv(*arguments, *(["--state", str(self.state)] if state else []))
         if check and done.returncode:
-            raise AssertionError(
+            raise NoAnswerError(
                 f"{' '.join(done.args)}: exit status {done.returncode}\n"
                 f"{done.stdout}\n{done.stderr}\n{self.story()}"
             )
         return done
 
+    def rows(self, *arguments: str) -> list[dict[str, Any]]:
+        """Return the objects that a verb prints with --json. Raises `NoAnswerError`."""
+        return rows_of(self.rosrv(*arguments, "--json", check=False))
+
+    def row(self, *arguments: str) -> dict[str, Any]:
+        """Return the only object that a verb prints with --json. Raises `NoAnswerError`."""
+        return row_of(self.rosrv(*arguments, "--json", check=False))
+
     def ask(self, request: AdminRequest[A]) -> A:
-        """Return the result of a verb of `rosrv`, without starting a process."""
-        answer = AdminSocket(self.state).ask(request)
-        assert answer.ok, answer.error
+        """Return the result of a verb of `rosrv`, without starting a process. Raises `NoAnswerError`."""
+        try:
+            answer = AdminSocket(self.state).ask(request)
+        except NotRunningError as error:
+            raise NoAnswerError(str(error)) from None
+        if not answer.ok:
+            raise NoAnswerError(answer.error)
         return answer.given()
 
     def status(self) -> dict[str, Any]:
-        """Return `rosrv status --json`; its exit status reports problems."""
-        status: dict[str, Any] = json.loads(self.rosrv("status", "--json", check=False).stdout)
-        return status
+        """Return `rosrv status --json`; its exit status reports problems. Raises `NoAnswerError`."""
+        return self.row("status")
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
         """Run `rosrv audit search --json` with these flags, and return the records that have these fields."""

@@ -26,6 +26,7 @@ from typing import Any, Self
 
 from appliance.network.namespaces import Namespace
 from tests.support.debian_base import base_archive
+from tests.support.printed import row_of
 from tests.support.processes import Host, ThisMachine
 from tests.support.requirements import need_program, need_root
 
@@ -313,11 +314,12 @@ class Compose:
         return [one for one in records if all(one.get(key) == value for key, value in fields.items())]
 
     def status(self) -> dict[str, Any]:
-        """Return `rosrv status --json` in the appliance."""
-        status: dict[str, Any] = json.loads(
-            self.exec("appliance", "rosrv", "status", "--json", check=False).stdout
-        )
-        return status
+        """Return `rosrv status --json` in the appliance. Raises `NoAnswerError`."""
+        return self.row("status")
+
+    def row(self, *arguments: str, service: str = "appliance") -> dict[str, Any]:
+        """Return the only object that a verb in a container prints with --json. Raises `NoAnswerError`."""
+        return row_of(self.exec(service, "rosrv", *arguments, "--json", check=False))
 
     def story(self) -> str:
         """Return the end of the containers' output."""

@@ -17,20 +17,34 @@ from tests.support.processes import LIMIT
 T = TypeVar("T")
 
 
+class NoAnswerError(AssertionError):
+    """Report that a program gives no answer now; it may start, or stand by for another."""
+
+
 def eventually(
     condition: Callable[[], T | None], what: str | Callable[[], str], seconds: float = 2 * LIMIT
 ) -> T:
     """Return the first true answer of `condition`; fail with `what` after `seconds`, which are generous.
 
-    `what` describes the expected event; a function is called only on failure.
+    `what` describes the expected event; a function is called only on failure. A `NoAnswerError` is no answer yet.
     """
     deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
-    while not (found := condition()):
+    while True:
+        found, why = _tried(condition)
+        if found:
+            return found
         if time.monotonic() > deadline:
-            raise AssertionError(f"not within {seconds:.0f} s: {what if isinstance(what, str) else what()}")
+            told = what if isinstance(what, str) else what()
+            raise AssertionError(f"not within {seconds:.0f} s: {told}{why}")
         pause.wait(moment)
         moment = min(1.5 * moment, 0.25)  # fewer polls do not slow down a slow machine further
-    return found
+
+
+def _tried(condition: Callable[[], T | None]) -> tuple[T | None, str]:
+    try:
+        return condition(), ""
+    except NoAnswerError as error:
+        return None, f"\nno answer: {error}"
 
 
 def allowed(seconds: float) -> float:

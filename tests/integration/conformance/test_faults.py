@@ -5,7 +5,6 @@ both libraries watch parameters. After each fault all traffic resumes (`pytest -
 parameter is missing, and the audit log is complete.
 """
 
-import json
 import os
 import signal
 import time
@@ -171,16 +170,19 @@ def _wait_for_another_rosout(robot: RobotAtWork, old: str) -> None:
 
 
 def processes(robot: RobotAtWork) -> dict[str, int]:
-    """Return the process of each role by `rosrv status`; empty while control is away."""
-    said = robot.appliance.rosrv("status", "--json", check=False).stdout
-    return {row["role"]: row["pid"] for row in json.loads(said)["processes"]} if said else {}
+    """Return the process of each role by `rosrv status`. Raises `NoAnswerError` while control is away."""
+    return {row["role"]: row["pid"] for row in robot.appliance.status()["processes"]}
 
 
 def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
     """Send a signal to the process of each role, as simultaneously as possible."""
-    pids = processes(robot)
-    for role in roles:
-        os.kill(pids[role], number)
+
+    def running() -> list[int] | None:
+        pids = processes(robot)
+        return [pids[role] for role in roles] if pids.keys() >= set(roles) else None
+
+    for pid in eventually(running, robot.appliance.story):
+        os.kill(pid, number)
 
 
 @pytest.mark.parametrize("role", KILLED)

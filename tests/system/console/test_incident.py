@@ -1,6 +1,5 @@
 """Review an incident in the console by keyboard, as in docs/review-an-incident.md; a recording; a shadow monitor."""
 
-import json
 import re
 import tempfile
 import zipfile
@@ -78,9 +77,8 @@ def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) ->
         appliance.recorded(event="message dropped")
 
     def closed() -> dict[str, Any] | None:
-        listed = appliance.rosrv("record", "list", "--json", check=False).stdout.splitlines()
-        row: dict[str, Any] | None = json.loads(listed[-1]) if listed else None
-        return row
+        rows = appliance.rows("record", "list")
+        return rows[-1] if rows else None
 
     return eventually(closed, appliance.story)
 

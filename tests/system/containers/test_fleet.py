@@ -152,8 +152,7 @@ def _work(appliance: Appliance) -> None:
 
 
 def _collected(appliance: Appliance) -> int:
-    status = json.loads(appliance.rosrv("status", "--json", check=False).stdout)
-    return int(status["audit"]["collector"]["sequence"])
+    return int(appliance.status()["audit"]["collector"]["sequence"])
 
 
 def _push(robot: FleetRobot, state: Path) -> None:

@@ -1,6 +1,5 @@
 """Test compose.standby.yaml: two appliances in containers; one is killed while the operator drives."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,17 +29,9 @@ def pair(site: Site, tmp_path: Path) -> Iterator[Compose]:
 def test_the_standby_takes_over_from_a_killed_container(pair: Compose) -> None:
     """The operator loses the robot for a moment; every node goes on in its container."""
     pair.wait_for_log("ocu", '"position"', timeout=180)
-    eventually(
-        lambda: (
-            json.loads(pair.exec("a", "rosrv", "standby", "status", "--json", check=False).stdout or "{}")
-            .get("other", {})
-            .get("in_sync")
-        ),
-        pair.story,
-    )
+    eventually(lambda: pair.row("standby", "status", service="a")["other"]["in_sync"], pair.story)
     nodes = {name: pair.container(name) for name in ("landshark", "ocu")}
     pair("kill", "a")
     pair.wait_for_log("ocu", '"regained"', timeout=120)
-    status = json.loads(pair.exec("b", "rosrv", "standby", "status", "--json", check=False).stdout)
-    assert status["role"] == "active"
+    assert pair.row("standby", "status", service="b")["role"] == "active"
     assert {name: pair.container(name) for name in nodes} == nodes

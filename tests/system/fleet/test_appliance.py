@@ -39,7 +39,7 @@ def pushing(site: FleetSite, folder: Path) -> dict[str, Any]:
 
 def collector_state(appliance: Appliance) -> dict[str, Any]:
     """Return the state of the collector in `rosrv status`."""
-    return dict(json.loads(appliance.rosrv("status", "--json", check=False).stdout)["audit"]["collector"])
+    return dict(appliance.status()["audit"]["collector"])
 
 
 def work(appliance: Appliance, count: int) -> None:

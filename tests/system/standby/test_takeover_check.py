@@ -3,7 +3,6 @@
 The standby `b` has keys of the site, which `a` does not know. All tests of the file use the same appliances.
 """
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from appliance.channel import admin
 from examples.landshark.lab import Lab
 from tests.support.appliance import OPEN_POLICY
 from tests.support.nodes import has_ros
+from tests.support.printed import row_of
 from tests.support.requirements import need_program, need_root, needs
 from tests.support.site_key import LINE, signed
 from tests.support.standby_site import StandbySite
@@ -49,14 +49,12 @@ def until_obstacle(site: StandbySite, words: str, *names: str) -> None:
 
     def reported(name: str) -> bool:
         done = site.appliances[name].rosrv("standby", "status", "--json", check=False)
-        if not done.stdout:  # control starts
-            return False
-        state = json.loads(done.stdout)
+        state = row_of(done)
         obstacle, troubles = state["obstacle"], state["troubles"]
         if not words:
             return obstacle == "" and troubles == [] and done.returncode == 0
         text = f"the standby b (10.79.0.3) cannot take over: {obstacle}"
-        return words in obstacle and text in troubles[0] and done.returncode == 1
+        return words in obstacle and text in " ".join(troubles[:1]) and done.returncode == 1
 
     for name in names:
         eventually(lambda name=name: reported(name), site.story)  # type: ignore[misc]  # mypy infers no type for a lambda's default
@@ -138,9 +136,6 @@ def test_a_specification_that_it_cannot_load(site: StandbySite) -> None:
     until_obstacle(site, "", "a", "b")
     site.cut("a")
     site.until_taken_over("b")
-
-    def lists_it() -> bool:
-        done = site.appliances["b"].rosrv("monitor", "list", "--json", check=False)
-        return not done.returncode and json.loads(done.stdout)["name"] == "seen"
-
-    eventually(lists_it, site.story)
+    eventually(
+        lambda: [row["name"] for row in site.appliances["b"].rows("monitor", "list")] == ["seen"], site.story
+    )
