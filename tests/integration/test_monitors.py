@@ -387,6 +387,7 @@ import sys
 sys.path.insert(0, {str(ROOT / "examples" / "landshark" / "nodes")!r})
 import rospy
 from landshark_messages import paintball_trigger
+from report import report
 from sensor_msgs.msg import JointState
 Trigger = paintball_trigger()
 rospy.init_node(sys.argv[1])
@@ -395,10 +396,10 @@ GUN = (
     LANDSHARK
     + """
 def aimed(message):
-    print('{"event": "aimed", "tilt": %s}' % message.position[1], flush=True)
-rospy.Subscriber("/landshark_control/trigger", Trigger, lambda m: print('{"event": "shot"}', flush=True))
+    report("aimed", tilt=message.position[1])
+rospy.Subscriber("/landshark_control/trigger", Trigger, lambda m: report("shot"))
 rospy.Subscriber("/landshark/joint_states", JointState, aimed)
-print('{"event": "ready"}', flush=True)
+report("ready")
 rospy.spin()
 """
 )
@@ -409,7 +410,7 @@ aim = rospy.Publisher("/landshark/joint_states", JointState, queue_size=10)
 fire = rospy.Publisher("/landshark_control/trigger", Trigger, queue_size=10)
 while not (aim.get_num_connections() and fire.get_num_connections()):
     rospy.sleep(0.05)
-print('{"event": "ready"}', flush=True)
+report("ready")
 for line in sys.stdin:
     if line == "fire\\n":
         fire.publish(Trigger())

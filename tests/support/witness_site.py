@@ -42,14 +42,16 @@ class Peer:
         self.sent = b""
 
     def ask(self, operation: Operation, epoch: int) -> WitnessAnswer:
-        """Return the witness's answer; a lost one is asked for again."""
+        """Return the witness's answer; a lost one is asked for again, and a late one to an earlier question ignored."""
+        asked: list[WitnessRequest] = []
 
         def answer() -> WitnessAnswer | None:
-            self.sent = self.channel.write(WitnessRequest(operation, epoch, 1, 0.0))
+            asked.append(WitnessRequest(operation, epoch, 1, 0.0))
+            self.sent = self.channel.write(asked[-1])
             with contextlib.suppress(OSError):
                 self.socket.send(self.sent)
                 found = self.channel.read(self.socket.recv(1024))
-                return None if found is None else found[1]
+                return found[1] if found and any(found[0] is one for one in asked) else None
             return None
 
         return eventually(answer, "the witness answers")
