@@ -103,8 +103,10 @@ class RecordFolder:
         key = narrow = kind_of(plain)
         if key not in self._coming:
             key, _ = self._denial_key(plain, self._coming_beside(plain))
-        kind = self._kinds.get(key)
-        first: AuditRecord | FoldState = self._coming.setdefault(key, record) if kind is None else kind.state
+        first: AuditRecord | FoldState | None = self._coming.get(key)
+        if first is None:  # not coming, or offered by another thread by now: then its kind exists
+            kind = self._kinds.get(key)
+            first = self._coming.setdefault(key, record) if kind is None else kind.state
         if first is record:
             self._coming_as[record.id] = key
             return record.id

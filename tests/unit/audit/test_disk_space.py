@@ -16,13 +16,13 @@ from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 
 _LIMIT_SECONDS = 30
-_RESERVE = 4 << 20
+_RESERVE = 16 << 20
 
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a file system of 8 MiB."""
-    with small_disk(tmp_path / "disk", "8m") as place:
+    """Mount a file system of 32 MiB: each batch of records needs space, and a busy machine makes many small ones."""
+    with small_disk(tmp_path / "disk", "32m") as place:
         yield place
 
 
@@ -40,7 +40,7 @@ def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
         assert settle(log) is None
         assert log.degraded is None
         filler = disk / "filler"
-        filler.write_bytes(b"x" * (5 << 20))
+        filler.write_bytes(b"x" * (20 << 20))
         await_degraded(log, degraded=True)
         eventually(lambda: [one["event"] for one in said] == ["disk nearly full"], lambda: str(said))
     assert "make room" in said[0]["reason"]

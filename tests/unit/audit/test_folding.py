@@ -1,6 +1,7 @@
 """Tests of folding repeated denials, with a clock that the test moves."""
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -63,6 +64,40 @@ def test_summaries_continue_with_the_repetitions() -> None:
     assert len(folder) == 0
     again = denial()
     assert offer(folder, again, now=31) == [again]
+
+
+class Interrupted(dict[Any, Any]):
+    """A dictionary that lets another thread work after each look into it."""
+
+    def __init__(self, here: dict[Any, Any], others_work: Callable[[], object]) -> None:
+        super().__init__(here)
+        self._others_work = others_work
+
+    def get(self, key: Any, default: Any = None) -> Any:
+        """Look, then let the other thread work."""
+        found = super().get(key, default)
+        self._others_work()
+        return found
+
+
+@pytest.mark.parametrize("attribute", ["_kinds", "_coming"])
+def test_a_repetition_gets_the_id_of_a_record_that_is_just_written(
+    monkeypatch: pytest.MonkeyPatch, attribute: str
+) -> None:
+    """Between two looks of the answering thread, the writing thread offers the first denial."""
+    folder = make_folder()
+    first, second = denial(), denial()
+    assert folder.in_full(first) == first.id
+    written: list[AuditRecord] = []
+    left = iter([first])
+
+    def write() -> None:
+        written.extend(offer(folder, *left))
+
+    monkeypatch.setattr(folder, attribute, Interrupted(getattr(folder, attribute), write))
+    told = folder.in_full(second)
+    written += offer(folder, *left, second)
+    assert told in {one.id for one in written}
 
 
 def test_the_reason_of_a_summary_counts_in_english() -> None:
