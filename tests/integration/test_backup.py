@@ -20,7 +20,7 @@ LOADED = OPEN_POLICY + "[Services]\ndefault = *\n"
 @contextlib.contextmanager
 def busy(uri: str) -> Iterator[None]:
     """Run a node that sets parameters continuously."""
-    ending = threading.Event()
+    started, ending = threading.Event(), threading.Event()
 
     def work() -> None:
         with master_at(uri) as master:
@@ -28,10 +28,12 @@ def busy(uri: str) -> Iterator[None]:
             while not ending.is_set():
                 number += 1
                 assert master.setParam("/busy", "/counter", number)[0] == 1
+                started.set()
 
     thread = threading.Thread(target=work)
     thread.start()
     try:
+        assert started.wait(LIMIT)
         yield
     finally:
         ending.set()

@@ -71,7 +71,7 @@ def test_no_path_shows_contents_of_messages_to_a_viewer(appliance: Appliance, tm
             lambda: tokens["viewer"].get("/v1/recordings").json["recordings"], appliance.story
         )
     named = {
-        (one["event"], one["detail"].get("monitor")): one["id"] for one in appliance.audit("--limit", "500")
+        (one["event"], one["detail"].get("monitor")): one["id"] for one in appliance.audit("--limit", "10000")
     }
     values = {
         "name": ["drops", "changes", "faults", "tells", "publishes"], "recording_id": [listed[0]["id"]],

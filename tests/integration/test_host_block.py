@@ -41,7 +41,8 @@ class Robot(NamedTuple):
 
     def heard(self) -> set[str]:
         """Return the talkers of the messages that arrive with the next messages of the robot's own talker."""
-        self.hears("/friend")  # messages that were already sent have arrived
+        for _ in range(SOME):
+            self.hears("/friend")  # messages that were already sent have arrived
         first = self.listener.mark()
         self.listener.wait_for_count(SOME, event="received", publisher="/friend", since=first)
         return {event["publisher"] for event in self.listener.events[first:] if "publisher" in event}

@@ -26,7 +26,7 @@ begin words() {
         heard = heard + 1;
         if (text.find("bad") != std::string::npos) { ROS_WARN("a bad word"); return; }
         text = "checked " + text;
-        if (heard == 3) { report.data = "three words"; PUBLISH(/alarm, std_msgs/String, report); }
+        if (heard % 3 == 0) { report.data = "three words"; PUBLISH(/alarm, std_msgs/String, report); }
     }
 }
 """
@@ -109,10 +109,12 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     assert appliance.status()["monitors"]["differs_from_folder"] is True
     appliance.rosrv("monitor", "remove", "words")
     assert not appliance.rosrv("monitor", "list", "--json").stdout
-    last = len(listener.seen(event="received"))
-    listener.wait_for_count(last + 3, event="received")
+    removed = listener.mark()
+    listener.wait_for(lambda event: event.get("data", "").startswith("hello"), since=removed)
+    plain = listener.mark()
+    listener.wait_for_count(3, event="received", since=plain)
     assert without_gap(numbers(listener.seen(event="received")))
-    assert listener.seen(event="received")[-1]["data"].startswith("hello")
+    assert all(event["data"].startswith("hello") for event in listener.events[plain : plain + 3])
     appliance.rosrv("monitor", "reload")
     assert monitor(appliance, "words")["enabled"] is True
     for event in ("monitor disabled", "monitor enabled"):
@@ -230,10 +232,10 @@ def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
     appliance.kill("relay")
     before = len(plain.seen(event="received"))
+    alarm = appliance.recorded(event="monitors restarted")[0]
     plain.wait_for_count(before + 5, event="received")
     assert plain.seen(event="received")[-1]["data"].startswith("hello")
     assert monitor(appliance, "gate")["held"] is True
-    alarm = appliance.recorded(event="monitors restarted")[0]
     assert (alarm["severity"], alarm["detail"]["held"]) == ("alarm", ["gate"])
     before = len(listener.seen(event="received"))
     appliance.rosrv("monitor", "resume", "gate")
@@ -460,7 +462,7 @@ def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -
 def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
     """Test `publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    divide = "if (heard == 2) { heard = heard / (heard - 2); }\n        text = "
+    divide = 'if (text.find("9") != std::string::npos) { int zero = 0; zero = 1 / zero; }\n        text = '
     monitors = {"words": WORDS.replace("text = ", divide, 1)}
     settings = "publish_as: /guard\nhide_publisher: true\non_fault: pass\n"
     with (
@@ -469,11 +471,14 @@ def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
     ):
         alarm = ros.listener("rospy", "/alarm")
         listener = ros.listener("rospy", "/chatter")
-        ros.talker("rospy", "/chatter", "--rate", "3")
+        ros.talker("rospy", "/chatter")
         assert alarm.wait_for(event="received")["publisher"] == "/guard"
-        heard = [event["data"] for event in listener.wait_for_count(3, event="received")]
-        assert [text.startswith("checked") for text in heard] == [True, False, True]
-        assert appliance.recorded(event="monitor fault")[0]["detail"]["values"]["heard"] == 2
+        passed = listener.wait_for(lambda event: event.get("data", "").endswith("9"))
+        assert passed["data"].startswith("hello")
+        listener.wait_for_count(3, event="received", since=listener.mark())
+        heard = [event["data"] for event in listener.seen(event="received")]
+        assert all(text.startswith("hello" if "9" in text else "checked") for text in heard)
+        assert appliance.recorded(event="monitor fault")[0]["detail"]["values"] == {"zero": 0}
         assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout
 
 

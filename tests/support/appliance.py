@@ -37,6 +37,9 @@ default = *
 default = *
 """
 
+_FLAGS = {"event": "--event", "host": "--host"}
+"""Of fields whose values are not globs: the search by them is quicker than reading every record."""
+
 
 class Appliance:
     """A running appliance; a context manager."""
@@ -163,8 +166,13 @@ class Appliance:
         return self.row("status")
 
     def audit(self, *flags: str, **fields: Any) -> list[dict[str, Any]]:
-        """Run `rosrv audit search --json` with these flags, and return the records that have these fields."""
-        lines = self.rosrv("audit", "search", *flags, "--json").stdout.splitlines()
+        """Run `rosrv audit search --json` with these flags, and return the records that have these fields.
+
+        Without `--limit`, all records count, not only the newest.
+        """
+        whole = () if "--limit" in flags else ("--limit", "10000")
+        named = [f"{flag}={fields[name]}" for name, flag in _FLAGS.items() if fields.get(name)]
+        lines = self.rosrv("audit", "search", *named, *flags, *whole, "--json").stdout.splitlines()
         records: list[dict[str, Any]] = [json.loads(line) for line in lines if line.strip()]
         return [
             record
@@ -217,12 +225,12 @@ class Appliance:
         return eventually(told, self.story)
 
     def pids(self, role: str) -> list[int]:
-        """Return the process ids of a role, from `rosrv status`."""
-        return [row["pid"] for row in self.status()["processes"] if row["role"] == role]
+        """Return the ids of a role's running processes, from `rosrv status`. One that waits for its start has 0."""
+        return [row["pid"] for row in self.status()["processes"] if row["role"] == role and row["pid"]]
 
     def kill(self, role: str) -> int:
-        """Send SIGKILL to the (first) process of a role and return its id."""
-        pid = self.pids(role)[0]
+        """Send SIGKILL to the (first) process of a role, once it runs, and return its id."""
+        pid = eventually(lambda: self.pids(role), self.story)[0]
         os.kill(pid, signal.SIGKILL)
         return pid
 

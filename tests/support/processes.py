@@ -230,7 +230,8 @@ class Process:
     def kill(self) -> None:
         """Kill the process and its children at once, as a crash does."""
         if self.running:
-            os.killpg(self.popen.pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                os.killpg(self.popen.pid, signal.SIGKILL)
         self.popen.wait(LIMIT)
 
     def story(self) -> str:

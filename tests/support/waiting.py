@@ -26,7 +26,7 @@ def eventually(
 ) -> T:
     """Return the first true answer of `condition`; fail with `what` after `seconds`, which are generous.
 
-    `what` describes the expected event; a function is called only on failure. A `NoAnswerError` is no answer yet.
+    `what` describes the expected event; a function is called only on failure. `NoAnswerError` means: not yet.
     """
     deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
     while True:

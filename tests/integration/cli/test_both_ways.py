@@ -252,7 +252,9 @@ def test_watching_survives_a_restart_of_the_api(appliance: Appliance) -> None:
             seen = json.loads(watcher.stdout.readline())  # type: ignore[union-attr]  # checked above
             return next((one["pid"] for one in seen.get("processes", ()) if one["role"] == "api"), 0)
 
-        first = api_seen()
+        first = 0
+        while not first:
+            first = api_seen()
         os.kill(first, signal.SIGKILL)
         while api_seen() in (0, first):
             pass

@@ -171,7 +171,7 @@ def _wait_for_another_rosout(robot: RobotAtWork, old: str) -> None:
 
 def processes(robot: RobotAtWork) -> dict[str, int]:
     """Return the process of each role by `rosrv status`. Raises `NoAnswerError` while control is away."""
-    return {row["role"]: row["pid"] for row in robot.appliance.status()["processes"]}
+    return {row["role"]: row["pid"] for row in robot.appliance.status()["processes"] if row["pid"]}
 
 
 def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:

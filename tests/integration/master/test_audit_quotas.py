@@ -13,6 +13,7 @@ from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
+from tests.support.waiting import eventually
 
 SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 PARTS = 9000
@@ -67,9 +68,13 @@ def test_repeated_reads_are_counted(siege: Siege) -> None:
     part = {"methodName": "hasParam", "params": ["/poller", "/rosdistro"]}
     answer = siege.crowd.call(guest, "system.multicall", [part] * 2000)
     assert all(isinstance(one, list) and one[0][0] == 1 for one in answer)
-    summed = siege.trail.wait_for(event="repetitions folded", host=guest)
-    assert (summed["detail"]["key"], summed["detail"]["count"]) == ("/rosdistro", 1999)
-    assert summed["decision"] == "allow"
+
+    def sums() -> list[dict[str, Any]]:
+        return siege.trail.seen(event="repetitions folded", host=guest)
+
+    # one, unless the calls take ten seconds
+    eventually(lambda: sum(one["detail"]["count"] for one in sums()) == 1999, siege.trail.story)
+    assert {(one["detail"]["key"], one["decision"]) for one in sums()} == {("/rosdistro", "allow")}
 
 
 def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> None:

@@ -14,6 +14,7 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
+from tests.support.field import Impostor, answering
 from tests.support.nodes import Client, RosSession
 from tests.support.processes import Process
 from tests.support.rosmaster import call_on
@@ -37,6 +38,8 @@ class Pair:
     ear: Process
     voice: str
     topic: str
+    api: str
+    """The URI of the voice on the second machine, which answers."""
 
     def talker(self, client: Client, host: Host) -> Process:
         """Start the voice on a host; `ready` is set when its constructor returns, whatever the master answered."""
@@ -45,7 +48,7 @@ class Pair:
     def registered(self) -> Any:
         """Return the answer to the registration of the voice on the second machine."""
         register = ("registerPublisher", self.voice, self.topic, "std_msgs/String")
-        return call_on(self.second, self.appliance.master_uri, *register, f"http://{self.second.address}:9/")
+        return call_on(self.second, self.appliance.master_uri, *register, self.api)
 
 
 @pytest.fixture
@@ -58,9 +61,12 @@ def pair(masters: Masters, tmp_path: Path) -> Iterator[Pair]:
             site.lab.host(f"{name}{number}", f"10.77.0.{number + place}/24")
             for place, name in enumerate(("first", "second", "third"))
         )
-        with RosSession(site.master_uri, tmp_path, third) as ros:
+        with (
+            RosSession(site.master_uri, tmp_path, third) as ros,
+            Impostor(second, answering([1, "", 4711])) as node,
+        ):
             ear = ros.listener("roscpp", topic, name=f"ear{number}")
-            yield Pair(site.lab, site.appliance, first, second, ros, ear, voice, topic)
+            yield Pair(site.lab, site.appliance, first, second, ros, ear, voice, topic, node.uri)
 
 
 def unplugged(pair: Pair, _voice: Process) -> None:
@@ -117,7 +123,7 @@ def test_a_hanging_node_keeps_its_name_until_it_is_lost(pair: Pair) -> None:
         seconds = int(why.partition("unregistered in ")[2].partition(" s")[0])
         assert 0 < seconds <= 25
         eventually(lambda: pair.registered()[0] == 1, why)
-        withdraw = ("unregisterPublisher", pair.voice, pair.topic, f"http://{pair.second.address}:9/")
+        withdraw = ("unregisterPublisher", pair.voice, pair.topic, pair.api)
         assert call_on(pair.second, pair.appliance.master_uri, *withdraw)[2] == 1
     finally:
         voice.kill()  # without this, the node would publish without its name

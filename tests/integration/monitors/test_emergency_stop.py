@@ -1,5 +1,6 @@
 """A latched emergency stop survives the death of every process until an operator releases it."""
 
+import contextlib
 import itertools
 import json
 import os
@@ -44,6 +45,13 @@ def monitor(appliance: Appliance) -> dict[str, Any]:
     return found
 
 
+def press(appliance: Appliance, ros: RosSession) -> None:
+    """Press the stop, and wait until three more messages are dropped."""
+    before = monitor(appliance)["drops"]
+    ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
+    eventually(lambda: monitor(appliance)["drops"] >= before + 3, appliance.story)
+
+
 def kill_relays(appliance: Appliance) -> None:
     """Send SIGKILL to both relays at once."""
     for pid in appliance.pids("relay"):
@@ -55,10 +63,9 @@ def kill_everything(appliance: Appliance) -> None:
     assert appliance.process is not None
     processes = sorted(appliance.status()["processes"], key=lambda row: row["role"] != "supervisor")
     for row in processes:
-        try:
-            os.kill(row["pid"], signal.SIGKILL)
-        except ProcessLookupError:
-            continue
+        if row["pid"]:  # 0: it waits for its start
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(row["pid"], signal.SIGKILL)
     appliance.process.stop(with_signal=signal.SIGKILL, timeout=10)
     appliance.start()
 
@@ -92,8 +99,7 @@ def test_a_latched_stop_stays(stopped: Appliance, common_robot: Host, tmp_path: 
         listener = ros.listener("roscpp", "/chatter")
         ros.talker("roscpp", "/chatter")
         listener.wait_for_count(3, event="received")
-        ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
-        eventually(lambda: monitor(stopped)["drops"] >= 3, stopped.story)
+        press(stopped, ros)
     DEATHS[death](stopped)
     with session() as ros:
         listener = ros.listener("roscpp", "/chatter")
@@ -114,8 +120,7 @@ def test_a_changed_stop_holds_until_it_is_resumed(
         listener = ros.listener("roscpp", "/chatter")
         ros.talker("roscpp", "/chatter")
         listener.wait_for_count(3, event="received")
-        ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
-        eventually(lambda: monitor(stopped)["drops"] >= 3, stopped.story)
+        press(stopped, ros)
         spec = stopped.directory / "stop.rv"
         spec.write_text(STOP.replace("pressed", "is_pressed"))
         said = stopped.rosrv("monitor", "load", str(spec))

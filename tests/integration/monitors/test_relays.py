@@ -5,12 +5,16 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
+from xmlrpc.client import ServerProxy
 
 import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
+from tests.support.processes import Process
 from tests.support.requirements import needs
 from tests.support.site import Masters
 from tests.support.waiting import eventually
@@ -59,6 +63,13 @@ def rows(appliance: Appliance) -> dict[str, dict[str, object]]:
     return {row["name"]: row for row in map(json.loads, lines)}
 
 
+def is_connected(listener: Process) -> bool:
+    """Whether a listener is connected to a publisher of its topic, by its own account."""
+    with ServerProxy(str(listener.wait_for(event="ready")["uri"])) as node:
+        answer: Any = node.getBusInfo("/tests")
+    return any(topic != "/rosout" and connected for _, _, _, _, topic, connected, *_ in answer[2])
+
+
 def relay_of(appliance: Appliance, number: int) -> int:
     """Return the process id of a relay, counted from 1, by its process name."""
     name = "rosrv: relay" if number == 1 else f"rosrv: relay-{number}"
@@ -72,6 +83,8 @@ def test_the_death_of_a_relay_does_not_affect_the_other(appliance: Appliance, ro
     """Topics of the dead relay continue as after any restart; the monitors of both keep their state."""
     left, right = ros.listener("rospy", "/left"), ros.listener("roscpp", "/right")
     alarms = [ros.listener("rospy", f"/{one}/alarm") for one in ("left", "right")]
+    for alarm in alarms:
+        eventually(partial(is_connected, alarm), alarm.story)  # the alarm is sent once
     ros.talker("roscpp", "/left", name="one")
     ros.talker("rospy", "/right", name="other")
     for alarm, word in zip(alarms, ("left", "right"), strict=True):

@@ -7,6 +7,7 @@ import pytest
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
+from tests.support.rosmaster import await_node
 
 SPECIFICATION = """
 gate() {
@@ -33,6 +34,7 @@ def test_output_and_verdicts_reach_rosout_agg(appliance: Appliance, ros: RosSess
     The aggregator passes them on to rqt_console and `rostopic echo`.
     """
     echo = ros.start(["/usr/bin/rostopic", "echo", "--filter", "m.name == '/rosrv'", "/rosout_agg"])
+    await_node(appliance.master_uri, appliance.host, "/rosrv")
     assert "/rosrv" in ros.run("/usr/bin/rostopic", "info", "/rosout").stdout
     ros.talker("roscpp", "/chatter", name="voice")
     for text in (

@@ -235,7 +235,7 @@ def test_a_process_with_a_forbidden_message_is_replaced(common: Running, role: s
 def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
     """SIGKILL of the supervisor ends all its processes, and a new start is not obstructed."""
     running = start().until_ready()
-    os.kill(running.pid("relay"), signal.SIGSTOP)  # not even a process that cannot see its lifeline end
+    os.kill(running.living("relay"), signal.SIGSTOP)  # not even a process that cannot see its lifeline end
     os.kill(running.process.pid, signal.SIGKILL)
     running.until_childless()
     again = start().until_ready()
@@ -411,4 +411,8 @@ def _status(pid: int) -> dict[str, str]:
 
 
 def _open_files(pid: int) -> set[str]:
-    return {str(one.readlink()) for one in Path(f"/proc/{pid}/fd").iterdir()}
+    found = set()
+    for one in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # it is closed by now
+            found.add(str(one.readlink()))
+    return found

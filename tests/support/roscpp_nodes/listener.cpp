@@ -13,7 +13,7 @@ int main(int argc, char** argv) {
   ros::init(argc, argv, "listener");
   if (argc < 2) return 2;
   ros::NodeHandle node;
-  ros::Subscriber subscriber = node.subscribe(argv[1], 100, heard);
+  ros::Subscriber subscriber = node.subscribe(argv[1], 0, heard);  // 0: it loses nothing itself
   report_ready();
   ros::spin();
   report("ended");

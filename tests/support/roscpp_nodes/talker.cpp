@@ -26,7 +26,8 @@ int main(int argc, char** argv) {
   const auto left = [](const ros::SingleSubscriberPublisher& peer) {
     report("disconnected", ", \"topic\": " + json_string(peer.getTopic()));
   };
-  ros::Publisher publisher = node.advertise<std_msgs::String>(argv[1], 100, joined, left, ros::VoidConstPtr(), latch);
+  // 0: it loses nothing itself
+  ros::Publisher publisher = node.advertise<std_msgs::String>(argv[1], 0, joined, left, ros::VoidConstPtr(), latch);
   report_ready();
   ros::Rate rate(hertz);
   int number = 0;

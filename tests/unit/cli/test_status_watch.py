@@ -1,5 +1,6 @@
 """Tests of `appliance.cli.status_watch`: on a terminal, in a pipe, and while the appliance is away."""
 
+import codecs
 import contextlib
 import fcntl
 import json
@@ -73,9 +74,10 @@ class Terminal:
         fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
 
     def _read(self) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")()  # a part may end within a character
         with contextlib.suppress(OSError):  # the terminal closes with the command
             while part := os.read(self._ours, 65_536):
-                self.shown += part.decode()
+                self.shown += decoder.decode(part)
 
     def resize(self, columns: int, lines: int) -> None:
         """Change the size, as a window manager does."""

@@ -37,7 +37,7 @@ def test_a_report_of_problems_is_an_answer() -> None:
     [(STANDS_BY, 1), ("", 2), ("", 1)],
     ids=["stands by", "not running", "container gone"],
 )
-def test_an_error_is_no_answer(output: str, status: int) -> None:
+def test_an_error_counts_as_silence(output: str, status: int) -> None:
     """No key is missing, and no empty text is decoded."""
     with pytest.raises(NoAnswerError, match=re.escape(output.strip() or "no appliance is running")):
         row_of(done(output, status))
