@@ -46,6 +46,7 @@ RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
 _OUTPUT_LINES = 40
 _LONGEST_LINE = 500  # characters
+_LISTINGS = 5  # of the tunnels for one report
 
 T = TypeVar("T")
 
@@ -63,6 +64,7 @@ class TunnelProcess:
         self._wanted: messages.TunnelsStated | None = None
         self._changed = asyncio.Event()
         self._taken = 0
+        self._changes = 0  # of tunnels, told so far
         self._charon: asyncio.subprocess.Process | None = None
         self._vici: ViciClient | None = None
         self._one_at_a_time = asyncio.Lock()
@@ -166,7 +168,11 @@ class TunnelProcess:
 
     def _listen(self, vici: ViciClient) -> None:
         for host, up, remote in vici.listen():
-            self._loop.call_soon_threadsafe(self._tell, messages.TunnelChanged(host, up, remote))
+            self._loop.call_soon_threadsafe(self._tell_change, messages.TunnelChanged(host, up, remote))
+
+    def _tell_change(self, change: messages.TunnelChanged) -> None:
+        self._changes += 1
+        self._tell(change)
 
     async def _read_log(self, charon: asyncio.subprocess.Process) -> None:
         assert charon.stderr is not None  # noqa: S101  a pipe was asked for
@@ -201,7 +207,13 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: ViciClient) -> None:
-        self._tell(messages.TunnelsReported(self._taken, await self._in_turn(vici.seen)))
+        """Report all tunnels. If one changed since charon listed them, it lists them again: the list may be older."""
+        for _ in range(_LISTINGS):
+            changes = self._changes
+            seen = await self._in_turn(vici.seen)
+            if changes == self._changes:
+                break
+        self._tell(messages.TunnelsReported(self._taken, seen))
 
     async def _renew(self) -> None:
         while True:

@@ -1,8 +1,10 @@
 """Tests of the process that speaks to charon, with a stand-in for the conversation."""
 
 import asyncio
+import queue
 import socket
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +17,7 @@ from appliance.channel.messages import (
     Lifeline,
     LinkOpened,
     Stop,
+    TunnelChanged,
     TunnelLink,
     TunnelSeen,
     TunnelsReported,
@@ -35,6 +38,7 @@ class Conversation:
     def __init__(self) -> None:
         self._busy = threading.Event()
         self.interrupted = threading.Event()
+        self.told = threading.Event()
 
     def provision(self, _stated: TunnelsStated) -> None:
         """Wait a little for a query of the tunnels."""
@@ -52,7 +56,7 @@ class Conversation:
 class Bench(process.TunnelProcess):
     """The process with the stand-in in place of charon."""
 
-    conversation = Conversation()
+    conversation: Conversation = Conversation()
 
     async def _start(self, _wanted: TunnelsStated) -> ViciClient:
         return cast(ViciClient, self.conversation)
@@ -84,6 +88,70 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
     supervisor.send(Stop())
     await asyncio.wait_for(running, _LIMIT_SECONDS)
     assert not bench.failed
+    for one in (own, supervisor, link):
+        one.close()
+
+
+class Opening(Conversation):
+    """A stand-in for charon in which a tunnel opens while it lists the tunnels for the first time."""
+
+    tunnel = TunnelSeen("laptop", "10.88.0.9", 1, 0, 0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._opened: queue.SimpleQueue[tuple[str, bool, str]] = queue.SimpleQueue()
+        self._listed = False
+
+    def listen(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield the opening."""
+        yield self._opened.get(timeout=_LIMIT_SECONDS)
+
+    def seen(self) -> list[TunnelSeen]:
+        """Return the tunnels as they were at the beginning."""
+        listed, self._listed = self._listed, True
+        if not listed:
+            self._opened.put((self.tunnel.name, True, self.tunnel.remote))
+            self.told.wait(_LIMIT_SECONDS)
+        return [self.tunnel] if listed else []
+
+
+class ListeningBench(Bench):
+    """The process with that stand-in; it listens to it."""
+
+    async def _start(self, wanted: TunnelsStated) -> ViciClient:
+        vici = await super()._start(wanted)
+        self._loop.run_in_executor(None, self._listen, vici)
+        return vici
+
+    def _tell_change(self, change: TunnelChanged) -> None:
+        super()._tell_change(change)
+        self.conversation.told.set()
+
+
+async def test_no_report_is_older_than_the_changes_before_it(tmp_path: Path) -> None:
+    """Control would count the tunnel as closed, and then as open again."""
+    (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
+    own, supervisor, link = Channel(child, Lifeline), Channel(lifeline, Lifeline), Channel(ours, TunnelLink)
+    bench = ListeningBench(own, tmp_path, make_key())
+    bench.conversation = Opening()
+    running = asyncio.create_task(bench.run())
+    supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
+    theirs.close()
+    told: list[Any] = []
+    reported = asyncio.Event()
+
+    def heard(message: Any, _descriptors: tuple[int, ...]) -> None:
+        if isinstance(message, TunnelChanged | TunnelsReported):
+            told.append(message)
+        if isinstance(message, TunnelsReported):
+            reported.set()
+
+    link.attach(asyncio.get_running_loop(), heard, reported.set)
+    link.send(TunnelsStated(7, "kernel", "10.113.11.1", b"a", b"c", b"r", []))
+    await asyncio.wait_for(reported.wait(), _LIMIT_SECONDS)
+    assert told == [TunnelChanged("laptop", True, "10.88.0.9"), TunnelsReported(7, [Opening.tunnel])]
+    supervisor.send(Stop())
+    await asyncio.wait_for(running, _LIMIT_SECONDS)
     for one in (own, supervisor, link):
         one.close()
 
