@@ -95,7 +95,8 @@ class StandbySite:
         """Start the witness; at the first start with a lease of which `a` is in sync."""
         if not (self.home / "lease").exists():
             self.lease.write(LeaseRecord(1, "", ("a",), ""))
-        self.witness = Process(self.robot, self.command("serve"), env=dict(os.environ), label="witness")
+        command = ["nice", "-n", "-10", *self.command("serve")]  # as its unit does
+        self.witness = Process(self.robot, command, env=dict(os.environ), label="witness")
         self.witness.wait_for_error("the witness answers at")
 
     def stop_witness(self) -> None:
@@ -159,6 +160,12 @@ class StandbySite:
         one = self.appliances[name].process
         assert one is not None
         one.wait_for(event="ready", timeout=2 * LIMIT)
+
+    def promote(self, name: str) -> None:
+        """Let an active appliance hand over by an operator's order, again while it refuses and is active."""
+        eventually(
+            lambda: self.holder() != name or self.appliances[name].rosrv("standby", "promote"), self.story
+        )
 
     def until_taken_over(self, name: str) -> None:
         """Wait until this appliance has the lease."""

@@ -30,7 +30,7 @@ from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
 from tests.support.tunnel_site import API, LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
-from tests.support.waiting import allowed
+from tests.support.waiting import allowed, eventually
 
 CONFIG = f"""\
 api: 0.0.0.0:{API}
@@ -208,9 +208,16 @@ def leave(site: TunnelSite, laptop: ScriptHost, before: list[str]) -> None:
     assert "load = no" in laptop.run("cat", conf).stdout
     assert laptop.run("ls", "-A", "/run").stdout.split() == []
     assert laptop.run("nft", "list", "tables").stdout == ""
-    processes = laptop.outer.namespace.processes()
-    commands = [Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ") for pid in processes]
-    assert [one for one in commands if b"sleep infinity" not in one and b"nsenter" not in one] == []
+    eventually(lambda: not commands(laptop), lambda: str(commands(laptop)))
+
+
+def commands(laptop: ScriptHost) -> list[bytes]:
+    """Return the command lines of the laptop's own processes."""
+    found = []
+    for pid in laptop.outer.namespace.processes():
+        with contextlib.suppress(OSError):  # it has ended by now
+            found.append(Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" "))
+    return [one for one in found if one and b"sleep infinity" not in one and b"nsenter" not in one]
 
 
 def test_a_man_in_the_middle_gets_nothing(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
@@ -376,12 +383,12 @@ def test_revocation_while_rekeying(site: TunnelSite, laptop: ScriptHost, tmp_pat
                 closed = site.recorded(mark, event="connection closed")
                 down = site.recorded(mark, event="tunnel down")
                 assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < allowed(1.0)
-                heard = len(listener.seen(event="received"))
             # It keeps trying, each time from the start: an earlier attempt may wait minutes for its answer.
             anew = "swanctl --terminate --ike rosrv --force; swanctl --initiate --child ros --timeout 2"
             with endless(laptop, anew):
                 # The first count may have begun earlier, with another host of this machine.
                 site.recorded(mark, event="denials folded", host=OCU)
+                heard = len(listener.seen(event="received"))  # what had arrived before is read by now
                 site.recorded(site.mark, event="denials folded", host=OCU)
             assert len(listener.seen(event="received")) == heard
             assert row(site, "other")["state"] == "revoked"

@@ -52,7 +52,7 @@ def test_a_latched_stop_stays(site: StandbySite, planned: bool) -> None:
         eventually(lambda: dropped(site, "a", 3), site.story)
         seen = len(listener.seen(event="received"))
         if planned:
-            site.appliances["a"].rosrv("standby", "promote")
+            site.promote("a")
         else:
             site.cut("a")
         eventually(lambda: site.holder() == "b", site.story)

@@ -120,7 +120,7 @@ def test_an_unreadable_folder(site: StandbySite) -> None:
     site.until_active("b")
     site.restore("a")
     site.until_both_in_sync()
-    site.appliances["b"].rosrv("standby", "promote")
+    site.promote("b")
     site.until_taken_over("a")
     site.until_active("a")
     site.until_both_in_sync()
