@@ -103,10 +103,8 @@ class RecordFolder:
         key = narrow = kind_of(plain)
         if key not in self._coming:
             key, _ = self._denial_key(plain, self._coming_beside(plain))
-        first: AuditRecord | FoldState | None = self._coming.get(key)
-        if first is None:  # not coming, or offered by another thread by now: then its kind exists
-            kind = self._kinds.get(key)
-            first = self._coming.setdefault(key, record) if kind is None else kind.state
+        there = self._coming.get(key) or self._kinds.get(key)  # another thread adds to one, then removes
+        first = there.state if isinstance(there, _Kind) else there or self._coming.setdefault(key, record)
         if first is record:
             self._coming_as[record.id] = key
             return record.id
