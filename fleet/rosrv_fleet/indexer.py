@@ -28,7 +28,7 @@ from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase, migrate
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.robots import Robot, Robots
-from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.segment_store import FileStamp, SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
 LANES = ("pending", "large")
@@ -131,8 +131,9 @@ class Indexer:
         return found
 
     def _index_in_worker(self, place: SegmentPlace, robot: Robot | None) -> None:
+        stamp = self._store.stamp(place)
         if robot is None:
-            self._set_aside(place, "its robot is not enrolled")
+            self._set_aside(place, stamp, "its robot is not enrolled")
             return
         work = self._workers.submit(_index_one, self._config, place, robot.public_key)
         try:
@@ -140,24 +141,25 @@ class Indexer:
         except FileNotFoundError:
             self._store.forget_absent(place)
         except NOT_INDEXABLE as error:
-            self._set_aside(place, str(error).strip().partition("\n")[0])
+            self._set_aside(place, stamp, str(error).strip().partition("\n")[0])
         except BrokenProcessPool:
             self._killed[place] += 1
             if self._killed[place] < _MOST_KILLED:
                 raise
-            self._set_aside(place, f"{_MOST_KILLED} workers ended while they indexed it")
+            self._set_aside(place, stamp, f"{_MOST_KILLED} workers ended while they indexed it")
         except (psycopg.Error, OSError, CancelledError):  # not the segment's fault
             raise
         except Exception as error:  # noqa: BLE001  a defect, or no memory, must not delay other segments
-            self._set_aside(place, failure_of(error))
+            self._set_aside(place, stamp, failure_of(error))
         else:
             self._store.indexed(place)
             self._killed.pop(place, None)
 
-    def _set_aside(self, place: SegmentPlace, reason: str) -> None:
-        self._damage = f"{self._store.path(place)}: {reason}; run 'rosrv-fleet verify {place.robot}'"
-        _log.error("a segment is stored, but cannot be indexed", reason=self._damage)
-        self._store.set_aside(place)
+    def _set_aside(self, place: SegmentPlace, stamp: FileStamp | None, reason: str) -> None:
+        """Report a segment, unless its robot has replaced the file since: then the segment waits for its next turn."""
+        if self._store.set_aside(place, stamp):
+            self._damage = f"{self._store.path(place)}: {reason}; run 'rosrv-fleet verify {place.robot}'"
+            _log.error("a segment is stored, but cannot be indexed", reason=self._damage)
         self._killed.pop(place, None)
 
     def _failed(self, lane: str, reason: str) -> None:

@@ -131,13 +131,14 @@ class Robots:
         A robot whose file became unreadable keeps its last valid state; `unreadable` has the reasons by name.
         """
         with self._lock:
+            now = time.time_ns()
             changed = self._folder.stat().st_mtime_ns if self._folder.is_dir() else 0
             if changed != self._seen and time.monotonic() >= self._again:
                 files = self._folder.iterdir() if changed else ()
                 self._read(sorted(file for file in files if file.suffix == ".json"))
-                # A second change within the clock's step would go unnoticed, so a fresh folder is read again; and a
-                # repaired file does not change the folder.
-                fresh = time.time_ns() - changed <= 1_000_000_000
+                # A second change within the clock's step would go unnoticed, so a folder that was fresh before the
+                # reading is read again; and a repaired file does not change the folder.
+                fresh = now - changed <= 1_000_000_000
                 self._seen = -1 if fresh or self.unreadable else changed
                 self._again = time.monotonic() + 1.0 if self.unreadable else 0.0
             return self._robots

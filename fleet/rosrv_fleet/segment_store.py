@@ -55,6 +55,7 @@ _DAMAGED = (gzip.BadGzipFile, EOFError, zlib.error, ValueError)
 _LOG = re.compile("[0-9a-f]{32}")
 _FILE = re.compile(r"(\d{18})-([0-9a-f]{64})\.ndjson\.gz")
 _MARK = re.compile(r"([0-9a-f]{32})~(\d{18})~([0-9a-f]{64})")
+FileStamp = tuple[int, int, int]
 
 
 class StoreFullError(OSError):
@@ -334,11 +335,26 @@ class SegmentStore:
         for kind in ("pending", "large", "damaged"):
             self._unmark(kind, place)
 
-    def set_aside(self, place: SegmentPlace) -> None:
-        """Note that the index cannot have a segment. Raises `OSError`."""
-        self._touch("damaged", place)
-        for kind in ("pending", "large"):
-            self._unmark(kind, place)
+    def stamp(self, place: SegmentPlace) -> FileStamp | None:
+        """Return a stamp that changes when `keep` replaces the file of a segment; None: it is absent."""
+        try:
+            found = self.path(place).stat()
+        except FileNotFoundError:
+            return None
+        return found.st_ino, found.st_size, found.st_mtime_ns
+
+    def set_aside(self, place: SegmentPlace, stamp: FileStamp | None) -> bool:
+        """Note that the index cannot have the file with this stamp; return False if it was replaced since.
+
+        Raises `OSError`.
+        """
+        with self._lock(place.robot):
+            if self.stamp(place) != stamp:
+                return False
+            self._touch("damaged", place)
+            for kind in ("pending", "large"):
+                self._unmark(kind, place)
+            return True
 
     def try_again(self) -> None:
         """Let the segments wait for the index that it could not have before; they stay reported. Raises `OSError`."""
@@ -433,7 +449,10 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _in_bucket(robot: str, log: str, bucket: Path) -> list[SegmentPlace]:
-    names = sorted(os.listdir(bucket)) if bucket.is_dir() else []  # noqa: PTH208  names, not paths
+    try:
+        names = sorted(os.listdir(bucket))  # noqa: PTH208  names, not paths
+    except (FileNotFoundError, NotADirectoryError):  # retention may have just removed it
+        return []
     found = [match for match in map(_FILE.fullmatch, names) if match is not None]
     return [SegmentPlace(robot, log, int(match[1]), match[2]) for match in found]
 

@@ -7,7 +7,6 @@ removal by retention the signer signed, or after the segments that the collector
 
 import gzip
 import zlib
-from collections.abc import Callable
 from datetime import UTC, datetime
 
 import msgspec
@@ -16,6 +15,7 @@ from appliance.audit.segments import SegmentError, SegmentHeader, SegmentReader
 from rosrv_fleet.robots import Robot
 from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
 
+_MOST_ATTEMPTS = 10  # to prove a log of which retention removes segments at the same time
 _UNREADABLE = (SegmentError, OSError, EOFError, zlib.error, gzip.BadGzipFile)
 
 
@@ -44,27 +44,37 @@ class LogProof(msgspec.Struct, kw_only=True):
         return not self.findings
 
 
-def prove(
-    store: SegmentStore,
-    robot: Robot,
-    segment_bytes: int,
-    progress: Callable[[int], None] = lambda _records: None,
-) -> list[LogProof]:
-    """Verify all stored segments of a robot; one result for each log. `progress` gets the number of records."""
-    return [_prove_log(store, robot, log, segment_bytes, progress) for log in store.logs(robot.name)]
+def prove(store: SegmentStore, robot: Robot, segment_bytes: int) -> list[LogProof]:
+    """Verify all stored segments of a robot; one result for each log."""
+    return [_prove_log(store, robot, log, segment_bytes) for log in store.logs(robot.name)]
 
 
-def _prove_log(
-    store: SegmentStore, robot: Robot, log: str, segment_bytes: int, progress: Callable[[int], None]
+def _prove_log(store: SegmentStore, robot: Robot, log: str, segment_bytes: int) -> LogProof:
+    """Prove a log; again, if segments were missing that retention has just removed. It writes its note before."""
+    for _attempt in range(_MOST_ATTEMPTS):
+        note, damage = _removal(store, robot, log)
+        proof = _proof_after(note, store, robot, log, segment_bytes)
+        if proof.ok or _removal(store, robot, log) == (note, damage):
+            break
+    if damage:
+        proof.findings.insert(0, damage)
+    return proof
+
+
+def _removal(store: SegmentStore, robot: Robot, log: str) -> tuple[RemovalNote | None, str]:
+    """Return the note of removed segments, if there is one, and its damage; empty for none."""
+    try:
+        return store.removal(robot.name, log), ""
+    except OSError as error:
+        return None, f"the note of removed segments is damaged: {error}"
+
+
+def _proof_after(
+    note: RemovalNote | None, store: SegmentStore, robot: Robot, log: str, segment_bytes: int
 ) -> LogProof:
     proof = LogProof(robot=robot.name, log=log)
     ends: dict[int, list[SegmentHeader]] = {}
     removed, first = 0, 1
-    try:
-        note = store.removal(robot.name, log)
-    except OSError as error:
-        proof.findings.append(f"the note of removed segments is damaged: {error}")
-        note = None
     if note is not None:
         _begin_after(note, proof)
         ends, first = {note.number: note.ends}, note.number + 1
@@ -89,7 +99,6 @@ def _prove_log(
         proof.records += header.end.sequence - header.start[0]
         proof.last = max(proof.last, header.end.sequence)
         removed = max(removed, header.end.removed or 0)
-        progress(proof.records)
     if proof.begins_after > removed:
         proof.missing += proof.begins_after
         proof.findings.insert(

@@ -42,6 +42,7 @@ _PAUSE_SECONDS = 5.0  # after a failure
 _DEAF_SECONDS = 60.0  # robots report every 30 s
 _CLOCK_SECONDS = 60.0  # by which the clocks of the operator and the collector may differ
 _MOST_COUNTED = 1_000_000_000
+_MOST_ATTEMPTS = 10  # to apply an operator's order to a rollout that ticks change at the same time
 _Stamp = tuple[tuple[str, int, int], ...]
 
 
@@ -87,6 +88,8 @@ class BundleService:
         self.robots: dict[RobotGroup, dict[str, RobotSeen]] = {}
         self.rollouts: dict[RobotGroup, StoredRollout] = {}
         self._stamp: _Stamp | None = None
+        self._ticking = asyncio.Lock()
+        self._arrived: dict[str, StoredReport] = {}  # stored since the last tick began to read them
         self.listeners: set[SelectionListener] = set()
         self.stopping = False
 
@@ -101,15 +104,20 @@ class BundleService:
             await asyncio.sleep(_TICK_SECONDS)
 
     async def tick(self) -> None:
-        """Read the publication and the database, sign a due timestamp, advance rollouts, wake robots."""
-        await self._publish()
-        members = await asyncio.to_thread(self._members)
-        reports = await asyncio.to_thread(self.store.reports)
-        self.robots = _by_group(members, reports)
-        self.rollouts = await asyncio.to_thread(self.store.latest)
-        await self._resume(reports)
-        await self._advance()
-        self._wake()
+        """Read the publication and the database, sign a due timestamp, advance rollouts, wake robots.
+
+        One tick at a time: the older of two would replace what the newer has read.
+        """
+        async with self._ticking:
+            await self._publish()
+            members = await asyncio.to_thread(self._members)
+            self._arrived.clear()
+            reports = await asyncio.to_thread(self.store.reports)
+            self.robots = _by_group(members, reports | self._arrived)
+            self.rollouts = await asyncio.to_thread(self.store.latest)
+            await self._resume(reports)
+            await self._advance()
+            self._wake()
 
     @property
     def advancing(self) -> bool:
@@ -130,6 +138,7 @@ class BundleService:
         """Store what a robot of a group reports about itself. Raises `RolloutRefusedError` for an invalid report."""
         seen = _checked(report, self._clock())
         await asyncio.to_thread(self.store.save_report, robot, group, seen)
+        self._arrived[robot] = StoredReport(group, seen)
         if robot in self.robots.get(group, {}):
             self.robots[group][robot] = seen
 
@@ -264,18 +273,26 @@ class BundleService:
     async def _change(
         self, group: RobotGroup, change: Callable[[BundleRollout], BundleRollout], number: int | None
     ) -> StoredRollout:
-        stored = (await asyncio.to_thread(self.store.latest)).get(group)
-        if stored is None:
-            raise RolloutRefusedError(f"there was no rollout of {group}")
-        changed = change(stored.rollout)
-        there = number in (None, stored.number)
-        if not there or (
-            changed != stored.rollout
-            and not await asyncio.to_thread(self.store.replace, group, stored, changed, self._clock())
-        ):
-            raise RolloutRefusedError("the rollout has changed in the meantime: look at it, and try again")
-        await self.tick()
-        return self.rollouts[group]
+        """Change the last rollout of a group, also if a tick changes it at the same time.
+
+        Raises `RolloutRefusedError`, also if an operator changes it at the same time.
+        """
+        acts: list[OperatorAct] | None = None
+        for _attempt in range(_MOST_ATTEMPTS):
+            stored = (await asyncio.to_thread(self.store.latest)).get(group)
+            if stored is None:
+                raise RolloutRefusedError(f"there was no rollout of {group}")
+            number = stored.number if number is None else number
+            acts = stored.rollout.acts if acts is None else acts
+            if (stored.number, stored.rollout.acts) != (number, acts):
+                break
+            changed = change(stored.rollout)
+            if changed == stored.rollout or await asyncio.to_thread(
+                self.store.replace, group, stored, changed, self._clock()
+            ):
+                await self.tick()
+                return self.rollouts[group]
+        raise RolloutRefusedError("the rollout has changed in the meantime: look at it, and try again")
 
     async def _publish(self) -> None:
         """Read the publication if it has changed, and sign a timestamp if one is due."""

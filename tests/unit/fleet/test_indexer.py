@@ -1,6 +1,8 @@
 """Tests of `rosrv_fleet.indexer`: a failure that is not the segment's fault sets no segment aside."""
 
 import errno
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -23,6 +25,20 @@ class _NoProcesses(Workers):
         raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
 
 
+class _Damage(Workers):
+    """Workers that find damage in the bytes of each segment; `before` is called while they work."""
+
+    def __init__(self, before: Callable[[], object]) -> None:
+        super().__init__(1)
+        self._before = before
+
+    def submit(self, *_work: Any, **_named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self._before()
+        future.set_exception(EOFError("the file ends too early"))
+        return future
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> SegmentStore:
     """Return a store with a segment of arm1 that waits for the index."""
@@ -32,9 +48,9 @@ def store(tmp_path: Path) -> SegmentStore:
     return store
 
 
-def _indexer(store: SegmentStore, data: Path) -> Indexer:
+def _indexer(store: SegmentStore, data: Path, workers: Workers | None = None) -> Indexer:
     config = FleetConfig(certificate=data, key=data)
-    return Indexer(store, Robots(data / "robots"), _NoProcesses(1), config)
+    return Indexer(store, Robots(data / "robots"), workers or _NoProcesses(1), config)
 
 
 def test_segments_wait_while_no_worker_can_be_started(store: SegmentStore, tmp_path: Path) -> None:
@@ -59,6 +75,23 @@ def test_segments_wait_while_the_file_of_their_robot_is_damaged(store: SegmentSt
         indexer.step("pending")
     assert store.marked("pending", "arm1", 9) == [_PLACE]
     assert store.marked("damaged", "arm1", 9) == []
+
+
+def test_a_segment_that_was_replaced_is_indexed_again(store: SegmentStore, tmp_path: Path) -> None:
+    """The damage of bytes that its robot has replaced since is not reported; that of the present ones is."""
+    enrolled_robots(tmp_path, "arm1")
+    file = store.path(_PLACE)
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"damaged")
+    whole = tmp_path / "whole"
+    whole.write_bytes(b"whole")
+    indexer = _indexer(store, tmp_path, _Damage(lambda: whole.exists() and whole.rename(file)))
+    assert indexer.step("pending")
+    assert store.marked("pending", "arm1", 9) == [_PLACE]
+    assert store.marked("damaged", "arm1", 9) == []
+    assert indexer.step("pending")
+    assert store.marked("pending", "arm1", 9) == []
+    assert store.marked("damaged", "arm1", 9) == [_PLACE]
 
 
 def test_a_segment_that_is_tried_again_stays_reported(store: SegmentStore, tmp_path: Path) -> None:

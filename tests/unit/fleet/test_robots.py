@@ -2,10 +2,12 @@
 
 import errno
 import json
+import os
 import ssl
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -16,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
 from rosrv_fleet.cli import app, robot_app, token_app
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots
+from rosrv_fleet.robots import EnrolmentError, Robot, RobotGroup, Robots
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
 
@@ -271,6 +273,31 @@ def test_an_unreadable_folder_is_not_an_empty_one(tmp_path: Path, monkeypatch: p
     make_unreadable(folder, monkeypatch)
     with pytest.raises(PermissionError):
         Robots(folder).all()
+
+
+def test_a_change_while_the_folder_is_read_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second change within the clock's step is noticed, also if the reading takes long."""
+    enrolled_robots(tmp_path, "arm1", "arm2")
+    folder, now = tmp_path / "robots", time.time_ns()
+    second = (folder / "arm2.json").rename(tmp_path / "arm2.json")
+    os.utime(folder, ns=(now, now))
+    read, clock = robots_module._read, [now]
+
+    def slow(file: Path, known: Robot | None) -> Robot:
+        found = read(file, known)
+        clock[0] += 5_000_000_000
+        if second.exists():
+            second.rename(folder / "arm2.json")
+            os.utime(folder, ns=(now, now))
+        return found
+
+    monkeypatch.setattr(robots_module, "_read", slow)
+    monkeypatch.setattr(time, "time_ns", lambda: clock[0])
+    robots = Robots(folder)
+    assert robots.known().keys() == {"arm1"}
+    assert robots.known().keys() == {"arm1", "arm2"}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,178 @@
+"""Tests of `rosrv_fleet.rollouts.service`: orders, reports and ticks at the same time. No threads, no database."""
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import pytest
+from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.rollouts.machine import Baseline, BundleRollout, HealthGates, OperatorAct, RobotSeen
+from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
+from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
+
+from appliance.bundles.poller import RobotReport
+from appliance.bundles.terms import Ring, Terms
+
+T = TypeVar("T")
+_GROUP = RobotGroup("site-a", "arms")
+_PATH = "site-a/arms/2.tar"
+_TAKEN = RobotReport("site-a", "arms", _PATH, "", "", "", changed=False, denials=0, failing=0, trouble="")
+_ROLLOUT = BundleRollout(
+    _PATH, "site-a/arms/1.tar", Terms(0, [Ring("canary", ["r-0"]), Ring("rest", [], 100)]), HealthGates(), 0.0,
+    ring=0, opened=1000.0, healthy=1000.0, baselines={"r-0": Baseline(0, 0)}, why="healthy",
+    acts=[OperatorAct(0.0, "olga", "start")],
+)  # fmt: skip
+
+
+class _Memory(RolloutStore):
+    """A store with one rollout, in memory. `meddle` is called before the rollout is replaced."""
+
+    def __init__(self) -> None:
+        super().__init__(IndexDatabase("", connections=1, statement_seconds=1.0))
+        self.stored = StoredRollout(1, _ROLLOUT)
+        self.seen = {"r-0": StoredReport(_GROUP, RobotSeen(1000.0, _PATH))}
+        self.meddle: Callable[[], None] = lambda: None
+
+    def change(self, **fields: Any) -> None:
+        """Change the rollout, as another collector does."""
+        self.stored = StoredRollout(1, msgspec.structs.replace(self.stored.rollout, **fields))
+
+    def latest(self) -> dict[RobotGroup, StoredRollout]:
+        return {_GROUP: self.stored}
+
+    def replace(self, _group: RobotGroup, before: StoredRollout, rollout: BundleRollout, _now: float) -> bool:
+        self.meddle()
+        if before != self.stored:
+            return False
+        self.stored = StoredRollout(1, rollout)
+        return True
+
+    def reports(self) -> dict[str, StoredReport]:
+        return dict(self.seen)
+
+    def save_report(self, name: str, group: RobotGroup, seen: RobotSeen) -> None:
+        self.seen[name] = StoredReport(group, seen)
+
+
+class _Calls:
+    """Runs calls at once instead of in a thread. The first call with the name `held` waits for `go`.
+
+    It waits before its work, or with `answered` after it.
+    """
+
+    def __init__(self, held: str = "", *, answered: bool = True) -> None:
+        self.held = held
+        self.answered = answered
+        self.began, self.go = asyncio.Event(), asyncio.Event()
+
+    async def __call__(self, work: Callable[..., T], *arguments: Any) -> T:
+        holds = getattr(work, "__name__", "") == self.held and not self.began.is_set()
+        if not holds:
+            await asyncio.sleep(0)
+            return work(*arguments)
+        self.began.set()
+        if self.answered:
+            result = work(*arguments)
+            await self.go.wait()
+            return result
+        await self.go.wait()
+        return work(*arguments)
+
+    async def during(self, tick: Coroutine[Any, Any, None], other: Coroutine[Any, Any, object]) -> None:
+        """Begin a tick, let `other` do all that it can while the call waits, and end both."""
+        ticking = asyncio.create_task(tick)
+        await self.began.wait()
+        beside = asyncio.create_task(other)
+        for _ in range(1000):
+            await asyncio.sleep(0)
+        self.go.set()
+        await asyncio.gather(ticking, beside)
+
+
+@pytest.fixture
+def store() -> _Memory:
+    """Return a store with a healthy rollout, whose first ring is open since 1000 s."""
+    return _Memory()
+
+
+def _service(store: _Memory, folder: Path, now: list[float]) -> BundleService:
+    return BundleService(folder / "absent", folder / "key", store, lambda: {"r-0": _GROUP}, lambda: now[0])
+
+
+def _run(monkeypatch: pytest.MonkeyPatch, calls: _Calls, work: Coroutine[Any, Any, T]) -> T:
+    monkeypatch.setattr(asyncio, "to_thread", calls)
+    return asyncio.run(work)
+
+
+@pytest.mark.parametrize("number", [None, 1])
+def test_a_tick_refuses_no_order(
+    number: int | None, store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If ticks change the reason or the health several times while an operator stops the rollout, it stops."""
+    changes = iter(({"why": "ring canary is open"}, {"healthy": None}, {"healthy": 1001.0}))
+    store.meddle = lambda: store.change(**next(changes, {}))
+    service = _service(store, tmp_path, [1010.0])
+    stopped = _run(monkeypatch, _Calls(), service.stop(_GROUP, "otto", number))
+    assert (stopped.rollout.state, stopped.rollout.why) == ("stopped", "stopped by otto")
+    assert [act.who for act in stopped.rollout.acts] == ["olga", "otto"]
+    assert store.stored == stopped
+
+
+def test_another_operator_refuses_an_order(
+    store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If another operator's order comes first, the later one is refused, and changes nothing."""
+    acts = [*_ROLLOUT.acts, OperatorAct(1005.0, "olga", "stop")]
+    store.meddle = lambda: store.change(state="stopped", acts=acts)
+    service = _service(store, tmp_path, [1010.0])
+    with pytest.raises(RolloutRefusedError, match="changed in the meantime"):
+        _run(monkeypatch, _Calls(), service.stop(_GROUP, "otto"))
+    assert store.stored.rollout.acts == acts
+
+
+def test_a_rollout_that_always_changes_ends_an_order(
+    store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An order that never succeeds is refused after several attempts."""
+    numbers = iter(range(1000))
+    store.meddle = lambda: store.change(healthy=float(next(numbers)))
+    service = _service(store, tmp_path, [1010.0])
+    with pytest.raises(RolloutRefusedError, match="changed in the meantime"):
+        _run(monkeypatch, _Calls(), service.stop(_GROUP, "otto"))
+    assert next(numbers) > 3
+
+
+def test_an_older_tick_undoes_no_order(
+    store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If a tick has read the rollout before a stop, robots still get the selection of the stopped rollout."""
+    service, calls = _service(store, tmp_path, [1010.0]), _Calls("latest")
+    _run(monkeypatch, calls, calls.during(service.tick(), service.stop(_GROUP, "otto")))
+    assert service.rollouts[_GROUP].rollout.state == "stopped"
+
+
+def test_a_tick_forgets_no_report(store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report that arrives after a tick has read the reports is not replaced by an older one."""
+    store.seen["r-0"] = StoredReport(_GROUP, RobotSeen(1000.0))
+    service, calls = _service(store, tmp_path, [1010.0]), _Calls("reports")
+    _run(monkeypatch, calls, calls.during(service.tick(), service.report("r-0", _GROUP, _TAKEN)))
+    assert service.robots[_GROUP]["r-0"] == RobotSeen(1010.0, _PATH)
+
+
+def test_an_absence_is_health_for_no_tick(
+    store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the first tick after an absence resumes the rollout, a second one opens no ring."""
+    now = [1000.0]
+    service, calls = _service(store, tmp_path, now), _Calls("replace", answered=False)
+
+    async def run() -> None:
+        await service.tick()
+        now[0] += 3600.0
+        await calls.during(service.tick(), service.tick())
+
+    _run(monkeypatch, calls, run())
+    assert (store.stored.rollout.ring, store.stored.rollout.healthy) == (0, 4600.0)

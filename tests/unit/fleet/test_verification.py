@@ -1,0 +1,102 @@
+"""Tests of `rosrv_fleet.verification`: a proof while segments are removed."""
+
+import asyncio
+import gzip
+import itertools
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from rosrv_fleet.robots import Robot
+from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
+from rosrv_fleet.verification import LogProof, prove
+
+from appliance.audit.segments import write_segment
+from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
+
+__all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures and their types
+
+_OLD = 1_500_000_000 * 10**9
+
+
+class _Store(SegmentStore):
+    """A store of which segments are removed while they are listed.
+
+    `remove` is called once, after a proof has the names of the files, or with `listed=False` before it has them.
+    """
+
+    remove: Callable[[], object] = staticmethod(bool)
+    listed = True
+
+    def segments(self, robot: str, log: str) -> Iterator[SegmentPlace]:
+        before = list(super().segments(robot, log))
+        remove, self.remove = self.remove, bool
+        remove()
+        yield from before if self.listed else super().segments(robot, log)
+
+
+@pytest.fixture
+def store(make_log: MakeLog, path: Path, tmp_path: Path) -> _Store:
+    """Return a store with an indexed log, of which all but the last segment are old."""
+    log, found = make_log(checkpoint_every=10), _Store(tmp_path / "data", 0)
+    for number in range(50):
+        log.record(decision(log, number))
+        if number % 10 == 9:
+            settle(log)
+    asyncio.run(asyncio.wait_for(log.wait_signed(), 60))
+    for number in itertools.count(1):
+        lines: list[bytes] = []
+        summary = write_segment(path, number, lines.append)
+        if summary is None:
+            break
+        upload = tmp_path / "upload"
+        upload.write_bytes(gzip.compress(b"".join(lines)))
+        place = found.keep("arm1", upload, summary, 1)
+        upload.unlink()
+        os.utime(found.path(place), (1e9, 1e9))
+        found.indexed(place)
+    assert len(_places(found)) > 3
+    return found
+
+
+def _places(store: SegmentStore) -> list[SegmentPlace]:
+    (log,) = store.logs("arm1")
+    return list(store.segments("arm1", log))
+
+
+def _proof(store: SegmentStore, key: Ed25519PrivateKey) -> LogProof:
+    robot = Robot(name="arm1", key=key.public_key().public_bytes_raw().hex(), certificate="", added=0)
+    (proof,) = prove(store, robot, 1 << 20)
+    return proof
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_retention_during_a_proof_loses_nothing(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
+    """Segments that retention removes while they are verified are neither damaged nor missing."""
+    (log,) = store.logs("arm1")
+    whole, number = _proof(store, key), len(_places(store))
+    assert (whole.findings, whole.segments) == ([], number)
+    store.remove = lambda: store.prune("arm1", log, _OLD, "retention.segment_days: 30")
+    store.listed = listed
+    proof = _proof(store, key)
+    assert (proof.findings, proof.segments, proof.last) == ([], 1, whole.last)
+    assert f"{number - 1} segments with 0 gaps" in proof.removal
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_removal_without_a_note_is_a_loss(listed: bool, store: _Store, key: Ed25519PrivateKey) -> None:
+    """A segment that something else removes while the log is verified is missing, also after retention."""
+    (log,) = store.logs("arm1")
+    places = _places(store)
+    os.utime(store.path(places[1]))
+    lost = store.header(places[2])
+    first, last = lost.start[0] + 1, lost.end.sequence
+    store.prune("arm1", log, _OLD, "retention.segment_days: 30")
+    store.remove = store.path(places[2]).unlink
+    store.listed = listed
+    proof = _proof(store, key)
+    assert (proof.segments, proof.missing) == (len(places) - 2, last - first + 1)
+    assert f"records {first} to {last} are missing" in proof.findings
