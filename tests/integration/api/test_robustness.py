@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.support.appliance import Appliance
+from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
 from tests.support.rest import Rest
 from tests.support.waiting import allowed, eventually
@@ -68,9 +69,7 @@ def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
         until_another(appliance, "api", pid)
     assert unchanged(appliance, control)
     assert process_row(appliance, "api")["restarts"] == api["restarts"] + 3
-    for _ in range(100):
-        if rest.get("/readyz").status == 200:
-            break
+    eventually(lambda: rest.get("/readyz").status == 200, appliance.story)
     assert rest.get("/v1/status").status == 200
 
 
@@ -90,7 +89,7 @@ def test_rest_outlives_control(appliance: Appliance) -> None:
     assert rest.get("/v1/status").status == 200
     api = appliance.pids("api")[0]
     appliance.kill("control")
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 2 * LIMIT
     while (answer := rest.get("/v1/status")).status != 200:
         assert answer.status in (503, 401)
         assert answer.headers["content-type"] == "application/problem+json"
@@ -132,7 +131,7 @@ def answers(rest: Rest) -> bool:
     """Whether REST accepts a connection and answers."""
     try:
         return rest.get("/healthz").status == 200
-    except ConnectionError:
+    except OSError:
         return False
 
 
@@ -174,7 +173,7 @@ def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:
         certificate.write_text("nonsense")
         appliance.start()
         assert appliance.process is not None
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 2 * LIMIT
         while not any("REST cannot be served" in line for line in list(appliance.process.errors)):
             assert time.monotonic() < deadline, appliance.story()
             assert seconds_of_a_call(appliance) < allowed(5)

@@ -23,9 +23,10 @@ VIEWS = [
 
 
 @pytest.fixture(autouse=True)
-def refused(attempt: Callable[..., Any]) -> None:
+def refused(appliance: Appliance, attempt: Callable[..., Any]) -> None:
     """Make records for the views to show."""
     attempt("registerPublisher", "/intruder", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
+    appliance.recorded("--deny", caller_id="/intruder")
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
@@ -56,7 +57,9 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
 
 def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> None:
     """No word touches its neighbour or the edge of the window, not even on a telephone."""
-    page = opened(width=390).go("now")
+    reader = opened(width=390)
+    page = reader.go("now")
+    reader.settle()
     words = """() => [...document.querySelectorAll(".nav a > span:not(.key, .count)")].map((word) => {
       const range = document.createRange();
       range.selectNodeContents(word);

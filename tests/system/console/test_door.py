@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
@@ -106,6 +106,65 @@ def test_an_unused_page_is_locked_and_loses_nothing(
     page.keyboard.press("Escape")
     expect(reader.editor()).to_contain_text("# not finished")
     expect(page.locator("[data-standing=live]")).to_be_visible()
+
+
+def test_a_stored_token_waits_for_the_appliance(appliance: Appliance, opened: Callable[..., Reader]) -> None:
+    """While the appliance starts or does not answer, a reloaded page says so, keeps the token and tries again."""
+    reader = opened()
+    failures: list[Callable[[Route], None]] = [
+        lambda route: route.fulfill(
+            status=503, content_type="application/problem+json", json={"detail": "the appliance is starting"}
+        ),
+        lambda route: route.abort(),
+    ]
+    page = reader.page
+
+    def answer(route: Route) -> None:
+        (failures.pop(0) if failures else Route.continue_)(route)
+
+    page.route("**/v1/whoami", answer)
+    page.goto(f"{reader.url}/console/audit")
+    waiting = page.get_by_role("region", name="Waiting")
+    expect(waiting.get_by_role("alert")).to_contain_text("the appliance is starting")
+    expect(waiting.get_by_role("status")).to_contain_text("tries again automatically")
+    expect(waiting.get_by_role("alert")).to_contain_text("The appliance does not answer")
+    expect(page.get_by_role("heading", level=1, name="Audit")).to_be_visible()
+    assert page.evaluate("sessionStorage.getItem('rosrv.token')") == appliance.ready["token"]
+
+
+def test_a_person_who_waits_can_sign_out(opened: Callable[..., Reader]) -> None:
+    """The page that waits is accessible; its button forgets the token and ends the wait."""
+    reader = opened()
+    page = reader.page
+    page.clock.install()
+    page.route("**/v1/whoami", lambda route: route.fulfill(status=503, json={"detail": "starting"}))
+    page.goto(f"{reader.url}/console/now")
+    expect(page.get_by_role("alert")).to_contain_text("starting")
+    assert reader.axe() == []
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Access token")).to_be_visible()
+    assert page.evaluate("sessionStorage.getItem('rosrv.token')") is None
+    page.unroute("**/v1/whoami")
+    before = len(reader.asked)
+    page.clock.fast_forward("01:00")
+    expect(page.get_by_label("Access token")).to_be_visible()
+    assert reader.asked[before:] == []
+
+
+def test_a_stored_token_that_was_revoked_is_not_tried_again(
+    browser: Browser, appliance: Appliance, token: Callable[..., str]
+) -> None:
+    """The sign-in page appears at once, with the reason."""
+    revoked = token("viewer", "gone")
+    appliance.rosrv("token", "revoke", "gone")
+    with Reader(browser, str(appliance.ready["api"]), revoked) as reader:
+        reader.page.clock.install()
+        reader.page.goto(reader.url)
+        ended = reader.page.get_by_role("status").filter(has_text="Signed out")
+        expect(ended).to_contain_text("wrong or revoked")
+        reader.page.clock.fast_forward("01:00")
+        expect(reader.page.get_by_label("Access token")).to_be_visible()
+        assert len([url for url in reader.asked if url.endswith("/v1/whoami")]) == 1
 
 
 def test_a_tab_reloaded_after_hours_asks_for_the_token(opened: Callable[..., Reader]) -> None:

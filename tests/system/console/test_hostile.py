@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import expect
 
+from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 
 MARKUP = '/<img src=x onerror="window.ran=1"><script>window.ran=1</script>'
@@ -16,12 +17,14 @@ LONG = "/" + "n" * 10_000
 
 
 @pytest.fixture(autouse=True)
-def sent(attempt: Callable[..., Any]) -> None:
-    """Try each hostile text as the name of a node and of a topic."""
+def sent(appliance: Appliance, attempt: Callable[..., Any]) -> None:
+    """Try each hostile text as the name of a node and of a topic; wait until all of it is recorded."""
     for name in (MARKUP, REORDERING, INVISIBLE, CONTROL, LONG):
         attempt("registerPublisher", name, "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
         attempt("registerPublisher", "/somebody", name, "std_msgs/String", "http://127.0.0.1:1/")
         attempt("getParam", name, name)
+    attempt("registerPublisher", "/afterwards", "/guarded", "std_msgs/String", "http://127.0.0.1:1/")
+    appliance.recorded("--deny", caller_id="/afterwards")
 
 
 @pytest.mark.parametrize("view", ["now", "graph", "audit", "audit?text=img", "audit?severity=warning"])

@@ -50,6 +50,7 @@ def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], 
     for view, heading in (("monitors", None), ("monitors/obstacleAvoidance", "obstacleAvoidance")):
         page = reader.go(view, heading=heading)
         expect(page.locator("td .given").first).to_be_visible()
+        reader.settle()
         broken = page.eval_on_selector_all(
             "td .given",
             """names => names.filter(name => new Set([...name.getClientRects()].map(one => one.bottom)).size

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from roswire.xmlrpc import build_call, parse_response
 from tests.support.appliance import Appliance
 from tests.support.robot import MACHINES, Robot
+from tests.support.waiting import eventually
 from tests.system.console.conftest import CONFIG, POLICY
 from tests.system.console.reader import Reader
 
@@ -290,6 +291,36 @@ def test_two_engineers_do_not_overwrite_each_other(
     page.get_by_role("button", name="Keep my text, show the difference").click()
     expect(page.locator(".diff-line.removed")).to_contain_text("# theirs")
     expect(page.locator(".diff-line.added")).to_contain_text("# mine")
+
+
+def test_a_late_dry_run_does_not_clear_the_error_of_a_load(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """A dry run that is answered after a rejected load changes nothing: the rejection stays in the dialog."""
+    reader = opened()
+    page = reader.go("policy")
+    rest = appliance.rest()
+    text = rest.get("/v1/policy").json["text"]
+    reader.write(text + "\n# slow\n")
+    expect(page.get_by_text("changed here, not loaded")).to_be_visible()
+    assert rest.post("/v1/policy", text + "\n# quick\n", match="*").status == 200
+    expect(page.get_by_text("came into force while you wrote")).to_be_visible()
+    held: list[Route] = []
+
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    page.route("**/v1/policy?dry_run=1", hold, times=1)
+    page.get_by_role("button", name="Load", exact=True).click()
+    eventually(lambda: page.evaluate("true") and held, "the dialog's dry run")
+    page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
+    rejected = page.get_by_role("dialog").get_by_text("Changed by someone else")
+    expect(rejected).to_be_visible()
+    with page.expect_response("**/v1/policy?dry_run=1"):
+        held[0].continue_()
+    page.evaluate("new Promise(requestAnimationFrame)")
+    page.evaluate("new Promise(requestAnimationFrame)")
+    expect(rejected).to_be_visible()
 
 
 def test_it_explains_and_leads_to_the_line(opened: Callable[..., Reader]) -> None:

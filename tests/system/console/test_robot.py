@@ -13,6 +13,7 @@ from tests.system.console.reader import Reader, wait_until
 
 WIDE, NARROW = (1280, 800), (390, 844)
 SMALLEST_NAME = 11  # pixels on the screen
+_Box = tuple[float, float, float, float]  # left, top, right, bottom
 _ALL_IN_FRAME = """() => {
   const frame = document.querySelector(".drawing").getBoundingClientRect();
   return [...document.querySelectorAll(".box .shape")].map((one) => one.getBoundingClientRect()).every((box) =>
@@ -58,7 +59,7 @@ def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[
     page = _graph(opened(width=size[0], height=size[1]))
     expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
     wait_until(page, _ALL_IN_FRAME)  # it is fitted once it is drawn
-    boxes = [_place(one) for one in page.locator(".box .shape").all()]
+    boxes = _boxes(page)
     assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
     assert _smallest_name(page) >= SMALLEST_NAME
     names = page.locator(".box.many .box-name").all_text_contents()
@@ -83,7 +84,7 @@ def test_a_group_opens_where_it_stands(opened: Callable[..., Reader]) -> None:
     after = _corners(page)
     assert {key: after[key] for key in before} == before
     assert at in after.values()
-    boxes = [_place(one) for one in page.locator(".box .shape").all()]
+    boxes = _boxes(page)
     assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
     page.get_by_role("button", name="Close groups").click()
     expect(page.locator(".box.many")).to_have_count(10)
@@ -160,13 +161,20 @@ def _corner(box: Locator) -> tuple[float, float]:
     return float(words[0]), float(words[1])
 
 
-def _place(shape: Locator) -> tuple[float, float, float, float]:
-    found = shape.bounding_box()
-    assert found is not None
-    return found["x"], found["y"], found["x"] + found["width"], found["y"] + found["height"]
+def _boxes(page: Page) -> list[_Box]:
+    """Return the places of all boxes at the same time: the drawing may move between two questions."""
+    boxes: list[_Box] = page.eval_on_selector_all(
+        ".box .shape",
+        """all => all.map(one => {
+             const { left, top, right, bottom } = one.getBoundingClientRect();
+             return [left, top, right, bottom];
+           })""",
+    )
+    assert boxes
+    return boxes
 
 
-def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+def _overlap(one: _Box, other: _Box) -> bool:
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 

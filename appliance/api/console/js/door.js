@@ -6,18 +6,43 @@ import { Given } from "./parts/given.js";
 import { Mark } from "./parts/icon.js";
 import { Failure, Notice } from "./parts/notice.js";
 import { Check, Field } from "./parts/field.js";
+import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
-import { open, session, stated, UNUSED } from "./session.js";
+import { end, kept, open, session, stated, UNUSED } from "./session.js";
 import { useStore } from "./store.js";
 
-/** Look up a token's holder and start the session. Throws `Problem`. @param {string} token @param {boolean} keep */
-export async function enter(token, keep) {
+const FIRST_PAUSE = 1000; // milliseconds
+const LONGEST_PAUSE = 10_000;
+
+/** Return the session of a token. Throws `Problem`. @param {string} token */
+async function sessionOf(token) {
   const { body } = await ask("GET", "/v1/whoami", { token });
-  open({ token, ...body }, keep);
+  return { token, ...body };
+}
+
+/**
+ * Sign in with the token of an earlier page of this tab. While the appliance cannot check it, try again with a growing
+ * pause, until the token is forgotten.
+ */
+export async function resume() {
+  session.update({ checking: true });
+  for (let pause = FIRST_PAUSE; session.get().checking; pause = Math.min(2 * pause, LONGEST_PAUSE)) {
+    const token = kept();
+    if (!token) return end(null);
+    try {
+      const found = await sessionOf(token);
+      if (session.get().checking) open(found, true);
+    } catch (/** @type {any} */ error) {
+      if (!session.get().checking) return;
+      if (!(error instanceof Problem && error.passing)) return session.update({ ended: error.message, checking: false, waiting: null });
+      session.update({ waiting: error });
+      await new Promise((resolve) => setTimeout(resolve, Math.max(pause, (error.retryAfter ?? 0) * 1000)));
+    }
+  }
 }
 
 export function Door() {
-  const { ended, checking, locked } = useStore(session);
+  const { ended, checking, waiting, locked } = useStore(session);
   const [token, setToken] = useState("");
   const [keep, setKeep] = useState(true);
   const [error, setError] = useState(/** @type {unknown} */ (null));
@@ -27,7 +52,7 @@ export function Door() {
     setBusy(true);
     setError(null);
     try {
-      await enter(token.trim(), keep);
+      open(await sessionOf(token.trim()), keep);
     } catch (failure) {
       setError(failure);
     } finally {
@@ -35,9 +60,10 @@ export function Door() {
     }
   };
   const notice = stated("notice");
+  if (waiting) return html`<${Waiting} error=${waiting} />`;
   if (checking) return html`<main class="door" id="main"><p class="muted" role="status">Checking the token.</p></main>`;
   return html`<main class="door" id="main"><div class="door-box">
-    <div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">ROSRV</h1><div class="brand-sub">Console of this appliance</div></div></div>
+    <${Brand} />
     <form class="panel" onSubmit=${submit}>
       ${notice && html`<div class="site-notice" role="note" aria-label="Site notice">${notice}</div>`}
       ${locked && !error && html`<${Notice} tone="warn" title="Locked" role="status">This page was not used for ${lasting(UNUSED / 1000)}. The work of <${Given} value=${locked.name} most=${40} /> is kept for that token; another token starts a new session.</${Notice}>`}
@@ -49,6 +75,22 @@ export function Door() {
       <button class="button primary" type="submit" disabled=${busy || !token.trim()}>${busy ? "Signing in" : "Sign in"}</button>
     </form>
   </div></main>`;
+}
+
+/** Shown while the appliance cannot check the token of an earlier page. @param {{error: Problem}} given */
+function Waiting({ error }) {
+  return html`<main class="door" id="main"><div class="door-box">
+    <${Brand} />
+    <section class="panel" aria-label="Waiting">
+      <${Failure} error=${error} />
+      <p role="status">The token is kept. The page tries again automatically.</p>
+      <button class="button" onClick=${() => end(null)}>Sign out</button>
+    </section>
+  </div></main>`;
+}
+
+function Brand() {
+  return html`<div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">ROSRV</h1><div class="brand-sub">Console of this appliance</div></div></div>`;
 }
 
 /** The sign-in page of a locked session, above everything else, including dialogs. */

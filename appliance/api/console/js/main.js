@@ -2,12 +2,8 @@
 
 import { App } from "./app.js";
 import { html, render } from "./html.js";
-import { enter } from "./door.js";
-import { kept, session } from "./session.js";
+import { resume } from "./door.js";
+import { kept } from "./session.js";
 
-const token = kept();
-if (token) {
-  session.update({ checking: true });
-  enter(token, true).catch((error) => session.update({ ended: error.message, checking: false }));
-}
+if (kept()) resume();
 render(html`<${App} />`, /** @type {Element} */ (document.getElementById("console")));

@@ -21,13 +21,15 @@ export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
  * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
- * `current` is null while signed out; `ended` is the reason why the last session ended. While the page is locked,
- * `locked` is the locked session. `number` counts sessions; unlocking does not start a new session.
+ * `current` is null while signed out; `ended` is the reason why the last session ended. `checking`: the token of an
+ * earlier page is being checked; `waiting` is the problem that delays the check. While the page is locked, `locked` is
+ * the locked session. `number` counts sessions; unlocking does not start a new session.
  */
 export const session = createStore({
   current: /** @type {Session | null} */ (null),
   ended: /** @type {string | null} */ (null),
   checking: false,
+  waiting: /** @type {Problem | null} */ (null),
   locked: /** @type {{name: string, role: string} | null} */ (null),
   number: 0,
 });
@@ -48,7 +50,7 @@ export function open(opened, keep) {
   if (locked && !same) end(null);
   if (keep) store(opened.token);
   const { number } = session.get();
-  session.set({ current: opened, ended: null, checking: false, locked: null, number: same ? number : number + 1 });
+  session.set({ current: opened, ended: null, checking: false, waiting: null, locked: null, number: same ? number : number + 1 });
   clearTimeout(ending);
   const left = opened.expires * 1000 - Date.now();
   if (left < LONGEST) ending = setTimeout(() => end("The token has expired. Create another: rosrv token add."), left);
@@ -61,7 +63,7 @@ export function end(why) {
   clearTimeout(ending);
   clearTimeout(locking);
   forget();
-  session.update({ current: null, ended: why, checking: false, locked: null });
+  session.update({ current: null, ended: why, checking: false, waiting: null, locked: null });
 }
 
 /** Lock the unused page: forget the token, but keep unsaved work. */

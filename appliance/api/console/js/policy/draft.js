@@ -65,21 +65,32 @@ export async function check(/** @type {AbortSignal} */ signal) {
   }
 }
 
-/** Compute the effect of the text with a dry run. Throws `Problem`. */
+let newest = 0; // number of the newest dry run or load: the result of an earlier one is ignored
+
+/**
+ * Compute the effect of the text with a dry run. Return false if its result is ignored, because a newer dry run or
+ * load has started or the text has changed. Throws `Problem`.
+ */
 export async function dryRun() {
   const { text, signature } = draft.get();
+  const number = ++newest;
+  const ignored = () => number !== newest || draft.get().text !== text || draft.get().signature !== signature;
   try {
     const { body } = await ask("POST", "/v1/policy", { query: { dry_run: 1 }, json: { text, signature } });
+    if (ignored()) return false;
     draft.update({ report: body, findings: body.warnings, errors: 0, error: null });
   } catch (error) {
+    if (ignored()) return false;
     refused(error);
     throw error;
   }
+  return true;
 }
 
 /** Bring the text into force. @param {string} note @param {number | null} within seconds to confirm */
 export async function load(note, within) {
   const { text, signature, etag } = draft.get();
+  newest += 1;
   try {
     const { body, etag: next } = await ask("POST", "/v1/policy", { query: { confirm_within: within }, json: { text, note, signature }, match: etag ?? "" });
     draft.update({ report: body, findings: body.warnings, errors: 0, base: text, etag: next, error: null, granted: false });

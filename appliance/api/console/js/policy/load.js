@@ -32,12 +32,12 @@ export function LoadDialog({ close }) {
   const within = chosen ?? preselected(report, granted);
   const [error, setError] = useState(/** @type {any} */ (null));
   useEffect(() => {
-    if (!report) dryRun().then(() => setError(null), setError);
+    if (!report) dryRun().then((shown) => shown && setError(null), setError);
   }, [text, signature]);
   const go = async () => {
     setError(null);
     try {
-      if (!report) await dryRun();
+      while (!draft.get().report) await dryRun(); // again if its result was ignored
       const seconds = chosen ?? preselected(draft.get().report, granted);
       const body = await load(note, seconds ? Number(seconds) : null);
       done(`Revision ${body.revision} is in force`, body.confirm_by ? "Confirm it before it rolls back." : `${body.revoked} registrations and connections were revoked.`);
