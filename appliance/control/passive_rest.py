@@ -30,12 +30,18 @@ class ReplicatedTokens:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._rows: dict[str, TokenRow] = {}
+        self._rows: dict[str, TokenRow] | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether the tokens could be read."""
+        return self._rows is not None
 
     def read(self) -> bool:
         """Read the tokens again; return whether they have changed."""
         with suppress(sqlite3.Error):  # no state yet
             with closing(sqlite3.connect(f"file:{self._path}?mode=ro", uri=True)) as connection:
+                connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time
                 keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
                 found = connection.execute("SELECT * FROM token").fetchall()
             rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
@@ -45,13 +51,13 @@ class ReplicatedTokens:
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
-        row = self._rows.get(token_id)
+        row = (self._rows or {}).get(token_id)
         return row if row is not None and row.usable(time.time()) else None
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens."""
         now = time.time()
-        return [kept_by_api(row) for row in self._rows.values() if row.usable(now)]
+        return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(now)]
 
 
 class PassiveRest:
@@ -66,10 +72,11 @@ class PassiveRest:
         self._serving: set[asyncio.Task[None]] = set()
 
     def attach(self, channel: Channel) -> None:
-        """Serve a new api process."""
+        """Serve a new api process. Until the tokens can be read, it answers 503: the appliance is starting."""
         self._link.attach(channel)
-        self._tokens.read()  # with an empty list, the api would tell users that their tokens are revoked
-        self._state_tokens()
+        self._tokens.read()
+        if self._tokens.known:  # with an empty list, the api would tell users that their tokens are revoked
+            self._state_tokens()
 
     def release(self) -> Channel | None:
         """Stop serving; return the channel to the api for the active control."""

@@ -2,7 +2,9 @@
 
 import asyncio
 import socket
+import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,12 @@ from appliance.channel import admin
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink, RequestAnswered, RequestMade, TokensStated
+from appliance.control import passive_rest
 from appliance.control.lease_client import HandOverError
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.control.standby_orders import StandbyAdministration
-from appliance.store.access_tokens import make_token
+from appliance.signing.request_signing import TokenKeys
+from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 
@@ -34,18 +38,26 @@ class Standby:
         raise HandOverError("not now")
 
 
-async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
-    """Its first message has every replicated token: with an empty list, users would be signed out.
+def made(name: str) -> tuple[TokenRow, str]:
+    """Return a token, and its text."""
+    return make_token(name, "viewer", now=time.time(), seconds=60)
 
-    A request with such a token gets the active appliance's address.
-    """
-    row, token = make_token("alice", "viewer", now=time.time(), seconds=60)
-    store = StateStore(tmp_path, failed=pytest.fail)
-    store.save_tokens(row)
+
+def save(folder: Path, *rows: TokenRow) -> None:
+    """Store tokens, as replication does."""
+    store = StateStore(folder, failed=pytest.fail)
+    store.save_tokens(*rows)
     store.close()
-    rest = PassiveRest(
-        StandbyAdministration(Standby(), orders=False), ReplicatedTokens(tmp_path / "state.db")
-    )
+
+
+def rest_of(folder: Path) -> PassiveRest:
+    """Return the link to the api of a standby whose state is in this folder."""
+    tokens = ReplicatedTokens(folder / "state.db")
+    return PassiveRest(StandbyAdministration(Standby(), orders=False), tokens)
+
+
+def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
+    """Attach a new api; return its end of the channel, and the messages that it receives."""
     ours, theirs = socket.socketpair()
     heard: asyncio.Queue[Any] = asyncio.Queue()
     api = Channel(theirs, ApiLink)
@@ -53,6 +65,18 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
         asyncio.get_running_loop(), lambda message, _descriptors: heard.put_nowait(message), lambda: None
     )
     rest.attach(Channel(ours, ApiLink))
+    return api, heard
+
+
+async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
+    """Its first message has every replicated token: with an empty list, users would be signed out.
+
+    A request with such a token gets the active appliance's address.
+    """
+    row, token = made("alice")
+    save(tmp_path, row)
+    rest = rest_of(tmp_path)
+    api, heard = attached(rest)
     async with asyncio.timeout(20):
         first = await heard.get()
         assert isinstance(first, TokensStated)
@@ -62,3 +86,50 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
     assert isinstance(answer, RequestAnswered)
     assert admin.decode(answer.answer, admin.StatusWanted()).active == "10.0.0.1"
     api.close()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+async def test_no_tokens_are_stated_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """Without a state file the api receives no list, so it answers 503; once there is a list, also an empty one, it
+    receives it.
+    """
+    monkeypatch.setattr("appliance.control.passive_rest._READ_SECONDS", 0.01)
+    rest = rest_of(tmp_path)
+    api, heard = attached(rest)
+    async with asyncio.timeout(20):
+        api.send(RequestMade(7, admin.StatusWanted(), ""))
+        first = await heard.get()
+        assert isinstance(first, RequestAnswered), "the list would have come before the answer"
+        save(tmp_path, *(made("alice")[0] for _ in range(count)))
+        reading = asyncio.create_task(rest.run())
+        stated = await heard.get()
+        reading.cancel()
+    assert isinstance(stated, TokensStated)
+    assert len(stated.tokens) == count
+    api.close()
+
+
+def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A token that is made while the tokens are read is in the next list, with its keys."""
+    first, second = made("alice")[0], made("bob")[0]
+    save(tmp_path, first)
+    tokens = ReplicatedTokens(tmp_path / "state.db")
+    later = iter([second])
+
+    def keys(*columns: bytes) -> TokenKeys:
+        for row in later:
+            with closing(sqlite3.connect(tmp_path / "state.db")) as database, database:
+                assert row.keys
+                database.execute("INSERT INTO token_keys VALUES (?, ?, ?)", (row.id, *row.keys))
+                database.execute("INSERT INTO token VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row[:-1])
+        return TokenKeys(*columns)
+
+    monkeypatch.setattr(passive_rest, "TokenKeys", keys)
+    seen = []
+    for _ in range(2):
+        assert tokens.read()
+        seen.append(sorted(one.name for one in tokens.usable()))
+        assert all(row.keys for row in map(tokens.usable_row, (first.id, second.id)) if row)
+    assert seen == [["alice"], ["alice", "bob"]]
