@@ -138,12 +138,17 @@ def test_bad_bundles_are_refused_with_the_reason(site: tuple[BundleSite, str], a
 def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]) -> None:
     """A bundle under which denials multiply is rolled back at once, with its specifications and its hosts."""
     served, url = site
+    served.selection = ""  # an earlier bundle would be tried for as long
     with robot(served, url, confirm_seconds=120) as appliance:
         hosts = "hosts: [{name: ocu-9}]\n"
         files = bundle_files(CLOSED_POLICY, hosts_dot_yaml=hosts, monitors__quiet_dot_rv=MONITOR)
         path = served.add(files)
         eventually(lambda: bundles_of(appliance)["trying"] == str(path), appliance.story)
         eventually(lambda: appliance.status()["monitors"]["loaded"] == 1, appliance.story)
+        eventually(
+            lambda: "Publishers" not in appliance.rosrv("policy", "show").stdout,
+            "the bundle's policy is in force",
+        )
         with master_at(appliance.master_uri) as master:
             for number in range(30):
                 master.setParam("/worker", f"/value{number}", number)

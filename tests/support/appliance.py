@@ -38,7 +38,7 @@ default = *
 """
 
 _FLAGS = {"event": "--event", "host": "--host"}
-"""Of fields whose values are not globs: the search by them is quicker than reading every record."""
+"""Flags of the search for fields whose values are not globs: it is quicker than reading every record."""
 
 
 class Appliance:

@@ -97,7 +97,7 @@ class RolloutCollector:
             app.include_router(operator_routes(self.service, _operator, _operator))
             config = uvicorn.Config(
                 app, host="127.0.0.1", port=0, http=_Protocol, log_level="warning", lifespan="off", backlog=2048,
-                timeout_graceful_shutdown=1,
+                timeout_graceful_shutdown=1, timeout_keep_alive=90,
             )  # fmt: skip
             config.load()
             config.ssl = self._authority.server_context

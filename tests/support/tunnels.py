@@ -115,6 +115,7 @@ class JoinedHost:
                 "CHILD_SA ros" in str(event.get("text")) and "established" in str(event.get("text"))
             ),
             since=since,
+            timeout=2 * LIMIT,
         )
 
     def wait_until_replaced(self) -> None:

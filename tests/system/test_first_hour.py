@@ -13,7 +13,7 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV
 from tests.support.own_namespace import own_namespace
-from tests.support.processes import Process
+from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_root
 
 PAGE = Path(__file__).parents[2] / "docs" / "first-hour.md"
@@ -87,7 +87,7 @@ def test_the_page_is_true(hosts: dict[str, Host], folder: Path) -> None:
                 assert (code != 0) == (step.how == "fails"), process.story()
                 process.stop()
             for line in shown:
-                process.wait_for_text(line)
+                process.wait_for_text(line, timeout=2 * LIMIT)
     finally:
         for process in reversed(staying):
             os.killpg(process.pid, signal.SIGTERM)

@@ -11,6 +11,7 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
+from tests.support.processes import LIMIT
 from tests.support.requirements import need_root
 
 
@@ -22,10 +23,10 @@ def lab() -> Iterator[Lab]:
         yield lab
 
 
-def status(certificate: str, address: str, port: int) -> str:
+def status(certificate: str, address: str, port: int, timeout: float = LIMIT) -> str:
     """Return the status of `GET /healthz` at an address, over TLS with only this certificate trusted."""
     connection = http.client.HTTPSConnection(
-        address, port, timeout=5, context=ssl.create_default_context(cadata=certificate)
+        address, port, timeout=timeout, context=ssl.create_default_context(cadata=certificate)
     )
     try:
         connection.request("GET", "/healthz")
@@ -38,7 +39,7 @@ def status(certificate: str, address: str, port: int) -> str:
 
 def certificate_of(appliance: Appliance, host: Host, port: int) -> str:
     """Return the served certificate, once it is there."""
-    return host.run(partial(ssl.get_server_certificate, ("127.0.0.1", port), timeout=30))
+    return host.run(partial(ssl.get_server_certificate, ("127.0.0.1", port), timeout=LIMIT))
 
 
 def test_only_configured_networks_reach_it(lab: Lab, tmp_path: Path) -> None:
@@ -65,7 +66,7 @@ def test_a_given_address_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None
     options = ("--config", str(config), "--api", "10.82.0.2:8443")
     with Appliance(machine, isolation="container", options=options) as appliance:
         assert appliance.ready["api"] == "https://10.82.0.2:8443"
-        served = manager.run(partial(ssl.get_server_certificate, ("10.82.0.2", 8443), timeout=30))
+        served = manager.run(partial(ssl.get_server_certificate, ("10.82.0.2", 8443), timeout=LIMIT))
         assert manager.run(partial(status, served, "10.82.0.2", 8443)) == "200"
 
 
@@ -76,7 +77,7 @@ def test_in_a_namespace_of_its_own_the_machine_reaches_it(lab: Lab, tmp_path: Pa
         assert appliance.ready["api"] == "https://127.0.0.1:8443"
         certificate = certificate_of(appliance, machine, 8443)
         assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
-        assert unknown.run(partial(status, certificate, "10.82.0.2", 8443)) in (
+        assert unknown.run(partial(status, certificate, "10.82.0.2", 8443, timeout=5)) in (
             "ConnectionRefusedError", "TimeoutError",
         )  # fmt: skip
 

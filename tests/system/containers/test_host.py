@@ -10,6 +10,7 @@ from appliance.network.scan import scan
 from tests.support.docker import Compose, MachineInside, project
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
+from tests.support.waiting import eventually
 from tests.system.containers.conftest import Site
 
 pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
@@ -44,12 +45,10 @@ def test_nodes_of_the_machine_work_and_its_ports_are_closed(
         listener = ros.listener("rospy", "/chatter", name="listener")
         ros.talker("roscpp", "/chatter", name="talker")
         listener.wait_for(event="received")
-        hosts = {
-            record["host"]
-            for record in beside.audit("--event", "registered")
-            if record["caller_id"] == "/talker"
-        }
-        assert hosts == {MACHINE}
+        registered = eventually(
+            lambda: beside.audit("--event", "registered", caller_id="/talker"), beside.story
+        )
+        assert {record["host"] for record in registered} == {MACHINE}
 
         def open_ports() -> tuple[int, ...]:
             return site.laptop.run(lambda: scan("10.79.0.1", LOCAL_PORTS, seconds=2.0)).open

@@ -9,6 +9,7 @@ import pytest
 from tests.support.docker import Compose
 from tests.support.nodes import RosSession
 from tests.support.tunnels import JoinedHost, need_strongswan
+from tests.support.waiting import eventually
 from tests.system.containers.conftest import Site, without
 
 pytestmark = pytest.mark.timeout(1500)  # for the first test: the images are built
@@ -63,8 +64,10 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
             listener = ros.listener("rospy", "/chatter", name="listener")
             talker = ros.talker("rospy", "/chatter", name="talker")
             listener.wait_for(event="received")
-            hosts = {record["host"] for record in alone.audit("--event", "registered", "--caller", "/talker")}
-            assert hosts == {laptop.address}
+            registered = eventually(
+                lambda: alone.audit("--event", "registered", "--caller", "/talker"), alone.story
+            )
+            assert {record["host"] for record in registered} == {laptop.address}
             nowhere_to_write = alone.exec("appliance", "rosrv", "host", "kit", "laptop", check=False)
             assert nowhere_to_write.returncode == 2
             assert (
@@ -74,7 +77,7 @@ def test_a_laptop_joins_publishes_and_is_revoked(site: Site, alone: Compose, tmp
             assert not alone.audit("--event", "host renewed"), "its certificate and its tunnel were kept"
             assert "up" in alone.exec("appliance", "rosrv", "host", "list").stdout
             alone.exec("appliance", "rosrv", "host", "revoke", "laptop")
-            assert alone.audit("--event", "host revoked")
+            eventually(lambda: alone.audit("--event", "host revoked"), alone.story)
             assert "revoked" in alone.exec("appliance", "rosrv", "host", "list").stdout
             cut = listener.mark()
             with pytest.raises(AssertionError, match="5 s passed"):

@@ -27,7 +27,7 @@ from appliance.forwarding.segment_pusher import SegmentPusher
 from tests.support.audit import decision, settle
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.sources import ROOT
-from tests.support.waiting import eventually
+from tests.support.waiting import NoAnswerError, eventually
 
 
 @dataclass
@@ -120,11 +120,17 @@ class FleetSite:
             context.load_cert_chain(robot.certificate, robot.key)
         return httpx.Client(base_url=f"https://127.0.0.1:{self.port}", verify=context, timeout=60)
 
+    def answer(self, path: str, **parameters: Any) -> dict[str, Any]:
+        """Return an answer. Raises `NoAnswerError` if the collector asks to come back later."""
+        found = self.get(path, **parameters)
+        if found.status_code in (429, 503):
+            raise NoAnswerError(found.text)
+        assert found.status_code == 200, found.text
+        return dict(found.json())
+
     def search(self, **words: Any) -> list[dict[str, Any]]:
         """Return the records of a search."""
-        answer = self.get("/v1/search", **words)
-        assert answer.status_code == 200, answer.text
-        records: list[dict[str, Any]] = answer.json()["records"]
+        records: list[dict[str, Any]] = self.answer("/v1/search", **words)["records"]
         return records
 
     def all(self, **words: Any) -> list[dict[str, Any]]:
@@ -132,7 +138,7 @@ class FleetSite:
         found: list[dict[str, Any]] = []
         more: dict[str, str] = {}
         while True:
-            page = self.get("/v1/search", limit=1000, **words, **more).json()
+            page = self.answer("/v1/search", limit=1000, **words, **more)
             found += page["records"]
             if page["cursor"] is None:
                 return found
@@ -145,9 +151,7 @@ class FleetSite:
 
     def health(self) -> dict[str, Any]:
         """Return the health."""
-        answer = self.get("/v1/health")
-        assert answer.status_code == 200, answer.text
-        return dict(answer.json())
+        return self.answer("/v1/health")
 
     def indexed(self) -> None:
         """Wait until every stored segment is indexed."""

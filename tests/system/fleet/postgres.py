@@ -91,6 +91,7 @@ class PostgresCluster:
             # Its processes have groups of their own; one that outlived the server would keep it from starting again.
             server = self._process.pid
             self._process.send_signal(signal.SIGSTOP)
+            eventually(lambda: _is_stopped(server), "PostgreSQL starts no more processes")
             children = Path(f"/proc/{server}/task/{server}/children").read_text().split()
             for child in map(int, children):
                 with contextlib.suppress(ProcessLookupError):
@@ -106,6 +107,11 @@ class PostgresCluster:
         with psycopg.connect(self.database("postgres"), autocommit=True) as connection:
             connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(name)))
         return self.database(name)
+
+
+def _is_stopped(pid: int) -> bool:
+    """Whether a process is stopped, or has ended."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in ("T", "Z")
 
 
 @contextmanager

@@ -72,7 +72,7 @@ def test_an_appliance_pushes_its_log(site: FleetSite) -> None:
         certificate = str(appliance.directory / "fleet" / "peer.pem")
         site.run("robot", "add", "arm1", "--key", key, "--certificate", certificate)
         eventually(lambda: not collector_state(appliance)["trouble"], "segments are pushed")
-        (pid,) = appliance.pids("fleet")
+        (pid,) = eventually(lambda: appliance.pids("fleet"), appliance.story)
         owner = Path(f"/proc/{pid}").stat()
         assert (owner.st_uid, owner.st_gid) == PUSHER
         os.kill(pid, 9)

@@ -9,7 +9,6 @@ import ssl
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -183,10 +182,16 @@ def test_a_client_with_another_history_continues_from_the_common_part(
 
 @pytest.fixture
 def strict(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Return a collector with small limits."""
-    limits: dict[str, Any] = {
-        "segment_bytes": 200_000, "upload_bytes": 50_000, "upload_seconds": 1.0, "header_seconds": 1.0,
-    }  # fmt: skip
+    """Return a collector with small limits of size."""
+    limits = {"segment_bytes": 200_000, "upload_bytes": 50_000}
+    with running(FleetSite(tmp_path / "site", database, limits)) as found:
+        yield found
+
+
+@pytest.fixture
+def hasty(database: str, tmp_path: Path) -> Iterator[FleetSite]:
+    """Return a collector with short limits of time, which suffice for honest clients."""
+    limits = {"upload_seconds": 10.0, "header_seconds": 10.0}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
 
@@ -211,15 +216,15 @@ def test_a_huge_segment_is_refused(strict: FleetSite) -> None:
     robot.close()
 
 
-def test_a_slow_robot_is_cut_off(strict: FleetSite) -> None:
+def test_a_slow_robot_is_cut_off(hasty: FleetSite) -> None:
     """An upload that takes too long is ended, and so is a connection without a request; other robots go on."""
-    slow, other = FleetRobot(strict, "slow"), FleetRobot(strict, "other")
+    slow, other = FleetRobot(hasty, "slow"), FleetRobot(hasty, "other")
     other.record(5)
-    context = ssl.create_default_context(cafile=strict.server.ca)
+    context = ssl.create_default_context(cafile=hasty.server.ca)
     context.load_cert_chain(slow.certificates.certificate, slow.certificates.key)
 
     def connect() -> ssl.SSLSocket:
-        plain = socket.create_connection(("127.0.0.1", strict.port), 30)
+        plain = socket.create_connection(("127.0.0.1", hasty.port), 30)
         return context.wrap_socket(plain, server_hostname="127.0.0.1")
 
     with connect() as silent, connect() as half, connect() as slowly:

@@ -1,5 +1,6 @@
 """Compromised robots, clients and viewers take only their own part of the collector, which still serves others."""
 
+import contextlib
 import gzip
 import os
 import secrets
@@ -55,11 +56,14 @@ def _push_again_and_again(
 def _attack(site: FleetSite, attackers: list[FleetRobot], *, valid: bool) -> Iterator[None]:
     """Let robots push large segments, valid or with a wrong last line, during a block."""
     ended, log = threading.Event(), secrets.token_hex(16)
+    made = [(robot, *forged(robot, _RECORDS, log=log)) for robot in attackers]
+    pushed = [
+        (robot, summary, gzip.compress(body if valid else body[:-2] + b" \n", 1))
+        for robot, summary, body in made
+    ]
     with ThreadPoolExecutor(len(attackers)) as pool:
-        for robot in attackers:
-            summary, body = forged(robot, _RECORDS, log=log)
-            packed = gzip.compress(body if valid else body[:-2] + b" \n", 1)
-            pool.submit(_push_again_and_again, site, robot, summary, packed, ended)
+        for attacker, summary, packed in pushed:
+            pool.submit(_push_again_and_again, site, attacker, summary, packed, ended)
         try:
             assert site.data is not None
             incoming = site.data / "incoming"
@@ -136,8 +140,9 @@ def test_workers_end_with_the_collector(site: FleetSite, make_robot: MakeRobot) 
 def _descendants(process: int) -> list[int]:
     found = []
     for task in Path(f"/proc/{process}/task").iterdir():
-        for child in map(int, (task / "children").read_text().split()):
-            found += [child, *_descendants(child)]
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # the thread has ended
+            for child in map(int, (task / "children").read_text().split()):
+                found += [child, *_descendants(child)]
     return found
 
 

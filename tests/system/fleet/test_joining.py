@@ -113,7 +113,8 @@ def test_a_robot_joins_and_pushes(inviting: FleetSite, make_robot: MakeRobot, tm
     if os.geteuid() == 0:
         assert (found.st_uid, found.st_gid) == (61023, 61022)
     assert inviting.data is not None
-    inviting.indexed()  # then no file comes or goes
+    inviting.indexed()
+    inviting.stop()  # then no file comes or goes
     kept = b"".join(one.read_bytes() for one in inviting.data.rglob("*") if one.is_file())
     assert b"arm7" in kept
     assert key.read_text().splitlines()[1].encode() not in kept

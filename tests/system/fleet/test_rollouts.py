@@ -23,8 +23,9 @@ from appliance.bundles.terms import BundlePath, Ring
 from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from appliance.collector.connection import robot_context
 from tests.support.bundle_site import GROUP, SITE, BundleSite, bundle_files, everywhere
+from tests.support.processes import LIMIT
 from tests.support.rollout_collector import RolloutCollector, collector, serving
-from tests.support.waiting import eventually
+from tests.support.waiting import NoAnswerError, eventually
 from tests.system.fleet.postgres import PostgresCluster
 
 QUICK = {"healthy_seconds": 0, "share": 0.9}
@@ -117,8 +118,12 @@ class Fleet:
         return dict(answer.json())
 
     def state(self) -> dict[str, Any]:
-        """Return the rollout of the group."""
-        return dict(self.operator.get(f"/v1/rollouts/{SITE}/{GROUP}").json()["rollout"])
+        """Return the rollout of the group. Raises `NoAnswerError` while there is none."""
+        answer = self.operator.get(f"/v1/rollouts/{SITE}/{GROUP}")
+        found = answer.json()["rollout"] if answer.status_code == 200 else None
+        if found is None:
+            raise NoAnswerError(answer.text)
+        return dict(found)
 
     def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Let all robots poll until the rollout is as wanted."""
@@ -128,7 +133,7 @@ class Fleet:
             state = self.state()
             return state if wanted(state) else None
 
-        return eventually(found, lambda: json.dumps(self.state()))
+        return eventually(found, lambda: json.dumps(self.state()), 6 * LIMIT)
 
 
 def _nameless(fleet: Fleet) -> httpx.Client:

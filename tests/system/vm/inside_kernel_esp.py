@@ -71,7 +71,7 @@ def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHos
     """
     with site.talking(joined, rate=20) as (_talker, listener):
         listener.wait_for_count(20, event="received", timeout=LONG)
-    registered = site.trail.seen(event="registered", caller_id="/boss")[0]
+    registered = site.trail.wait_for(event="registered", caller_id="/boss", timeout=LONG)
     assert registered["host"] == joined.address
     used = re.findall(r"(\d+)\(bytes\)", told(middle(site), "ip", "-s", "xfrm", "state"))
     assert max(map(int, used)) > 1000, used
