@@ -11,7 +11,7 @@ PYTEST := $(BIN)/pytest
 CHECKED := appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
 # Rules on the source run with `make check`, however long they take.
-LONG_UNIT := $(filter-out tests/unit/test_%,$(shell grep '^tests/unit\|^rosmop' tests/long.txt))
+LONG_UNIT := $(filter-out tests/unit/test_% tests/unit/support/%,$(shell grep '^tests/unit\|^rosmop' tests/long.txt))
 # What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own. A
 # cluster of Ray needs processors: its tests run here, where only containers run in parallel.
 CONTAINERS := tests/system/containers
