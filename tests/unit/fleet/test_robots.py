@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
 from rosrv_fleet.cli import app, robot_app, token_app
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.robots import EnrolmentError, Robot, RobotGroup, Robots
+from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
 
@@ -283,17 +283,16 @@ def test_a_change_while_the_folder_is_read_is_noticed(
     folder, now = tmp_path / "robots", time.time_ns()
     second = (folder / "arm2.json").rename(tmp_path / "arm2.json")
     os.utime(folder, ns=(now, now))
-    read, clock = robots_module._read, [now]
+    iterdir, clock = Path.iterdir, [now]
 
-    def slow(file: Path, known: Robot | None) -> Robot:
-        found = read(file, known)
+    def slow(listed: Path) -> Iterator[Path]:
+        yield from list(iterdir(listed))
         clock[0] += 5_000_000_000
         if second.exists():
             second.rename(folder / "arm2.json")
             os.utime(folder, ns=(now, now))
-        return found
 
-    monkeypatch.setattr(robots_module, "_read", slow)
+    monkeypatch.setattr(Path, "iterdir", slow)
     monkeypatch.setattr(time, "time_ns", lambda: clock[0])
     robots = Robots(folder)
     assert robots.known().keys() == {"arm1"}
