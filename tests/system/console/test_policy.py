@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Route, expect
+from playwright.sync_api import Page, Route, expect
 
 from roswire.xmlrpc import build_call, parse_response
 from tests.support.appliance import Appliance
@@ -271,11 +271,8 @@ def test_a_policy_that_ends_connections_rolls_back_unless_confirmed(
     expect(page.get_by_text(re.compile("rolls back in .* unless confirmed"))).to_have_count(0)
 
 
-def test_two_engineers_do_not_overwrite_each_other(
-    appliance: Appliance, opened: Callable[..., Reader]
-) -> None:
-    """A text based on an older revision is rejected with the reason; the author can then load it over the new one."""
-    reader = opened()
+def page_with_an_outdated_draft(appliance: Appliance, reader: Reader) -> Page:
+    """Return the page of a policy with `# mine`, while another engineer has loaded one with `# theirs`."""
     page = reader.go("policy")
     rest = appliance.rest()
     text = rest.get("/v1/policy").json["text"]
@@ -283,10 +280,18 @@ def test_two_engineers_do_not_overwrite_each_other(
     expect(page.get_by_text("changed here, not loaded")).to_be_visible()
     assert rest.post("/v1/policy", text + "\n# theirs\n", match="*").status == 200
     expect(page.get_by_text("came into force while you wrote")).to_be_visible()
+    return page
+
+
+def test_two_engineers_do_not_overwrite_each_other(
+    appliance: Appliance, opened: Callable[..., Reader]
+) -> None:
+    """A text based on an older revision is rejected with the reason; the author can then load it over the new one."""
+    page = page_with_an_outdated_draft(appliance, opened())
     page.get_by_role("button", name="Load", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Load the policy").click()
     expect(page.get_by_role("dialog").get_by_text("Changed by someone else")).to_be_visible()
-    assert "# theirs" in rest.get("/v1/policy").json["text"]
+    assert "# theirs" in appliance.rest().get("/v1/policy").json["text"]
     page.get_by_role("dialog").get_by_role("button", name="Not yet").click()
     page.get_by_role("button", name="Keep my text, show the difference").click()
     expect(page.locator(".diff-line.removed")).to_contain_text("# theirs")
@@ -297,14 +302,7 @@ def test_a_late_dry_run_does_not_clear_the_error_of_a_load(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:
     """A dry run that is answered after a rejected load changes nothing: the rejection stays in the dialog."""
-    reader = opened()
-    page = reader.go("policy")
-    rest = appliance.rest()
-    text = rest.get("/v1/policy").json["text"]
-    reader.write(text + "\n# slow\n")
-    expect(page.get_by_text("changed here, not loaded")).to_be_visible()
-    assert rest.post("/v1/policy", text + "\n# quick\n", match="*").status == 200
-    expect(page.get_by_text("came into force while you wrote")).to_be_visible()
+    page = page_with_an_outdated_draft(appliance, opened())
     held: list[Route] = []
 
     def hold(route: Route) -> None:

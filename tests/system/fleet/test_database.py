@@ -26,17 +26,14 @@ def test_a_failed_migration_changes_nothing(database: str, tmp_path: Path) -> No
 
 def test_a_reading_transaction_is_limited_and_cannot_write(database: str) -> None:
     """A search that takes too long is cancelled, and its transaction writes nothing."""
-    index = IndexDatabase(database, connections=1, statement_seconds=0.2)
-    index.open()
-    try:
-        with pytest.raises(psycopg.errors.QueryCanceled), index.reading() as connection:
-            connection.execute("SELECT pg_sleep(60)")
-    finally:
-        index.close()
-    slow = IndexDatabase(database, connections=1, statement_seconds=30.0)
-    slow.open()
-    try:
-        with pytest.raises(psycopg.errors.ReadOnlySqlTransaction), slow.reading() as connection:
-            connection.execute("CREATE TABLE t (x int)")
-    finally:
-        slow.close()
+    for seconds, statement, error in (
+        (0.2, "SELECT pg_sleep(60)", psycopg.errors.QueryCanceled),
+        (30.0, "CREATE TABLE t (x int)", psycopg.errors.ReadOnlySqlTransaction),
+    ):
+        index = IndexDatabase(database, connections=1, statement_seconds=seconds)
+        index.open()
+        try:
+            with pytest.raises(error), index.reading() as connection:
+                connection.execute(statement)
+        finally:
+            index.close()

@@ -118,7 +118,7 @@ class Fleet:
         return dict(answer.json())
 
     def state(self) -> dict[str, Any]:
-        """Return the rollout of the group. Raises `NoAnswerError` while there is none."""
+        """Return the rollout of the group. Raises `NoAnswerError` until the collector returns one."""
         answer = self.operator.get(f"/v1/rollouts/{SITE}/{GROUP}")
         found = answer.json()["rollout"] if answer.status_code == 200 else None
         if found is None:

@@ -93,7 +93,7 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
 
 
 class Opening(Conversation):
-    """A stand-in for charon in which a tunnel opens while it lists the tunnels for the first time."""
+    """A stand-in for charon: a tunnel opens during the first listing, which does not contain the tunnel yet."""
 
     tunnel = TunnelSeen("laptop", "10.88.0.9", 1, 0, 0)
 
@@ -116,7 +116,7 @@ class Opening(Conversation):
 
 
 class ListeningBench(Bench):
-    """The process with that stand-in; it listens to it."""
+    """The process with `Opening` in place of charon; the process listens to its events."""
 
     async def _start(self, _wanted: TunnelsStated) -> ViciClient:
         vici = cast(ViciClient, self.conversation)
