@@ -161,7 +161,11 @@ def test_a_polling_client_gets_304_without_changes(running: Appliance, rest: Res
         if again.status == 200:  # the last use of a token is reported once a minute
             first, again = again, rest.get(path, If_None_Match=again.etag)
         assert (again.status, again.body, again.etag) == (304, b"", first.etag), path
-        assert rest.get(path, If_None_Match='"other"').body == first.body
+        other = rest.get(path, If_None_Match='"other"')
+        if other.etag != again.etag:  # as above
+            assert path == "/v1/tokens"
+            first, other = other, rest.get(path, If_None_Match='"other"')
+        assert (other.status, other.body) == (200, first.body), path
     for path in ("/v1/policy", "/v1/monitors", "/v1/hosts"):
         first = rest.get(path)
         assert rest.get(path, If_None_Match=first.etag).json.keys() == first.json.keys(), path

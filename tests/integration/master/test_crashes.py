@@ -1,11 +1,14 @@
 """Processes are killed or stopped, and policies reloaded under load: every confirmed call takes full effect."""
 
 import contextlib
+import json
 import os
 import signal
+import subprocess
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -104,6 +107,24 @@ def working(battlefield: Field) -> Iterator[Field]:
     late.stop()
 
 
+def published(field: Field, port: int, control: int) -> list[str]:
+    """Return the topics that have a publisher at the ROS master, which answers only to the user of control."""
+    ask = "import sys, xmlrpc.client as x; print(*dict(x.ServerProxy(sys.argv[1]).getSystemState('/looker')[2][0]))"
+    command = ["/usr/bin/python3", "-c", ask, f"http://127.0.0.1:{port}"]
+    user = Path(f"/proc/{control}").stat().st_uid
+    done = field.middle.run(
+        lambda: subprocess.run(command, user=user, cwd="/", stdout=subprocess.PIPE, text=True, check=True)
+    )
+    return str(done.stdout).split()
+
+
+def has_unread(port: int) -> bool:
+    """Whether a connection to a port of this namespace has bytes that its program has not read."""
+    rows = map(str.split, Path("/proc/thread-self/net/tcp").read_text(encoding="ascii").splitlines()[1:])
+    queues = [row[4] for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "01"]
+    return any(int(queue.split(":")[1], 16) for queue in queues)
+
+
 def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
     """The ROS master hangs and nodes are answered: after the death of control, it gets what was answered."""
     appliance, robot = working.appliance, working.robot
@@ -115,13 +136,16 @@ def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
             answer = working.call(robot, method, "/answered", topic, *kind, node.uri)
             assert answer[0] == 1, answer
 
-        registered("registerPublisher", "/ended")
-        # Reading the log takes longer than the 20 ms after which the ROS master gets this registration.
+        port = json.loads((appliance.state / "run" / "config.json").read_text())["rosmaster_port"]
+        control = appliance.pids("control")[0]
         known = len(appliance.audit("--event", "reconciled"))
+        registered("registerPublisher", "/ended")
+        eventually(lambda: "/ended" in published(working, port, control), "the ROS master has it")
         os.kill(rosmaster, signal.SIGSTOP)
         try:
             registered("registerPublisher", "/under_way")
-            control = appliance.pids("control")[0]
+            # From here on control waits for an answer, and sends nothing else.
+            eventually(lambda: working.middle.run(lambda: has_unread(port)), "the ROS master would get it")
             registered("registerPublisher", "/answered_only")
             registered("unregisterPublisher", "/ended")
             os.kill(control, signal.SIGKILL)
