@@ -98,12 +98,13 @@ async def test_connections_of_all_hosts_are_limited() -> None:
 
 async def test_unfinished_headers_are_cut_off() -> None:
     """The first and later requests of a connection are cut off; new connections are still served."""
-    async with listening(ApiLimits(header_seconds=0.3)) as connect:
-        slow, later = await connect(), await connect()
-        slow[1].write(REQUEST[:20])
+    async with listening(ApiLimits(header_seconds=2)) as connect:
+        later = await connect()
         assert await served(*later)
         await later[0].readuntil(b"\r\n\r\n")
         await later[0].readexactly(1)
+        slow = await connect()
+        slow[1].write(REQUEST[:20])
         later[1].write(REQUEST[:20])
         assert await cut_off(slow[0])
         assert await cut_off(later[0])

@@ -30,7 +30,7 @@ from tests.support.asgi import requested
 STATE = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a", "address": "10.0.0.1"})
 TEXT = "this appliance is the standby of a (10.0.0.1); give the command there"
 ENROLMENT = json.loads(Path(examples.__file__).with_name("examples.json").read_text())["Enrolment"]
-ROW, TOKEN = make_token("alice", "admin", now=time.time(), seconds=6000)
+ROW, TOKEN = make_token("alice", "admin", now=time.time(), seconds=86_400)
 
 
 class Standby(ControlLink):

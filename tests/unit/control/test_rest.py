@@ -33,8 +33,8 @@ from tests.support.heard import Heard
 
 pytestmark = pytest.mark.anyio
 
-VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=600)
-ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=600)
+VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=86_400)
+ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=86_400)
 
 
 def kept(row: TokenRow) -> TokenKept:
