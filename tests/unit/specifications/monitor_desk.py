@@ -10,7 +10,7 @@ Orders (`Dialogue.say`); `b` is the file b.rv with the text `b` of `TEXTS`, `c.r
     relay starts | relay takes 1 held=b             another relay is sent its statement; its answer
     revisions                                       list the kept revisions
     eve load b shadow confirm_within=0              an operator's order, with fields of its request
-    revision 3                                      wait until this revision is in force
+    revision 3                                      the time limit of a change ends; its rollback is this revision
 
 Effects follow: the answer (or refusal), what the relay is sent, the records, and the monitors if they have changed.
 """
@@ -26,7 +26,9 @@ import pytest
 from msgspec.structs import asdict
 
 from appliance.audit.log import AuditLog
+from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
+from appliance.channel.answers.monitor_answers import Replacement
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.checking import check
 from appliance.specifications.live_topics import LiveType, Published
@@ -84,6 +86,8 @@ class Desk:
         self.away = False
         self.carried_out = asyncio.Event()
         self.carried_out.set()
+        self.limit_ends, self.rolled_back = asyncio.Event(), asyncio.Event()
+        self.limit_ends.set()
         self.try_out: Check = here
         self.check: Check = here
         self.live: Published = {}
@@ -98,7 +102,7 @@ class Desk:
     ) -> SpecificationManager:
         """Start a control."""
         relay = Taking(self)
-        relay.monitors = SpecificationManager(
+        relay.monitors = WaitingManager(
             self.folder if folder else None,
             enable,
             self.store,
@@ -115,6 +119,7 @@ class Desk:
             parts=parts_here,
             live=lambda: self.live,
         )
+        relay.monitors.desk = self
         await relay.monitors.start(restarted=restarted)
         return relay.monitors
 
@@ -124,10 +129,25 @@ class Desk:
         self.log.close()
 
 
+class WaitingManager(SpecificationManager):
+    """Monitors that roll back an unconfirmed change only when the desk lets the time limit end."""
+
+    desk: Desk
+
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
+        """Wait, unless an operator ordered it."""
+        if who != UNCONFIRMED:
+            return await super().roll_back(request, who)
+        await self.desk.limit_ends.wait()
+        replaced = await super().roll_back(request, who)
+        self.desk.rolled_back.set()
+        return replaced
+
+
 class Taking:
     """One relay, which accepts everything, refuses it with the findings of the desk, or is away."""
 
-    monitors: SpecificationManager
+    monitors: WaitingManager
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
@@ -189,6 +209,7 @@ class Dialogue:
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
+        desk.limit_ends.clear()
         self._monitors: SpecificationManager | None = None
         self._last = ""
 
@@ -206,7 +227,7 @@ class Dialogue:
         self._last = now
         return effects
 
-    async def _done(self, said: list[str]) -> list[str]:  # noqa: PLR0912 - one branch for each action
+    async def _done(self, said: list[str]) -> list[str]:
         desk = self.desk
         match said:
             case ["start", *how]:
@@ -240,9 +261,12 @@ class Dialogue:
                 )
                 self.monitors.received(taken)
             case ["revision", number]:
+                desk.limit_ends.set()
                 async with asyncio.timeout(30):
-                    while self.monitors.revision != int(number):
-                        await asyncio.sleep(0.01)
+                    await desk.rolled_back.wait()
+                desk.limit_ends.clear()
+                desk.rolled_back.clear()
+                assert self.monitors.revision == int(number)
             case [who, verb, *words]:
                 return await self._ordered(who, verb, words)
         return []
