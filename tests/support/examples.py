@@ -1,4 +1,6 @@
-"""Set the number of examples of a property: a sixth in each run, with a new seed; all in `make test-system`.
+"""Set the number of examples of a property: a sixth in each run, all in `make test-system`.
+
+With `CI=true` Hypothesis draws them from the property itself, and otherwise with a new seed.
 
 @settings(max_examples=examples(400))
 """

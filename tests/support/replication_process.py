@@ -42,6 +42,7 @@ async def main() -> None:
         await active.sender.acknowledged(active.database.number)
         _report(mark)
     await active.sender.acknowledged(active.database.number)
+    await active.database.settled()
     _report("equal")
 
 

@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 
 from tests.support.appliance import Appliance
+from tests.support.processes import LIMIT
 from tests.support.rest import Rest
 
 SCHEMATHESIS = str(Path(sys.executable).parent / "schemathesis")
-SECONDS = 60
+PATIENCE = 8 * LIMIT  # it takes half a minute on an idle machine
+PHASES = ("Examples", "Coverage", "Fuzzing", "Stateful")
 WITHOUT_TOKEN = {
     "GET /healthz", "GET /readyz", "GET /v1/healthz", "GET /v1/readyz",
     # A host has a one-time token, or uses its tunnel; lists and certificates of an authority are public.
@@ -52,26 +54,13 @@ expected-statuses = ["400", "401", "403", "404", "405", "406", "409", "413", "41
 def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProcess[str]:
     """Run schemathesis once, in its own folder."""
     (directory / "schemathesis.toml").write_text(REFUSED)
-    command = [
-        SCHEMATHESIS,
-        "run",
-        f"{rest.url.geturl()}/v1/openapi.json",
-        "--no-color",
-        "--request-timeout",
-        "20",
-    ]
-    command += [
-        "-H",
-        f"Authorization: Bearer {rest.token}",
-        "--max-time",
-        str(SECONDS),
-        "--seed",
-        "1",  # the same cases in every run
-        "--max-examples",
-        "40",
-        *flags,
-    ]
-    return subprocess.run(command, cwd=directory, capture_output=True, text=True, timeout=170, check=False)
+    command = [SCHEMATHESIS, "run", f"{rest.url.geturl()}/v1/openapi.json", "--no-color"]
+    command += ["--request-timeout", str(2 * LIMIT), "-H", f"Authorization: Bearer {rest.token}"]
+    # The same cases in every run, however fast the machine is.
+    command += ["--seed", "1", "--max-examples", "20", *flags]
+    return subprocess.run(
+        command, cwd=directory, capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
 
 
 def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
@@ -88,7 +77,7 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
         "--exclude-path", "/v1/live", "--exclude-operation-id", "revoke_token",
     )  # fmt: skip
     assert done.returncode == 0, shown(done.stdout + done.stderr)
-    assert "passed" in done.stdout
+    assert [phase for phase in PHASES if f"✅ {phase}" not in done.stdout] == [], shown(done.stdout)
     rows = appliance.status()["processes"]
     assert [one["restarts"] for one in rows if one["role"] in ("control", "api")] == [0, 0]
     assert rest.get("/v1/status").status == 200

@@ -2,7 +2,6 @@
 
 import contextlib
 import gzip
-import os
 import secrets
 import threading
 from collections.abc import Callable, Iterator
@@ -27,9 +26,7 @@ from tests.system.fleet.test_attacks import put
 
 MakeRobot = Callable[..., FleetRobot]
 _ATTACKERS = 6
-_RECORDS = int(
-    os.environ.get("FAIRNESS_RECORDS", "10000")
-)  # of an attacker's segment: seconds of processor time
+_RECORDS = 10_000  # of an attacker's segment: much processor time
 
 
 def _push_again_and_again(
@@ -52,6 +49,13 @@ def _push_again_and_again(
     return count
 
 
+def _seen(site: FleetSite, uploads: set[str]) -> set[str]:
+    """Add the names of the uploads that are there now."""
+    assert site.data is not None
+    uploads.update(path.name for path in (site.data / "incoming").iterdir())
+    return uploads
+
+
 @contextmanager
 def _attack(site: FleetSite, attackers: list[FleetRobot], *, valid: bool) -> Iterator[None]:
     """Let robots push large segments, valid or with a wrong last line, during a block."""
@@ -65,10 +69,9 @@ def _attack(site: FleetSite, attackers: list[FleetRobot], *, valid: bool) -> Ite
         for attacker, summary, packed in pushed:
             pool.submit(_push_again_and_again, site, attacker, summary, packed, ended)
         try:
-            assert site.data is not None
-            incoming = site.data / "incoming"
             if not valid:
-                eventually(lambda: len(list(incoming.iterdir())) >= len(attackers), "the attack runs")
+                uploads: set[str] = set()
+                eventually(lambda: len(_seen(site, uploads)) >= len(attackers), "the attack runs")
             yield
         finally:
             ended.set()
