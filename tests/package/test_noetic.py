@@ -18,6 +18,7 @@ from tests.support.nodes import RosSession
 from tests.support.script_host import ScriptHost
 from tests.support.tunnel_site import MASTER, MIDDLE, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
+from tests.support.waiting import eventually
 
 pytestmark = pytest.mark.timeout(2400)  # the system is fetched, and the image is built
 SUITE = "bullseye"
@@ -87,14 +88,19 @@ LOST = (
 def lose_pings(site: TunnelSite, laptop: ScriptHost) -> None:
     """Assert that strongSwan 5.9.1, which would add a CHILD_SA to an open tunnel, gets one CHILD_SA per tunnel."""
     count = "grep -c 'CHILD_SA ros{[0-9]*} established' /run/rosrv/charon.log"
+
+    def whole() -> bool:
+        return bool(laptop.run("swanctl", "--list-sas").stdout.count("INSTALLED") == 1)
+
+    eventually(whole, laptop.log)
     before = int(laptop.run("sh", "-c", count).stdout)
     mark = site.mark
     laptop.run("nft", LOST)
     site.recorded(mark, event="tunnel down")
+    mark = site.mark
     laptop.run("nft", "delete", "table", "inet", "lost")
     site.recorded(mark, event="tunnel up")
-    tunnels = laptop.run("swanctl", "--list-sas").stdout
-    assert tunnels.count("INSTALLED") == 1, tunnels
+    eventually(whole, laptop.log)
     assert int(laptop.run("sh", "-c", count).stdout) == before + 1, laptop.log()
 
 

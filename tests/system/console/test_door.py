@@ -111,23 +111,26 @@ def test_an_unused_page_is_locked_and_loses_nothing(
 def test_a_stored_token_waits_for_the_appliance(appliance: Appliance, opened: Callable[..., Reader]) -> None:
     """While the appliance starts or does not answer, a reloaded page says so, keeps the token and tries again."""
     reader = opened()
-    failures: list[Callable[[Route], None]] = [
+    answers: list[Callable[[Route], None]] = [
         lambda route: route.fulfill(
             status=503, content_type="application/problem+json", json={"detail": "the appliance is starting"}
         ),
         lambda route: route.abort(),
+        lambda route: route.continue_(),
     ]
     page = reader.page
 
     def answer(route: Route) -> None:
-        (failures.pop(0) if failures else Route.continue_)(route)
+        answers[0](route)
 
     page.route("**/v1/whoami", answer)
     page.goto(f"{reader.url}/console/audit")
     waiting = page.get_by_role("region", name="Waiting")
     expect(waiting.get_by_role("alert")).to_contain_text("the appliance is starting")
     expect(waiting.get_by_role("status")).to_contain_text("tries again automatically")
+    answers.pop(0)
     expect(waiting.get_by_role("alert")).to_contain_text("The appliance does not answer")
+    answers.pop(0)
     expect(page.get_by_role("heading", level=1, name="Audit")).to_be_visible()
     assert page.evaluate("sessionStorage.getItem('rosrv.token')") == appliance.ready["token"]
 

@@ -136,6 +136,7 @@ def test_a_refusal_runs_behind_no_box(
         assert (
             robot.call(node, "registerPublisher", "/arm/command", "std_msgs/Float64", robot.api(node))[0] != 1
         )
+        appliance.recorded("--deny", caller_id=node, resource="/arm/command")
     page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
     expect(page.locator("g.attempt")).to_have_count(3)
     wait_until(page, _ALL_IN_FRAME)

@@ -99,7 +99,14 @@ def remote_browser(
 
 @pytest.fixture
 def pair(site: StandbySite, remote_browser: Browser, tokens: dict[str, str]) -> Iterator[PairConsoles]:
-    """Return the consoles; the windows are closed and checked after the test."""
+    """Return the consoles, with `a` active; the windows are closed and checked after the test.
+
+    A machine that starves the lease for a second makes `b` active.
+    """
+    if site.holder() != "a":
+        site.promote(site.holder())
+        site.until_taken_over("a")
+        site.until_both_in_sync()
     consoles = PairConsoles(site, remote_browser, tokens)
     with consoles.windows:
         yield consoles
