@@ -84,14 +84,16 @@ def verify(
     the directory with the signer's memory. `copies` are checkpoints from another machine. `progress` is called with
     the sequence from time to time.
     """
-    if public_key is None and pinned_key_path(path).exists():
-        public_key = read_public_key(pinned_key_path(path))
     with reading(path, advice="") as connection:
         connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
         log = _log_id(connection)
         # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
         remembered = None if signer is None else read_signer_memory(signer, log)
         connection.execute("BEGIN")
+        _log_id(connection)  # from here on the log is as it is now
+        # A key is pinned before its first signature is stored: read it after the log.
+        if public_key is None and pinned_key_path(path).exists():
+            public_key = read_public_key(pinned_key_path(path))
         verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
         return verifier.run()
 

@@ -21,6 +21,7 @@ from appliance.ipsec.strongswan import connection, connection_name, host_of, poo
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
+_LISTS = 3  # at most, until a rekeyed tunnel is in one
 # vici's own errors, and the errors that its packing raises for a value that is too long.
 _FAULTS = (
     CommandException, SessionException, EventUnknownException, DeserializationException, struct.error, OSError,
@@ -85,7 +86,10 @@ class ViciClient:
         Tunnels of removed hosts, or with a replaced certificate, are closed again: a rekeying during the first close
         can keep such a tunnel open.
         """
-        found = self._standing()
+        for _ in range(_LISTS):
+            found = self._standing()
+            if not _hidden(found):
+                break
         standing = {host for name, _ in found if (host := host_of(name)) is not None}
         for host in sorted(standing - self._loaded.keys()):
             self._close(host)
@@ -172,9 +176,20 @@ def _der_of(pem: bytes) -> bytes:
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
+def _hidden(found: list[tuple[str, Any]]) -> set[str]:
+    """Return the connections of which a list has only the tunnel before a rekeying.
+
+    charon puts the new tunnel at the beginning of its table: a list that had passed it misses it.
+    """
+    names = {True: set[str](), False: set[str]()}
+    for name, row in found:
+        names[_text(row, "state") == "REKEYED"].add(name)
+    return names[True] - names[False]
+
+
 def _seen(name: str, row: Any) -> TunnelSeen | None:
     host = host_of(name)
-    if host is None or _text(row, "state") != "ESTABLISHED":
+    if host is None or _text(row, "state") not in ("ESTABLISHED", "REKEYING"):
         return None
     children = [child for child in row.get("child-sas", {}).values() if _text(child, "state") == "INSTALLED"]
     if not children:

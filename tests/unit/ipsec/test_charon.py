@@ -18,16 +18,18 @@ from appliance.ipsec.strongswan import connection_name
 
 
 class Standing(NamedTuple):
-    """An open tunnel: the name of its connection, the number of its IKE SA, and that of its child SA."""
+    """An open tunnel: the name of its connection, the number of its IKE SA, and that of its child SA (0: none)."""
 
     tunnel: str
     ike: int
     child: int
+    state: str = "ESTABLISHED"
 
     def listed(self) -> bytes:
         """Return charon's entry of the tunnel in its list."""
         name, child = b"list-sa", {"state": "INSTALLED", "uniqueid": str(self.child)}
-        row = {"state": "ESTABLISHED", "uniqueid": str(self.ike), "child-sas": {f"ros-{self.child}": child}}
+        children = {f"ros-{self.child}": child} if self.child else {}
+        row = {"state": self.state, "uniqueid": str(self.ike), "child-sas": children}
         said: bytes = Message.serialize({self.tunnel: row})
         return bytes([Packet.EVENT, len(name)]) + name + said
 
@@ -38,6 +40,7 @@ class StandIn:
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])
         self.standing: list[Standing] = []
+        self.later: list[list[Standing]] = []  # of the next lists
         self.asked: list[tuple[str, dict[str, bytes]]] = []
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(path))
@@ -57,6 +60,7 @@ class StandIn:
                     self.asked.append((name, dict(Message.deserialize(FiniteStream(body)))))
                     if name == "list-sas":
                         answers[:0] = map(Standing.listed, self.standing)
+                        self.standing = self.later.pop(0) if self.later else self.standing
                 for answer in answers:
                     connection.sendall(struct.pack("!I", len(answer)) + answer)
 
@@ -138,3 +142,17 @@ def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
     stand_in.standing = [after, other]
     vici.seen()
     assert stand_in.ended("ike-id") == []
+
+
+def test_a_tunnel_is_seen_while_its_keys_are_replaced(charon: tuple[StandIn, ViciClient]) -> None:
+    """Its own state is no end, and a list that has only the earlier tunnel is asked for again."""
+    stand_in, vici = charon
+    tunnel = connection_name("laptop")
+    vici.provision(msgspec.structs.replace(stated(1), hosts=[TunnelHost("laptop", "10.113.11.2", "1a")]))
+    stand_in.standing = [Standing(tunnel, 3, 7, "REKEYING")]
+    assert [one.name for one in vici.seen()] == ["laptop"]
+    stand_in.standing = [Standing(tunnel, 3, 0, "REKEYED")]
+    stand_in.later = [[Standing(tunnel, 4, 7), Standing(tunnel, 3, 0, "REKEYED")]]
+    assert [one.name for one in vici.seen()] == ["laptop"]
+    stand_in.standing = [Standing(tunnel, 4, 0, "REKEYED")]
+    assert vici.seen() == []
