@@ -72,7 +72,8 @@ def test_every_record_arrives_and_verifies(
     work(appliance, 50)
     wanted = all_sequences(appliance)
     collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
-    assert collector.sequences() == sorted(set(collector.sequences()))
+    came = collector.sequences()
+    assert came == sorted(set(came))
     collector.wait_for(lambda messages: any(one.event == "checkpoint-signed" for one in messages))
     kept = tmp_path / "receiver.ndjson"
     checkpoints = [one for one in collector.messages if one.event == "checkpoint-signed"]

@@ -138,9 +138,9 @@ def test_control_killed_between_answer_and_forwarding(working: Field) -> None:
 
         port = json.loads((appliance.state / "run" / "config.json").read_text())["rosmaster_port"]
         control = appliance.pids("control")[0]
-        known = len(appliance.audit("--event", "reconciled"))
         registered("registerPublisher", "/ended")
         eventually(lambda: "/ended" in published(working, port, control), "the ROS master has it")
+        known = len(appliance.audit("--event", "reconciled"))
         os.kill(rosmaster, signal.SIGSTOP)
         try:
             registered("registerPublisher", "/under_way")

@@ -77,6 +77,14 @@ def held(site: Site, name: str, epoch: int) -> Iterator[Renewing]:
         renewing.end()
 
 
+def connected(site: Site) -> socket.socket | None:
+    """Return a connection from the follower to the fixed address; None while it is shut out."""
+    try:
+        return site.connect(site.follower, FIXED, MASTER)
+    except OSError:
+        return None
+
+
 def reaches(site: Site, name: str) -> bool:
     """Whether the follower reaches this appliance at the fixed address, and the appliance the follower."""
     try:
@@ -93,7 +101,7 @@ def test_a_follower_changes_over_with_the_robot(site: Site) -> None:
     assert site.refused(site.follower, FIXED, MASTER)
     with held(site, "a", 1) as first:
         eventually(lambda: reaches(site, "a"), "the follower admits a")
-        idle = site.connect(site.follower, FIXED, MASTER)
+        idle = eventually(lambda: connected(site), "the follower is admitted")
         site.accepted(site.servers["a"])
         assert site.refused(site.follower, ADDRESSES["b"], MASTER)
         first.end()
@@ -108,7 +116,7 @@ def test_without_the_witness_a_follower_shuts_out_both(site: Site) -> None:
     following = site.follow()
     with held(site, "a", 1) as holder:
         eventually(lambda: reaches(site, "a"), "the follower admits a")
-        idle = site.connect(site.follower, FIXED, MASTER)
+        idle = eventually(lambda: connected(site), "the follower is admitted")
         assert site.process is not None
         holder.end()
         site.process.stop()

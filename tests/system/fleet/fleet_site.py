@@ -190,7 +190,9 @@ class FleetRobot:
             eventually(self.is_trusted, "the running collector notices the robot")
 
     def _open(self) -> None:
-        self.log = AuditLog(self.log_file, checkpoint_every=self._every, signer=self._sign)
+        self.log = AuditLog(
+            self.log_file, checkpoint_every=self._every, checkpoint_seconds=86_400, signer=self._sign
+        )
         self.log.request_signatures()
 
     def rewind(self, number: int) -> None:

@@ -19,9 +19,9 @@ MakeRobot = Callable[..., FleetRobot]
 
 
 @pytest.fixture
-def narrow(database: str, tmp_path: Path) -> Iterator[FleetSite]:
-    """Return a collector that permits few connections."""
-    limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": 10.0}
+def narrow(database: str, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[FleetSite]:
+    """Return a collector that permits few connections, each for this time (seconds) without a request."""
+    limits = {"robot_connections": 3, "address_connections": 6, "header_seconds": request.param}
     with running(FleetSite(tmp_path / "site", database, limits)) as found:
         yield found
 
@@ -59,6 +59,7 @@ def _is_healthy(site: FleetSite) -> bool:
         return False
 
 
+@pytest.mark.parametrize("narrow", [10.0], indirect=True)
 def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
     """Connections before their TLS handshake count for the address; other addresses, and later ones, are served."""
     context = ssl.create_default_context(cafile=narrow.server.ca)
@@ -74,6 +75,7 @@ def test_an_address_has_a_limit_of_connections(narrow: FleetSite) -> None:
     eventually(lambda: _is_healthy(narrow), "later connections are served")
 
 
+@pytest.mark.parametrize("narrow", [120.0], indirect=True)
 def test_a_robot_has_a_limit_of_connections(narrow: FleetSite) -> None:
     """A robot's connections count for its certificate: neither its address nor other robots behind it lose any."""
     bad, good = FleetRobot(narrow, "bad"), FleetRobot(narrow, "good")

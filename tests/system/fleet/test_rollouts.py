@@ -165,7 +165,7 @@ def test_a_rollout_reaches_all_robots_ring_by_ring(fleet: Fleet) -> None:
     path = fleet.publish(*RINGS)
     eventually(lambda: fleet.collector.service.timestamp is not None, "a timestamp")
     fleet.poll()
-    fleet.start(path)
+    fleet.start(path, share=1)
     fleet.poll(*list(fleet.robots)[2:])
     assert not any(robot.taken for robot in fleet.robots.values())
     state = fleet.until(lambda state: state["state"] == "done")

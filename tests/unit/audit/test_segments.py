@@ -39,10 +39,11 @@ def public(key: Ed25519PrivateKey) -> bytes:
 
 @pytest.fixture
 def segments(make_log: MakeLog, path: Path) -> list[bytes]:
-    """Return the first three segments of a real log."""
+    """Return the first three segments of a real log; its last checkpoint, that of its end, is not signed."""
     log = make_log(checkpoint_every=5)
-    fill(log, 20)
-    eventually(lambda: len(signed_checkpoints(path)) >= 3, "three checkpoints are signed")
+    fill(log, 21)
+    eventually(lambda: len(signed_checkpoints(path)) == 4, "four checkpoints are signed")
+    assert log.close() is None
     return [written(path, number) for number in (1, 2, 3)]
 
 
@@ -81,10 +82,11 @@ def test_its_records_are_the_lines_of_an_export(segments: list[bytes], path: Pat
 
 
 def test_an_unsigned_checkpoint_has_no_segment_yet(segments: list[bytes], path: Path) -> None:
-    """A segment needs both signatures; the next checkpoint does not exist."""
+    """A segment needs both signatures; of the checkpoint after it there is nothing."""
     assert segments
-    last = signed_checkpoints(path)[-1].number
-    assert write_segment(path, last + 1, lambda _line: None) is None
+    assert signed_checkpoints(path)[-1].number == 4
+    for number in (5, 6):
+        assert write_segment(path, number, lambda _line: None) is None
 
 
 def _lines(change: Callable[[list[bytes]], list[bytes]]) -> Callable[[bytes], bytes]:

@@ -255,6 +255,7 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     assert lives.store is not None
     await lives.store.settled()
+    assert lives.log.close() is None  # a thread in SQLite would leave its locks to the child
     child = os.fork()
     if not child:
         try:

@@ -48,7 +48,8 @@ def test_a_bundle_cannot_use_up_the_memory(
     assert bomb.stat().st_size < 1 << 20
     with pytest.raises(EvidenceError, match=r"manifest\.json: cannot be read: MemoryError"):
         checked(workers, bomb, key)
-    assert checked(workers, bundle, key).records == 20
+    runs = json.loads(members_of(bundle)["manifest.json"])["runs"]
+    assert checked(workers, bundle, key).records == sum(last - first + 1 for first, last in runs) >= 20
 
 
 def test_a_bundle_cannot_use_up_the_time(

@@ -10,6 +10,7 @@ import pytest
 
 from appliance.forwarding.receiver import DatagramReceiver, StreamReceiver, tls_context
 from tests.support.certificates import Certificates, make_certificates
+from tests.support.processes import LIMIT
 from tests.support.syslog import DatagramCollector, StreamCollector
 
 HOST = "127.0.0.1"
@@ -109,8 +110,9 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
         assert collector.messages == []
 
 
-def test_tls_with_client_certificates(certificates: Certificates) -> None:
+def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: pytest.MonkeyPatch) -> None:
     """The receiver accepts our certificate; without one, its refusal is an error although TLS 1.3 reports it late."""
+    monkeypatch.setattr("appliance.forwarding.receiver._OBJECTION_SECONDS", LIMIT)
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(
             HOST,

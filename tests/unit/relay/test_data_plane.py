@@ -274,15 +274,16 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
         world.until(lambda: any(isinstance(one, UpstreamWanted) for one in world.told))
         waits.append(time.monotonic() - began)
     assert waits[-1] > 10 * LIMITS.retry_first
-    patient = World(replace(LIMITS, retry_longest=0.05))
+    patient = World(replace(LIMITS, retry_first=0.001, retry_longest=1.0))
     patient.connect(encode_header(ASK))
     for _ in range(3):
         patient.upstream().sock.close()
         patient.hears(UpstreamLost)
     staying = patient.upstream()
-    ends = time.monotonic() + 0.1
+    ((topic, publisher),) = patient.engine.topics.values()
+    patient.until(lambda: topic.header is not None)
+    ends = time.monotonic() + 1.2
     patient.until(lambda: time.monotonic() > ends)
-    ((_topic, publisher),) = patient.engine.topics.values()
     assert isinstance(publisher, PublisherConnection)
     assert publisher.failures == 3
     staying.sock.close()

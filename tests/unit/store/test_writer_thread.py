@@ -457,6 +457,7 @@ def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> 
         for change in changes:
             other.execute(*Tables.statement(msgspec.msgpack.decode(change.body, type=Change)))
         query = "SELECT * FROM thing ORDER BY name"
+        asyncio.run(database.settled())
         assert other.execute(query).fetchall() == database.query(query)
     database.close()
 

@@ -422,6 +422,7 @@ def test_events_without_a_control_reach_the_next_one(world: Monitored) -> None:
     world.control.close()
     world.connect_control()
     world.state(stated(1, [("0.rv", GUARD)], {}, {}, True))
+    world.engine.interceptor.observations.repeat()  # as at the end of what a control states
     assert world.event("drop", count=0).monitor == "guard"
 
 
