@@ -16,11 +16,14 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from appliance.audit.chain import genesis, record_hash
 from appliance.audit.chain_findings import FindingKind
 from appliance.audit.checkpoints import SignerMemory, read_signer_memory
+from appliance.audit.copies import signed_checkpoints
+from appliance.audit.log import AuditLog
 from appliance.audit.log_database import COLUMNS, LogUnreadableError
 from appliance.audit.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.verification import verify
 from appliance.signing.signed_statements import parse_checkpoint
 from tests.support.audit import decision, settle
+from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog
 from tests.unit.transcripts import transcripts
 
@@ -61,6 +64,28 @@ def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
     result = verify(path, **arguments)
     assert result.ok == (not result.findings)
     return [(one.kind, one.first, one.last) for one in result.findings]
+
+
+def test_a_first_signature_during_the_verification_has_its_key(
+    path: Path, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The key is read after the log, because it is pinned before its first signature is stored."""
+    asked: list[tuple[int, bytes]] = []
+    log = AuditLog(path, checkpoint_every=5, signer=lambda *one: asked.append(one))
+    for number in range(10):
+        log.record(decision(log, number))
+    assert settle(log) is None
+    eventually(lambda: asked, "the log asks for a signature")
+
+    def sign(*_arguments: object) -> None:
+        for number, text in asked:
+            log.signed(number, key.sign(text), key.public_key().public_bytes_raw())
+        eventually(lambda: signed_checkpoints(path), "it is stored")
+
+    monkeypatch.setattr("appliance.audit.verification.read_signer_memory", sign)
+    result = verify(path, signer=path.parent)
+    assert (result.findings, result.signed_checkpoints > 0) == ([], True)
+    log.close()
 
 
 def test_an_unchanged_log_is_complete(log: Path, key: Ed25519PrivateKey) -> None:
