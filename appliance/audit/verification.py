@@ -89,9 +89,8 @@ def verify(
         log = _log_id(connection)
         # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
         remembered = None if signer is None else read_signer_memory(signer, log)
-        connection.execute("BEGIN")
-        _log_id(connection)  # from here on the log is as it is now
-        # A key is pinned before its first signature is stored: read it after the log.
+        connection.execute("BEGIN").execute("SELECT count(*) FROM sqlite_schema")  # the log as it is now
+        # A key is pinned before its first signature is stored: read it after that.
         if public_key is None and pinned_key_path(path).exists():
             public_key = read_public_key(pinned_key_path(path))
         verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)

@@ -145,7 +145,7 @@ def test_tunnels_of_a_replaced_certificate_are_closed_at_each_check(
 
 
 def test_a_tunnel_is_seen_while_its_keys_are_replaced(charon: tuple[StandIn, ViciClient]) -> None:
-    """Its own state is no end, and a list that has only the earlier tunnel is asked for again."""
+    """It counts in both states; if a list has only the earlier tunnel, another list is asked for."""
     stand_in, vici = charon
     tunnel = connection_name("laptop")
     vici.provision(msgspec.structs.replace(stated(1), hosts=[TunnelHost("laptop", "10.113.11.2", "1a")]))
