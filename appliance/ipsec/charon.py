@@ -177,14 +177,9 @@ def _der_of(pem: bytes) -> bytes:
 
 
 def _hidden(found: list[tuple[str, Any]]) -> set[str]:
-    """Return the connections of which a list has only the tunnel before a rekeying.
-
-    charon puts the new tunnel at the beginning of its table: a list that had passed it misses it.
-    """
-    names = {True: set[str](), False: set[str]()}
-    for name, row in found:
-        names[_text(row, "state") == "REKEYED"].add(name)
-    return names[True] - names[False]
+    """Return the connections whose tunnel a list lacks, because their keys were replaced while charon made the list."""
+    rekeyed = {name for name, row in found if _text(row, "state") == "REKEYED"}
+    return rekeyed - {name for name, row in found if _seen(name, row) is not None}
 
 
 def _seen(name: str, row: Any) -> TunnelSeen | None:

@@ -1,6 +1,6 @@
 """Set the number of examples of a property: a sixth in each run, all in `make test-system`.
 
-With `CI=true` Hypothesis draws them from the property itself, and otherwise with a new seed.
+With `CI=true` Hypothesis derives the seed from the test; otherwise each run has a new seed.
 
 @settings(max_examples=examples(400))
 """

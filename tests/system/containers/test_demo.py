@@ -205,9 +205,8 @@ def test_every_process_has_the_documented_rights(demo: Compose) -> None:
         ]
         found = {int(row["Pid"]): row for row in rows}
         ended = set(roles.values()) - set(found)  # for example the compiler, which was idle
-        begins = any(
-            row["Name"].startswith("runc:") for row in rows
-        )  # the engine's check of health is not yet itself
+        # The engine's health check begins under the name of the engine's own program.
+        begins = any(row["Name"].startswith("runc:") for row in rows)
         return None if ended or begins else (roles, found)
 
     seen, processes = eventually(running, demo.story)

@@ -49,7 +49,7 @@ def test_a_latched_stop_stays(site: StandbySite, planned: bool) -> None:
         ros.talker("roscpp", "/chatter")
         listener.wait_for_count(3, event="received")
         ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
-        eventually(lambda: dropped(site, "a", 10), site.story)  # what passed before has arrived for long
+        eventually(lambda: dropped(site, "a", 10), site.story)  # earlier messages have arrived by then
         seen = len(listener.seen(event="received"))
         if planned:
             site.promote("a")

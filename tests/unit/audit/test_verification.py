@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
+from appliance.audit import verification
 from appliance.audit.chain import genesis, record_hash
 from appliance.audit.chain_findings import FindingKind
 from appliance.audit.checkpoints import SignerMemory, read_signer_memory
@@ -66,8 +67,9 @@ def found(path: Path, **arguments: Any) -> list[tuple[FindingKind, int, int]]:
     return [(one.kind, one.first, one.last) for one in result.findings]
 
 
+@pytest.mark.parametrize(("moment", "signed"), [("_log_id", True), ("_Verifier", False)])
 def test_a_first_signature_during_the_verification_has_its_key(
-    path: Path, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch
+    path: Path, key: Ed25519PrivateKey, monkeypatch: pytest.MonkeyPatch, moment: str, *, signed: bool
 ) -> None:
     """The key is read after the log, because it is pinned before its first signature is stored."""
     asked: list[tuple[int, bytes]] = []
@@ -76,15 +78,17 @@ def test_a_first_signature_during_the_verification_has_its_key(
         log.record(decision(log, number))
     assert settle(log) is None
     eventually(lambda: asked, "the log asks for a signature")
+    usual = getattr(verification, moment)
 
-    def sign(*_arguments: object) -> None:
+    def sign(*arguments: Any, **options: Any) -> Any:
         for number, text in asked:
             log.signed(number, key.sign(text), key.public_key().public_bytes_raw())
         eventually(lambda: signed_checkpoints(path), "it is stored")
+        return usual(*arguments, **options)
 
-    monkeypatch.setattr("appliance.audit.verification.read_signer_memory", sign)
-    result = verify(path, signer=path.parent)
-    assert (result.findings, result.signed_checkpoints > 0) == ([], True)
+    monkeypatch.setattr(verification, moment, sign)
+    result = verify(path)
+    assert (result.findings, result.signed_checkpoints > 0) == ([], signed)
     log.close()
 
 

@@ -155,7 +155,7 @@ def test_closing_closes_descriptors() -> None:
         assert _copies_of(listener.fileno()) > 1
         here.close()
         there.close()
-        assert _copies_of(listener.fileno()) == 1
+        assert (_copies_of(listener.fileno()), one.fileno(), other.fileno()) == (1, -1, -1)
 
 
 async def test_an_attached_end_reports_a_dead_peer_once(pair: Pair) -> None:

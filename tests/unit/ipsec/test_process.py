@@ -93,7 +93,7 @@ async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: py
 
 
 class Opening(Conversation):
-    """A stand-in for charon: a tunnel opens during the first listing, which does not contain the tunnel yet."""
+    """A stand-in for charon: a tunnel opens while charon makes its first list, so that the list lacks it."""
 
     tunnel = TunnelSeen("laptop", "10.88.0.9", 1, 0, 0)
 

@@ -43,9 +43,8 @@ _CONVERSATIONS = dict(text.strip().split("\n", 1) for text in _TEXTS)
 @pytest.mark.parametrize("title", _CONVERSATIONS)
 async def test_conversation(title: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each action has exactly the effects below it, in that order."""
-    monkeypatch.setattr(
-        liveness, "_RECENTLY_LOST_SECONDS", 3600.0
-    )  # no check of its own during the next action
+    # Checks of lost nodes would begin on their own during a later action.
+    monkeypatch.setattr(liveness, "_RECENTLY_LOST_SECONDS", 3600.0)
     written = _CONVERSATIONS[title].splitlines()
     conversation = Conversation(await ControlParts.begun(), **_POLICIES)
     took_place: list[str] = []
