@@ -10,20 +10,13 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance roswire rosmop fleet tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py lease.py lease_mutants.py lease_traces.py certifier.py events.py)
-# Rules on the source run with `make check`, however long they take.
+# What takes longer than a second waits for `make test`; the rules on the source, tests/unit/test_*.py, do not wait.
 LONG_UNIT := $(filter-out tests/unit/test_% tests/unit/support/%,$(shell grep '^tests/unit\|^rosmop' tests/long.txt))
-# What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own. A
-# cluster of Ray needs processors: its tests run here, where only containers run in parallel.
-CONTAINERS := tests/system/containers
-FETCHING := tests/system/vm $(addprefix tests/system/test_,clickhouse.py examples.py generated_client.py recordings_cluster.py)
-NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
-# What takes longest runs with `make test-system` only: attacks, crashes and stock tools; searches.
-LONGEST_NODES := $(wildcard tests/integration/*/test_attacks.py tests/integration/*/test_floods.py tests/integration/*/test_crashes.py tests/integration/*/test_robustness.py tests/integration/test_stock_tools.py tests/integration/*/test_stock_tools.py)
-LONGEST_UNITS := $(addprefix rosmop/tests/,batch/test_hostile_recordings.py certify/test_steps.py check/test_against_cpp.py learn/test_learner.py logics/test_verdicts.py test_hostile.py test_suppression.py tool/test_installed.py) \
-	$(addprefix tests/unit/,distribution/test_extension.py recorder/test_killed.py relay/transport/test_pump_fuzzer.py standby/test_replication_kills.py)
-PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
+DETERMINISTIC := -m "not nightly and not real" tests/unit rosmop/tests
+# Files with tests that are marked `real`.
+REAL = $(shell grep --recursive --files-with-matches --include='test_*.py' 'mark\.real' tests/unit tests/integration tests/system)
 
-.PHONY: help setup demo check static unit test units nodes test-system test-fleet system-machine system-containers system-nodes system-namespaces test-package prove wheel constraints package image site fleet release bench clean
+.PHONY: help setup demo check static unit test units real smoke nightly steady prove wheel constraints package image site fleet release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -35,7 +28,7 @@ demo: ## the appliance at work: a simulated robot, its operator and an attacker,
 	@scripts/setup --run
 	@$(BIN)/rosrv demo $(ARGS)
 
-check: setup ## format, lint, types, dependency directions, unit tests but the long ones
+check: setup ## format, lint, types, dependency directions, rules on the source, quick unit tests: a minute
 	$(MAKE) --jobs=2 --output-sync=target static unit
 
 static:
@@ -44,53 +37,29 @@ static:
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Once after a clone: the workers, which all begin with the same files, would each compile every test. What is wrong with
-# a test is said when it is to run.
-build/collected:
-	mkdir -p build
-	$(PYTEST) tests/unit rosmop/tests tests/integration tests/proofs --collect-only --quiet > /dev/null || true
-	touch $@
-
 unit:
-	$(PYTEST) tests/unit rosmop/tests $(addprefix --ignore=,$(LONG_UNIT)) -n $$(nproc) --quiet
+	$(PYTEST) $(DETERMINISTIC) $(addprefix --ignore=,$(LONG_UNIT)) -n $$(nproc) --quiet
 
-test: setup ## check, long unit tests, and tests with real ROS nodes (root: they make network namespaces)
-	$(MAKE) --jobs=3 --output-sync=target static units nodes
+test: setup ## check, all tests that chance cannot fail, and at most 100 cases with real nodes (root: network namespaces)
+	$(MAKE) --jobs=3 --output-sync=target static units real
 
-# Tests with real nodes wait half of their time: what computes has the processors then, and after them, for it is nice.
-units: build/collected
-	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit rosmop/tests $(addprefix --ignore=,$(LONGEST_UNITS)) -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
+# The real cases wait half of their time: what computes has the processors then, and after them, for it is nice.
+units:
+	nice $(PYTEST) $(DETERMINISTIC) -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
-nodes: build/collected
-	$(PYTEST) tests/integration $(addprefix --ignore=,$(LONGEST_NODES)) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
+real:
+	$(PYTEST) -m real $(REAL) -n $$(nproc) --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
-test-system: ## the whole product: attacks, demo, tunnels, containers, a virtual machine, the console in a browser
+smoke: setup ## the container as a user starts it: built, a denied call, a policy reload, an audit search
+	@scripts/setup --containers
+	$(PYTEST) tests/smoke --quiet
+
+nightly: setup ## every test, with all its examples: attacks, crashes, takeovers, containers, browser, machines; LANE=standby
 	@scripts/setup --system
-	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(LONGEST_UNITS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
-	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers
-	$(MAKE) --no-print-directory system-nodes
-	$(MAKE) --no-print-directory system-namespaces
+	$(BIN)/python -m tests.nightly $(if $(LANE),--lane $(LANE))
 
-system-machine:
-	$(PYTEST) $(FETCHING) --quiet --durations=5
-
-system-containers:
-	$(PYTEST) $(CONTAINERS) --quiet --durations=5
-
-system-namespaces:
-	$(PYTEST) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
-
-system-nodes: build/collected
-	$(PYTEST) $(LONGEST_NODES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
-
-test-fleet: ## the collector: real logs, PostgreSQL, kills and attacks; `make test-system` runs it, too
-	@scripts/setup --system
-	$(PYTEST) tests/unit/fleet tests/system/fleet -n auto --dist loadfile --quiet --durations=5
-
-test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
-	@scripts/setup --system
-	@scripts/setup --package
-	$(PYTEST) tests/package --quiet --durations=15
+steady: setup ## run one test N times beside busy loops: make steady TEST=tests/integration/test_nodes.py N=50
+	$(BIN)/python -m tests.steady $(TEST) $(N)
 
 wheel: setup ## the wheel of this architecture, for pipx: dist/rosrv_appliance-VERSION-….whl, and the versions that were tested
 	$(BIN)/python -m hatchling build --target wheel

@@ -49,6 +49,7 @@ def second(common_lab: Lab) -> Host:
     return common_lab.host("second", "10.77.0.66/24")
 
 
+@pytest.mark.real
 def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
     """Only the first machine is heard on the topic; the denial names the rule, in the answer and in the log."""
     listener = ros.listener("roscpp", "/topic1")
@@ -72,6 +73,7 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
     assert record["rule"]["line"] == POLICY.splitlines().index("/topic1 = first") + 1
 
 
+@pytest.mark.real
 def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> None:
     """The second machine can publish the topics that the policy grants it, as with any master."""
     listener = ros.listener("rospy", "/topic2")
@@ -79,6 +81,7 @@ def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> 
     assert listener.wait_for(event="received")["publisher"] == "/guest"
 
 
+@pytest.mark.real
 def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, second: Host) -> None:
     """`rosnode kill` has no effect from the second machine; from the first it works as usual."""
     talker = ros.talker("roscpp", "/topic1", name="driver")
@@ -91,6 +94,7 @@ def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, seco
     talker.wait()
 
 
+@pytest.mark.real
 def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, second: Host) -> None:
     """A name in use on one machine cannot be taken over from another, even if the policy lets both use it."""
     listener = ros.listener("rospy", "/topic2")

@@ -64,6 +64,7 @@ def robot(appliance: Appliance, ros: RosSession, tablet: Host) -> Iterator[Robot
         appliance.ask(HostUnblock(row.address))
 
 
+@pytest.mark.real
 def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, robot: Robot) -> None:
     """The answer has the numbers; calls of the host are denied with the reason; no node is restarted."""
     said = appliance.rosrv("host", "block", TABLET, "--for", "1h", "--note", "tablet lost").stdout

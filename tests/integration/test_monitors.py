@@ -63,6 +63,7 @@ def dropped_by(appliance: Appliance, name: str, count: int) -> bool:
     return monitor(appliance, name)["drops"] == count
 
 
+@pytest.mark.real
 def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: RosSession) -> None:
     """Both listeners get both talkers with their own headers; messages of a monitor come from the appliance."""
     alarms = [ros.listener(client, "/alarm") for client in CLIENTS]
@@ -92,6 +93,7 @@ def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: Ro
     assert "a bad word" in {one["reason"] for one in appliance.recorded(event="monitor log")}
 
 
+@pytest.mark.real
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
@@ -200,6 +202,7 @@ def test_a_missing_message_is_published_at_the_deadline(
     assert appliance.recorded(event="monitor published", resource="/alarm")
 
 
+@pytest.mark.real
 def test_an_invalid_specification_is_rejected_without_effect(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
@@ -242,6 +245,7 @@ def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
     listener.wait_for_count(before + 3, event="received")
 
 
+@pytest.mark.real
 def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tmp_path: Path) -> None:
     """A restart of the appliance or of control keeps them; ROSRV's calls and flags report the same."""
     spec = tmp_path / "more.rv"
@@ -314,6 +318,7 @@ gate() {
 """
 
 
+@pytest.mark.real
 def test_requests_are_refused_and_responses_changed(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:

@@ -19,6 +19,7 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
         yield session
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("subscriber_first", [True, False], ids=["listener-first", "talker-first"])
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
@@ -90,6 +91,7 @@ def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> N
     talker.wait_for(event="disconnected")
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_service(ros: RosSession, by: Client, to: Client) -> None:
@@ -129,6 +131,7 @@ def test_missing_service(ros: RosSession, client: Client) -> None:
     asker.wait_for(event="answered")
 
 
+@pytest.mark.real
 def test_watched_parameter(ros: RosSession) -> None:
     """A parameter set by one node reaches the nodes that watch it, rospy and roscpp."""
     python, cpp = ros.parameters("rospy"), ros.parameters("roscpp")
@@ -172,6 +175,7 @@ def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
     assert there.wait_for(event="received")["publisher"] == "/robot_voice"
 
 
+@pytest.mark.real
 def test_relative_and_private_names(ros: RosSession) -> None:
     """Namespaces and remappings are resolved as usual."""
     listener = ros.listener("roscpp", "/left/chatter")
@@ -182,6 +186,7 @@ def test_relative_and_private_names(ros: RosSession) -> None:
     other.wait_for(event="received", publisher="/remapped")
 
 
+@pytest.mark.real
 def test_action(ros: RosSession) -> None:
     """An action server accepts a goal, sends feedback in order, and a result: five topics both ways."""
     server = ros.node("rospy", "action", "server", name="counter")

@@ -21,6 +21,7 @@ def appliance(own_appliance: Appliance) -> Appliance:
     return own_appliance
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("without", [NO_CHATTER, NO_EARS], ids=["publication", "subscription"])
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
 def test_a_rollback_restores_rights_of_running_nodes(
@@ -42,6 +43,7 @@ def test_a_rollback_restores_rights_of_running_nodes(
     listener.wait_for(event="received", publisher="/voice", since=after)
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("client", ["rospy", "roscpp"])
 def test_revocations_survive_a_crash_of_control(
     appliance: Appliance, ros: RosSession, client: Client
@@ -107,6 +109,7 @@ def test_a_node_paused_during_a_reload_loses_revoked_rights(lab: Lab, robot: Hos
             listener.wait_for(event="received", publisher=name, since=after)
 
 
+@pytest.mark.real
 def test_sighup_reloads_the_policy(appliance: Appliance) -> None:
     """SIGHUP works like `rosrv policy reload`; a file with errors changes nothing, and the log names them."""
     assert appliance.process is not None

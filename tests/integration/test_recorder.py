@@ -123,6 +123,7 @@ def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
         assert bool(rest.get(f"/v1/audit?{every}&text=bad").json["records"]) is (role != "viewer")
 
 
+@pytest.mark.real
 def test_a_drop_makes_a_recording_that_stock_tools_read(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:

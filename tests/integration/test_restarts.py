@@ -17,6 +17,7 @@ def appliance(own_appliance: Appliance) -> Appliance:
     return own_appliance
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("role", ROLES)
 def test_kill(appliance: Appliance, ros: RosSession, role: str) -> None:
     """Messages arrive again, a service answers, parameters are kept, and a node started afterwards is heard."""

@@ -37,6 +37,7 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
         yield session
 
 
+@pytest.mark.real
 def test_rostopic_list(ros: RosSession) -> None:
     """`rostopic list` prints the topics, and `-v` their publishers and subscribers."""
     ros.talker("rospy", "/chatter")
@@ -47,6 +48,7 @@ def test_rostopic_list(ros: RosSession) -> None:
     assert "* /chatter [std_msgs/String] 1 subscriber" in verbose
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rostopic_echo(ros: RosSession, client: Client) -> None:
     """`rostopic echo -n 2` prints two messages and ends."""
@@ -85,6 +87,7 @@ def test_rostopic_pub(ros: RosSession) -> None:
         assert listener.wait_for(event="received")["data"] == "hi"
 
 
+@pytest.mark.real
 def test_rostopic_info_and_type(ros: RosSession) -> None:
     """`rostopic info` prints type, publisher and subscriber; `type` and `find` agree."""
     ros.talker("roscpp", "/chatter", name="voice")
@@ -103,6 +106,7 @@ def test_rosnode_list(ros: RosSession) -> None:
     assert ros.run("rosnode", "list").stdout.split() == ["/rosout", "/voice"]
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rosnode_info(ros: RosSession, client: Client) -> None:
     """`rosnode info` prints publications, subscriptions, services, and the node's connections."""
@@ -132,6 +136,7 @@ def test_rosnode_kill(ros: RosSession, client: Client) -> None:
     assert "/voice" not in ros.run("rosnode", "list").stdout.split()
 
 
+@pytest.mark.real
 def test_rosparam(ros: RosSession, tmp_path: Path) -> None:
     """`rosparam` sets, gets, lists, dumps, loads and deletes."""
     ros.run("rosparam", "set", "/arm", "{speed: 0.5, joints: [1, 2], name: left}")
@@ -147,6 +152,7 @@ def test_rosparam(ros: RosSession, tmp_path: Path) -> None:
     ros.run("rosparam", "delete", "/other")
 
 
+@pytest.mark.real
 def test_rosservice(ros: RosSession) -> None:
     """`rosservice` lists, shows the type and the node, and calls."""
     ros.service_server("roscpp", "/negate", name="negator")
@@ -158,6 +164,7 @@ def test_rosservice(ros: RosSession) -> None:
     assert answer == {"success": False, "message": "negated"}
 
 
+@pytest.mark.real
 def test_rosbag(ros: RosSession, tmp_path: Path) -> None:
     """A bag recorded from the running robot plays back to a listener."""
     bag = tmp_path / "run.bag"
@@ -184,6 +191,7 @@ def package_of_two_nodes(workspace: Path) -> Path:
     return launch
 
 
+@pytest.mark.real
 def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
     """`roslaunch` sets its parameters, starts two nodes that communicate, and ends them when interrupted."""
     file = package_of_two_nodes(tmp_path / "workspace")

@@ -2,9 +2,10 @@
 
     tree = make_base(directory, packages=["systemd-sysv", "iproute2"])
 
-The first call for a suite and package list takes a minute or two. Its result is kept under `build/debian/`, and later
-calls unpack it in seconds. A tree with packages is made from the tree of its suite without packages. The tree can fetch
-more packages: it has this machine's sources of Debian packages, proxy, certificate authorities and pip settings.
+The first call for a suite and package list takes a minute or two. Its result is kept in `CACHE`, for all checkouts of
+this machine, and later calls unpack it in seconds. A tree with packages is made from the tree of its suite without
+packages. The tree can fetch more packages: it has this machine's sources of Debian packages, proxy, certificate
+authorities and pip settings.
 """
 
 import fcntl
@@ -20,6 +21,7 @@ from pathlib import Path
 from tests.support.requirements import need_program, need_root
 
 ROOT = Path(__file__).parents[2]
+CACHE = Path("/var/cache/rosrv-tests")
 SUITE = "bookworm"
 MINUTES = 15
 _CERTIFICATES = Path("etc/ssl/certs/ca-certificates.crt")
@@ -76,7 +78,7 @@ def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
     need_root()
     need_program("debootstrap", "debootstrap")
     settings = machine_settings(suite)
-    folder = ROOT / "build" / "debian"
+    folder = CACHE / "debian"
     folder.mkdir(parents=True, exist_ok=True)
     archive = folder / f"{suite}-{_key(packages, settings)}.tar"
     with archive.with_suffix(".lock").open("w") as lock:

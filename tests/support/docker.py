@@ -8,7 +8,7 @@
 
 The engine runs on a host of the lab. Its bridges and rules are in the namespace of that host, not in this machine's.
 Images are built earlier, by an engine in this machine's own network that does not change it (no bridge, no rules).
-Both use the same data under `build/docker`, so that a second build is quick.
+Both use the same data in the cache of this machine, so that a second build is quick, also in a fresh clone.
 """
 
 import contextlib
@@ -25,13 +25,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from appliance.network.namespaces import Namespace
-from tests.support.debian_base import base_archive
+from tests.support.debian_base import CACHE, base_archive
 from tests.support.printed import row_of
 from tests.support.processes import Host, ThisMachine
 from tests.support.requirements import need_program, need_root
 
 ROOT = Path(__file__).parents[2]
-DATA = ROOT / "build" / "docker"
+DATA = CACHE / "docker"
 BASE = "rosrv-test/debian:12-slim"
 APPLIANCE, DEMO = "rosrv/appliance", "rosrv/demo"
 START_SECONDS = 60.0

@@ -1,4 +1,4 @@
-"""Set the number of examples of a property: a sixth in each run, all in `make test-system`.
+"""Set the number of examples of a property: a sixth in each run, all in `make nightly`.
 
 With `CI=true` Hypothesis derives the seed from the test; otherwise each run has a new seed.
 

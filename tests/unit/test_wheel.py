@@ -18,6 +18,8 @@ from packaging.tags import sys_tags
 from appliance import __version__
 from distribution.extension import IN_PLACE
 
+pytestmark = pytest.mark.nightly
+
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 RUNS = [Requirement(one) for one in (*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["iptables"])]

@@ -30,6 +30,7 @@ def new_token(appliance: Appliance, name: str, role: str, expires: str = "1h") -
     return str(json.loads(made)["token"])
 
 
+@pytest.mark.real
 def test_a_revoked_token_ends_at_once(running: Appliance, rest: Rest) -> None:
     """The answer after `rosrv token revoke` is 401; an open stream ends with the reason."""
     client = rest.with_token(new_token(running, "leaver", "viewer"))

@@ -65,6 +65,7 @@ def test_a_reconnecting_client_misses_no_record(appliance: Appliance, rest: Rest
         assert json.loads(next(events)["data"])["resource"] == "/second"
 
 
+@pytest.mark.real
 def test_search_returns_the_same_as_the_command(appliance: Appliance, rest: Rest) -> None:
     """The same filters return the same records as the command, field by field."""
     publish(appliance, "/sought")
@@ -106,6 +107,7 @@ def test_one_record_and_its_neighbours(appliance: Appliance, rest: Rest) -> None
     assert rest.get("/v1/audit/99999999").status == 404
 
 
+@pytest.mark.real
 def test_the_log_is_proven(rest: Rest) -> None:
     """Verification reports that the chain is complete, and how many records a signature covers."""
     verified = rest.get("/v1/audit/verify").json

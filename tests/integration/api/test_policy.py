@@ -124,6 +124,7 @@ def loaded_last_by(appliance: Appliance) -> list[str]:
     return [record["detail"]["who"] for record in newest]
 
 
+@pytest.mark.real
 def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
     """The policy denies from the answer on; its revision has the author; a restart keeps it."""
     rest = appliance.rest()
@@ -285,6 +286,7 @@ def test_revisions_are_kept_and_restored(appliance: Appliance) -> None:
     assert rest.post("/v1/policy/rollback", {"revision": 7777}, match=tag(first + 2)).status == 422
 
 
+@pytest.mark.real
 def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> None:
     """A search right after a change finds its record."""
     newest = ("--event", "policy loaded", "--limit", "1")
@@ -293,6 +295,7 @@ def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> Non
         assert [record["revision"] for record in appliance.audit(*newest)] == [loaded["revision"]]
 
 
+@pytest.mark.real
 def test_reload_replaces_the_policy_by_the_file(appliance: Appliance) -> None:
     """The file replaces the policy loaded over REST, as the answer reports; the file's revision is in force again."""
     rest = appliance.rest()

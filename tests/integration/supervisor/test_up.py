@@ -80,6 +80,7 @@ def pid_of_master(uri: str) -> str:
         return str(master.getPid("/tester"))
 
 
+@pytest.mark.real
 def test_it_says_when_nodes_may_connect_and_ends_cleanly_in_time(directory: Path) -> None:
     """`rosrv up` prints a line for scripts and a sentence for people.
 
@@ -219,6 +220,7 @@ def test_input_files_are_checked_before_the_state_is_made(
     assert not (directory / "state").exists()
 
 
+@pytest.mark.real
 def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
     """The appliance starts with the policy that an operator loaded, even if its file is gone.
 

@@ -54,6 +54,7 @@ def test_without_a_host_there_is_no_tunnel(site: TunnelSite) -> None:
     assert status["policy"]["warnings"] > 0
 
 
+@pytest.mark.real
 def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> None:
     """Nodes of both sides find and hear each other; the host has its virtual address in list, status and log."""
     assert joined.master == f"http://{OWN}:11311"
@@ -79,6 +80,7 @@ def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> 
     assert (row["name"], row["address"], row["state"], row["remote"]) == ("ocu-1", joined.address, "up", OCU)
 
 
+@pytest.mark.real
 def test_a_host_is_blocked_by_its_name_while_its_tunnel_stays(site: TunnelSite, joined: JoinedHost) -> None:
     """Its messages stop and return; the answer names the machine's other address, whose block alone changes nothing."""
     with site.talking(joined) as (_talker, listener):

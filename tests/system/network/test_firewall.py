@@ -103,6 +103,7 @@ def ruleset(host: Host) -> str:
     return "\n".join(outputs)
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_only_control_opens_connections_to_rosmaster(
     protected: Host, attacker: Host, backend: BackendChoice

@@ -92,6 +92,7 @@ def ask(host: Host, uid: int, uri: str) -> str:
     return str(process.communicate(timeout=60)[0]).strip()
 
 
+@pytest.mark.real
 @pytest.mark.parametrize("backend", ["nft", "iptables"])
 def test_control_alone_talks_to_the_real_rosmaster(
     host: Host, master: "subprocess.Popen[str]", backend: BackendChoice

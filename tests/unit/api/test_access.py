@@ -12,6 +12,8 @@ from appliance.channel.messages.api import TokenKept
 from appliance.store import access_tokens
 from appliance.store.access_tokens import TokenRow, make_token
 
+pytestmark = pytest.mark.nightly
+
 
 def kept(row: TokenRow) -> TokenKept:
     """Return a token's record as control sends it."""

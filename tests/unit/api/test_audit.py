@@ -1,11 +1,15 @@
 """Tests of `appliance.api.audit`."""
 
+import pytest
+
 from appliance.api.monitor_routes import records_of
 from appliance.api.shown_records import page_of
 from appliance.audit.query import Filter
 from tests.support.audit import decision, settle
 from tests.unit.api.test_streams import bearer
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
+
+pytestmark = pytest.mark.nightly
 
 __all__ = ["key", "make_log", "notary", "path"]
 

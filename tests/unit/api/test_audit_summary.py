@@ -18,6 +18,8 @@ from appliance.audit.query import Filter
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 
+pytestmark = pytest.mark.nightly
+
 __all__ = ["key", "make_log", "notary", "path"]
 
 

@@ -39,6 +39,7 @@ def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | 
         thread.join(10)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["10.1.2.3", "127.0.0.1", "::1", "localhost", "robot.example"])
 def test_it_is_trusted_for_its_names(tmp_path: Path, name: str) -> None:
     """A client that has the certificate connects by each of its names, with TLS 1.2 or newer."""
@@ -46,6 +47,7 @@ def test_it_is_trusted_for_its_names(tmp_path: Path, name: str) -> None:
     assert shake_hands(context, tmp_path / CERTIFICATE, name) in ("TLSv1.2", "TLSv1.3")
 
 
+@pytest.mark.nightly
 def test_it_is_not_for_other_names(tmp_path: Path) -> None:
     """A client rejects the certificate for any other address."""
     said = shake_hands(tls_context(tmp_path, [], NOW), tmp_path / CERTIFICATE, "10.9.9.9")
@@ -74,6 +76,7 @@ def test_it_is_renewed_for_a_new_name_or_before_it_expires(
     assert pin_of(tmp_path) == pin
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("wrong", [datetime.timedelta(days=-20_000), datetime.timedelta(days=3650)])
 def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta) -> None:
     """A certificate made in 1970 or dated ten years ahead is replaced once the clock is correct; the key stays."""
@@ -90,6 +93,7 @@ def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta)
     assert pin_of(tmp_path) == pin
 
 
+@pytest.mark.nightly
 def test_a_pin_is_the_hash_of_the_key(tmp_path: Path) -> None:
     """The pin has curl's format and equals openssl's output for the certificate; another key has another pin."""
     tls_context(tmp_path, [], NOW)

@@ -120,6 +120,7 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
     }  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "path",
     [

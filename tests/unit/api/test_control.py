@@ -27,7 +27,7 @@ from appliance.channel.messages.api import (
 from tests.support.answers import example
 from tests.support.heard import Heard
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Control:

@@ -236,6 +236,7 @@ def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[Request
     return list(api()[1].orders)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("tag", ["*", '"7"'])
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_the_api_and_control_understand_the_same(method: str, target: str, body: Any, tag: str) -> None:
@@ -251,6 +252,7 @@ MATRIX = [
 ]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("operation", "dry"), MATRIX, ids=[f"{one.name}{' dry' * dry}" for one, dry in MATRIX]
 )
@@ -305,6 +307,7 @@ def test_rows_name_fields_of_their_requests() -> None:
         assert set(re.findall(r"{(\w+)", one.path)) <= {*one.fields()}, one.path
 
 
+@pytest.mark.nightly
 def test_pruning_is_for_admins() -> None:
     """Operators load the folder's files; only admins remove monitors whose files the folder does not have."""
     for role, status in (("operator", 403), ("admin", 503)):
@@ -373,6 +376,7 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
             yield from roles_of(one)
 
 
+@pytest.mark.nightly
 def test_every_order_has_its_way() -> None:
     """`REQUESTS` has a request for every kind of order that the api may send."""
     found = {
@@ -381,6 +385,7 @@ def test_every_order_has_its_way() -> None:
     assert found == CHANGES
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any) -> None:
     """A compromised api cannot change a field of an order, except those that the appliance fills in."""
@@ -412,6 +417,7 @@ def _other(value: Any) -> Any:
             return value + 1
 
 
+@pytest.mark.nightly
 def test_control_hears_of_a_client_that_disconnects() -> None:
     """When the client of an order disconnects, its bearer ends, and control withdraws the order."""
     gate, control, tokens = api()

@@ -20,6 +20,8 @@ from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
 from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
+pytestmark = pytest.mark.nightly
+
 _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
 

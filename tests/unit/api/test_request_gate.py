@@ -8,6 +8,8 @@ import pytest
 from tests.support.asgi import requested
 from tests.unit.api.test_operation_routes import BY_HAND, api, routes
 
+pytestmark = pytest.mark.nightly
+
 
 def sent(method: str, path: str, headers: dict[str, str], host: str = "10.0.0.1") -> httpx.Response:
     """Return the answer to a request."""

@@ -69,6 +69,7 @@ def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Res
     return requested(gate, method, target, headers=headers, **more)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("method", "target"),
     [
@@ -96,6 +97,7 @@ def test_a_host_that_enrols_gets_the_same_problem(gate: RequestGate) -> None:
     assert (answer.status_code, answer.json()["active"]) == (503, "10.0.0.1")
 
 
+@pytest.mark.nightly
 def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
     """A standby is not `down` for Prometheus, and answers questions about itself."""
     assert asked(gate, "GET", "/v1/standby").json()["other"]["name"] == "a"
@@ -104,6 +106,7 @@ def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
     assert 'rosrv_standby_role{role="standby"} 1.0' in page.text
 
 
+@pytest.mark.nightly
 def test_no_other_problem_has_the_address(gate: RequestGate) -> None:
     """The address is part of this problem only, and only for valid tokens."""
     answer = requested(gate, "GET", "/v1/status", headers={"Authorization": "Bearer wrong"})

@@ -22,6 +22,8 @@ from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old
 
+pytestmark = pytest.mark.nightly
+
 STRANGE: dict[str, Any] = {
     "text": 'é"\\\n\x1b',
     "number": 0.1,

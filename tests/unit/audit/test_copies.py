@@ -24,6 +24,8 @@ from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
 from tests.unit.audit.conftest import MakeLog, Notary
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:

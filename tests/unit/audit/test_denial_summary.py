@@ -157,6 +157,7 @@ def test_no_reason_has_contents_of_messages() -> None:
     assert "secret" not in msgspec.json.encode(of(said)).decode()
 
 
+@pytest.mark.nightly
 def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     """It reads the records of `--deny`, in the same time; a folded flood counts with its number."""
     log = make_log()
@@ -172,6 +173,7 @@ def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     assert summary_of_log(log.path, Filter(since=time.time_ns() + 60 * _SECOND), 10).hosts == []
 
 
+@pytest.mark.nightly
 def test_ten_thousand_denials_take_less_than_half_a_second(make_log: MakeLog) -> None:
     """The limit is four times the processor time of 2026, in which a hundred thousand take a second."""
     log = make_log()

@@ -15,6 +15,8 @@ from tests.support.audit import decision, settle
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 
+pytestmark = pytest.mark.nightly
+
 _LIMIT_SECONDS = 30
 _RESERVE = 16 << 20
 

@@ -17,6 +17,8 @@ from appliance.audit.log_database import open_for_reading
 from tests.support.audit import decision, settle
 from tests.support.waiting import eventually
 
+pytestmark = pytest.mark.nightly
+
 _HOLD = """\
 import fcntl, os, struct, sys
 descriptor = os.open(sys.argv[1], os.O_RDONLY)

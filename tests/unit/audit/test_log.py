@@ -27,6 +27,8 @@ from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog
 
+pytestmark = pytest.mark.nightly
+
 _LIMIT_SECONDS = 30
 
 

@@ -23,6 +23,8 @@ from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old
 
+pytestmark = pytest.mark.nightly
+
 OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 

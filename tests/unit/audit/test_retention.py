@@ -20,6 +20,8 @@ from tests.support.audit import decision, settle
 from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog, Notary
 
+pytestmark = pytest.mark.nightly
+
 _DAY = 86_400_000_000_000
 _LIMIT_SECONDS = 30
 

@@ -28,6 +28,8 @@ from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old
 
+pytestmark = pytest.mark.nightly
+
 _LARGEST = 1 << 20
 
 

@@ -27,6 +27,8 @@ from tests.support.appliance_pair import Member, Story, World, four_takeovers, p
 from tests.support.audit import decision
 from tests.support.forgery import write_anew
 
+pytestmark = pytest.mark.nightly
+
 # ruff: noqa: S608  the attacker's statements are built from fixed words
 
 Kind = TakeoverFindingKind

@@ -27,6 +27,8 @@ from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 from tests.support.small_disk import small_disk
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:

@@ -134,6 +134,7 @@ def test_only_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
     assert sum(path.is_symlink() for path in there.iterdir()) == links
 
 
+@pytest.mark.nightly
 def test_a_full_disk_error_names_the_file(tmp_path: Path) -> None:
     """The system's error names no file; our error names the place where space is needed."""
     with small_disk(tmp_path, "4k"):
@@ -163,6 +164,7 @@ def test_links_and_pipes_are_written_through(tmp_path: Path) -> None:
     assert (tmp_path / "new").read_bytes() == b"one"
 
 
+@pytest.mark.nightly
 def test_writing_to_standard_output_keeps_the_order(tmp_path: Path) -> None:
     """`verb --write /dev/stdout >> file` keeps the file's contents, and the verb's output before and after."""
     file = tmp_path / "file"

@@ -120,6 +120,7 @@ def test_a_bad_certificate_file_is_an_error(
         _context(Path("given"))
 
 
+@pytest.mark.nightly
 def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
     """`rosrv policy check <(command)` reads the command's output: that pipe has a writer."""
     script = (

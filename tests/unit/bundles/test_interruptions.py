@@ -11,6 +11,8 @@ import pytest
 from appliance.bundles.verified_bundles import BundleFolderError, BundleRejectedError, VerifiedBundles
 from tests.support.bundle_site import BundleSite
 
+pytestmark = pytest.mark.nightly
+
 _KILLED, _DONE, _FULL = 9, 0, 7
 
 

@@ -27,6 +27,8 @@ from appliance.collector.connection import CollectorError
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files, everywhere, give
 from tests.support.waiting import allowed
 
+pytestmark = pytest.mark.nightly
+
 METADATA = "/v1/bundles/metadata"
 
 

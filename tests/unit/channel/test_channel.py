@@ -13,7 +13,7 @@ import pytest
 from appliance.channel.channel import SOON_SECONDS, Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, Message, Ping, Pong, ProbeFailed, SocketKept, StateBegan
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 Pair = tuple[Channel, Channel]
 

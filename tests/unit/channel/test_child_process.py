@@ -5,6 +5,8 @@ import socket
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+import pytest
+
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.channel.messages import (
@@ -18,6 +20,8 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
+
+pytestmark = pytest.mark.nightly
 
 
 class Bench:

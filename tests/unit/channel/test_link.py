@@ -11,7 +11,7 @@ from appliance.channel.link import Link
 from appliance.channel.messages import Ping, Pong
 from tests.support.heard import Heard
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class World:

@@ -25,6 +25,7 @@ def test_the_table_matches_the_verbs() -> None:
         assert " ".join(own.split("\n\n", maxsplit=1)[0].split()) == verb.help, name
 
 
+@pytest.mark.nightly
 def test_a_verb_imports_only_what_it_needs() -> None:
     """`rosrv` alone, and a query to a running appliance, import no network library, REST server, bags or compiler."""
     program = (
@@ -54,6 +55,7 @@ def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
     assert "Usage: " in shown.output
 
 
+@pytest.mark.nightly
 def test_the_completion_script_is_valid_bash(tmp_path: Path) -> None:
     """Bash runs the output of `--show-completion bash`, and the function offers verbs."""
     env = {

@@ -5,6 +5,10 @@ import pty
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.nightly
+
 PROGRAM = """
 from rosmop.tool.progress_bar import progress
 with progress("working", lambda: 10, shares_screen={shares}) as told:

@@ -25,6 +25,8 @@ from tests.support.answers import example
 from tests.support.fake_appliance import TOKEN, FakeAppliance
 from tests.support.waiting import eventually
 
+pytestmark = pytest.mark.nightly
+
 _LIMIT_SECONDS = 60
 _ANSI = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 _SERVED = {

@@ -22,6 +22,8 @@ from tests.support.bags import make_bag, number
 from tests.support.fake_appliance import FakeAppliance
 from tests.support.transcript import Section, Transcript, sections
 
+pytestmark = pytest.mark.nightly
+
 BASE = 1_767_225_600
 """2026-01-01T00:00:00Z, the beginning of all recordings."""
 

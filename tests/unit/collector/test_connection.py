@@ -27,6 +27,8 @@ from tests.support.lying_collector import Lie, Visitor, lying_collector
 from tests.support.waiting import allowed, eventually
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
 
+pytestmark = pytest.mark.nightly
+
 __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures and their types
 
 _SECONDS = 0.4

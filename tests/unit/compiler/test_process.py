@@ -37,7 +37,7 @@ b() { event said() /chatter std_msgs/String '{}' { if (shared > 3) { } } }
 DEFINITIONS = {"own_msgs/Seen.msg": "std_msgs/Header header\ngeometry_msgs/Point[] at\n"}
 HUNGRY = "s() { event e() /a std_msgs/Bool '{}' { " + "int x; x = 1 + 2 * 3; " * 2000 + " } }"
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 async def conversation(*wanted: messages.Message) -> list[Any]:

@@ -73,6 +73,7 @@ async def test_an_order_past_its_timeout_is_withdrawn(
         assert "nothing was changed" in answer.error
 
 
+@pytest.mark.nightly
 async def test_a_late_order_that_took_effect_is_answered(tmp_path: Path) -> None:
     """An order that takes effect before the tool gives up is answered as done."""
     async with served(tmp_path) as slow:
@@ -81,6 +82,7 @@ async def test_a_late_order_that_took_effect_is_answered(tmp_path: Path) -> None
         assert (answer.ok, slow.done) == (True, 1)
 
 
+@pytest.mark.nightly
 async def test_a_tool_without_an_answer_says_how_to_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,6 +96,7 @@ async def test_a_tool_without_an_answer_says_how_to_check(
             await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
 
 
+@pytest.mark.nightly
 async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
     """The order of a killed tool changes nothing; the next tool is served."""
     async with served(tmp_path) as slow:

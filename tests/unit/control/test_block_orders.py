@@ -26,7 +26,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 NODE, ROBOT, OTHER = "10.0.0.5", "10.0.0.1", "10.0.0.7"
 SECOND = 1_000_000_000
 

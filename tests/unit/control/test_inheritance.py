@@ -12,6 +12,8 @@ from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.store.state_file import StateStore
 from tests.support.standby_site import memberships
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:

@@ -21,7 +21,7 @@ from appliance.rpc.server import HttpRequest, Peer
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 WAIT = 30.0
 CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"

@@ -23,7 +23,7 @@ from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Standby:

@@ -27,7 +27,7 @@ from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 
 

@@ -18,7 +18,7 @@ from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
 from tests.support.idle import idle, idle_class
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 URI = "http://10.0.0.5:4000/"
 
 

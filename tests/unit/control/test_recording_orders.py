@@ -19,7 +19,7 @@ from appliance.recorder.recording_plan import RecordingPlan
 from appliance.recorder.recording_store import MOST_TEMPORARY
 from appliance.telemetry.audit_trail import AuditTrail
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 KEPT = Recording(
     "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""

@@ -31,7 +31,7 @@ from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.heard import Heard
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=86_400)
 ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=86_400)

@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.nightly
+
 # Pieces of a hundred megabytes are freed below the last piece, which is still in use. The child ends once most of them
 # are returned; otherwise the time limit of the test ends it.
 _FREED = """

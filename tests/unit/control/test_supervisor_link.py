@@ -21,7 +21,7 @@ from appliance.channel.messages import (
 )
 from appliance.control.supervisor_link import ROUTES_AT_ONCE, ControlLifeline
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 _LIMIT_SECONDS = 30
 

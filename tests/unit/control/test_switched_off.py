@@ -10,6 +10,8 @@ import pytest
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.store.state_file import StateStore
 
+pytestmark = pytest.mark.nightly
+
 
 class Scene:
     """Monitors and a policy for the watch; `recorded` are the alarms."""

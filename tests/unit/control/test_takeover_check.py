@@ -22,7 +22,7 @@ from tests.support.site_key import LINE, signed
 from tests.support.standby_site import memberships
 from tests.unit.specifications.monitor_desk import TEXTS, here
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 SECONDS = 60
 
 

@@ -15,6 +15,8 @@ from appliance.audit.search import search
 from tests.support.appliance_pair import Member, World, play
 from tests.support.waiting import eventually
 
+pytestmark = pytest.mark.nightly
+
 
 def records(member: Member, event: str) -> list[dict[str, Any]]:
     """Return the details of the records of an event, the oldest first; `reason` is added."""

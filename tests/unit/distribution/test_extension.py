@@ -13,6 +13,8 @@ import pytest
 from distribution.checkout import ROOT
 from distribution.extension import IN_PLACE, SOURCE
 
+pytestmark = pytest.mark.nightly
+
 _TEXT = '''"""A small module."""
 
 from libc.string cimport memcpy

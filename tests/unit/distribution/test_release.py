@@ -9,6 +9,8 @@ import pytest
 
 from distribution.release import main, release
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def released(tmp_path: Path) -> Path:

@@ -40,6 +40,8 @@ from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old
 from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
 
+pytestmark = pytest.mark.nightly
+
 Members = dict[str, bytes]
 
 

@@ -17,6 +17,8 @@ from tests.unit.audit.conftest import key, make_log, notary, path
 from tests.unit.evidence.conftest import Control, control
 from tests.unit.evidence.test_bundle import members_of, written
 
+pytestmark = pytest.mark.nightly
+
 __all__ = ["control", "key", "make_log", "notary", "path"]
 
 

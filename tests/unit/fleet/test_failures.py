@@ -102,6 +102,7 @@ def test_retention_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert (drop.calls, work.trouble) == (2, f"retention: {_DEFECT}")
 
 
+@pytest.mark.nightly
 def test_rollouts_continue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the defect, the next tick reads the robots again."""
     monkeypatch.setattr(service, "_PAUSE_SECONDS", 0.0)

@@ -128,6 +128,7 @@ def test_a_repeated_request_changes_nothing(data: Path, tmp_path: Path) -> None:
     assert _acts(data) == before
 
 
+@pytest.mark.nightly
 def test_two_robots_cannot_join_with_one_key(data: Path, tmp_path: Path) -> None:
     """If eight robots with one log key and one certificate join at the same time, one is enrolled."""
     key, certificate = (file.read_bytes() for file in _files(tmp_path, "arm7"))
@@ -234,6 +235,7 @@ def test_an_act_that_fails_is_recorded_as_failed(
     assert failed["result"].startswith("failed: [Errno 28] No space left on device")
 
 
+@pytest.mark.nightly
 def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) -> None:
     """A command that is killed before the change leaves an act without a result; later acts have their own lines."""
     key, certificate = map(str, _files(tmp_path, "arm7"))
@@ -258,6 +260,7 @@ def test_a_kill_between_the_record_and_the_change(data: Path, tmp_path: Path) ->
     assert [json.loads(line)["result"] for line in lines[2:]] == ["asked", "done"]
 
 
+@pytest.mark.nightly
 def test_two_changes_of_tokens_do_not_undo_each_other(tmp_path: Path) -> None:
     """Tokens that are added at the same time are all there afterwards."""
     tokens = OperatorTokens(tmp_path / "tokens.json")

@@ -4,11 +4,14 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 from tests.support.sources import ROOT
 
 SHIPPED = set(re.findall(r'"appliance/(\w+)"', (ROOT / "fleet/pyproject.toml").read_text()))
 
 
+@pytest.mark.nightly
 def test_the_collector_imports_only_what_is_shipped_with_it() -> None:
     """`rosrv-fleet` loads only the shipped modules of the appliance, and none of the other products."""
     program = "import rosrv_fleet.cli, sys; print(*sys.modules)"

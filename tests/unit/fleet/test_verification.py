@@ -17,6 +17,8 @@ from appliance.audit.segments import write_segment
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary, key, make_log, notary, path
 
+pytestmark = pytest.mark.nightly
+
 __all__ = ["MakeLog", "Notary", "key", "make_log", "notary", "path"]  # fixtures and their types
 
 _OLD = 1_500_000_000 * 10**9

@@ -5,9 +5,12 @@ import os
 import signal
 from pathlib import Path
 
+import pytest
 from rosrv_fleet.workers import Workers
 
 from tests.support.waiting import eventually
+
+pytestmark = pytest.mark.nightly
 
 
 def _hold(file: Path) -> None:

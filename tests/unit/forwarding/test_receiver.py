@@ -13,6 +13,8 @@ from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import LIMIT
 from tests.support.syslog import DatagramCollector, StreamCollector
 
+pytestmark = pytest.mark.nightly
+
 HOST = "127.0.0.1"
 
 

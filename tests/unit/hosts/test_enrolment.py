@@ -70,7 +70,7 @@ from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
 from tests.support.near_authority import NearAuthority
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Bench:

@@ -15,6 +15,8 @@ from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
 
+pytestmark = pytest.mark.nightly
+
 DAY = 86_400.0
 LONGEST = 65_535  # bytes of a value of vici
 _NUMBERS = itertools.count(1 << 70)

@@ -18,7 +18,7 @@ from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from tests.support.near_authority import NearAuthority
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 FIRST, SECOND = "10.0.0.2", "10.0.0.3"
 PIN = "sha256//" + 43 * "A" + "="

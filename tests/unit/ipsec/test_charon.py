@@ -16,6 +16,8 @@ from appliance.channel.messages import TunnelHost, TunnelsStated
 from appliance.ipsec.charon import CharonError, ViciClient
 from appliance.ipsec.strongswan import connection_name
 
+pytestmark = pytest.mark.nightly
+
 
 class Standing(NamedTuple):
     """An open tunnel: the name of its connection, the number of its IKE SA, and that of its child SA (0: none)."""

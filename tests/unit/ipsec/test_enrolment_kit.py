@@ -64,6 +64,7 @@ def test_a_host_that_made_its_key_gets_none() -> None:
     assert "rosrv-ocu-1/swanctl/private/rosrv.key" not in unpack(replace(KIT, key=None))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("script", ["join.sh", "leave.sh", "keep.sh", "renew.sh"])
 def test_scripts_are_complete_shell(script: str) -> None:
     """The shell reads them without an error, and every placeholder was replaced."""
@@ -117,6 +118,7 @@ def test_the_script_removes_the_rule_that_does_not_apply() -> None:
         assert sum(" saddr {" in line for line in left) == 1
 
 
+@pytest.mark.nightly
 def test_a_kit_says_where_its_certificate_is_renewed() -> None:
     """The kit has URL and pin of REST in the tunnel; where it is unreachable, the script says so instead."""
     host = structs.replace(HOST, rest_url="https://10.113.11.1:8443", pin="sha256//pin=")

@@ -16,6 +16,8 @@ from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
+pytestmark = pytest.mark.nightly
+
 SPELLINGS = {"before 3.2": "s/CN *= */CN = /; s/O *= */O = /", "3.2": "s/CN *= */CN=/; s/O *= */O=/"}
 
 

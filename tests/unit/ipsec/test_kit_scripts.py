@@ -13,6 +13,7 @@ FOLDER = Path(appliance.ipsec.__file__).parent / "kit_files"
 SCRIPTS = sorted(FOLDER.glob("*.sh"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
 def test_it_is_for_the_plainest_shell(script: Path) -> None:
     """dash, which is /bin/sh on Debian and Ubuntu, can read it; it uses no feature of bash."""
@@ -47,6 +48,7 @@ def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
     assert len(raw) == (script.name == "renew.sh")
 
 
+@pytest.mark.nightly
 def test_a_zombie_does_not_count_as_running() -> None:
     """Process 1 of a container may not collect its children: waiting for such a program would never end."""
     runs = next(line for line in (FOLDER / "stop.inc").read_text().splitlines() if line.startswith("runs() "))

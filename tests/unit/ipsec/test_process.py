@@ -62,6 +62,7 @@ class Bench(process.TunnelProcess):
         return cast(ViciClient, self.conversation)
 
 
+@pytest.mark.nightly
 async def test_charon_gets_one_request_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A query of the tunnels waits for the configuration: otherwise each would read the other's answers."""
     monkeypatch.setattr(process, "REPORT_SECONDS", 0.01)
@@ -124,6 +125,7 @@ class ListeningBench(Bench):
         return vici
 
 
+@pytest.mark.nightly
 async def test_no_report_is_older_than_the_changes_before_it(tmp_path: Path) -> None:
     """Control would count the tunnel as closed, and then as open again."""
     (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
@@ -197,6 +199,7 @@ def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.M
     assert said.reason.startswith("charon exited by SIGSEGV; its last output: xxx")
 
 
+@pytest.mark.nightly
 def test_charon_is_not_started_without_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If ESP runs in user space and the TUN device cannot be opened, the error gives advice."""
     monkeypatch.setattr(process, "PROGRAM", tmp_path / "none")

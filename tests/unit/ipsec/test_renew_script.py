@@ -13,6 +13,8 @@ from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
+pytestmark = pytest.mark.nightly
+
 CURL = """#!/bin/sh
 for one; do url=$one; done
 while [ $# -gt 0 ]; do

@@ -53,7 +53,7 @@ from appliance.ipsec.removals import RetentionLimits
 from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 _LIMIT_SECONDS = 30
 _TEXT = (

@@ -22,7 +22,7 @@ from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
 from tests.support.heard import Heard
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 REVOKE = ClientRequest("10.0.0.1", "DELETE", "/v1/hosts/laptop", '"3"', "", "", b"")
 LOAD = ClientRequest("10.0.0.1", "POST", "/v1/policy", '"3"', "text/plain", "", b"[Nodes]\n")

@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.nightly
+
 
 def said(*arguments: str) -> list[str]:
     """Return the output of a history in a separate process, in which a seed always gives the same history."""

@@ -13,6 +13,8 @@ from appliance.network import esp
 from appliance.network.namespaces import Namespace, NetworkError
 from tests.support.requirements import need_root
 
+pytestmark = pytest.mark.nightly
+
 
 def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
     """Let `ip` end with this status; return the commands it received."""

@@ -11,6 +11,8 @@ import pytest
 from appliance.network import hang_detection as patience
 from appliance.network.hang_detection import ProcessActivity, communicate
 
+pytestmark = pytest.mark.nightly
+
 BUSY = """
 import sys, time
 while time.process_time() < 0.8:

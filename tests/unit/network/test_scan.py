@@ -12,6 +12,8 @@ import pytest
 from appliance.network.namespaces import NetworkError
 from appliance.network.scan import addresses_of, scan
 
+pytestmark = pytest.mark.nightly
+
 
 def test_open_and_refused_ports_differ() -> None:
     """A port with a listener is open; a port that is bound but not listening is refused."""

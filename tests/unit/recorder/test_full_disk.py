@@ -12,6 +12,8 @@ from appliance.channel.answers.recording_answers import Recording, Trigger
 from tests.support.small_disk import small_disk
 from tests.unit.recorder.test_recorder import SECOND, TEXT, Scene
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:

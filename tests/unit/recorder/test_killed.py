@@ -18,6 +18,8 @@ from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.recorder.mcap import as_mcap
 from tests.unit.recorder.test_recorder import BEGAN, SECOND, Scene
 
+pytestmark = pytest.mark.nightly
+
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.chmod")
 _TOLD = (messages.RecordingClosed, messages.RecordingRemoved)
 _KILLED = 9

@@ -295,6 +295,7 @@ _WRITER = textwrap.dedent("""
 """)
 
 
+@pytest.mark.nightly
 def test_killed_at_random(tmp_path: Path) -> None:
     """A writer killed thirty times at random on the same memory leaves whole messages without a gap."""
     chance = random.Random(7)  # noqa: S311 - to find the same again

@@ -56,6 +56,8 @@ from tests.unit.relay.dialogue import Dialogue
 from tests.unit.relay.world import ASK, CALL, HEADER, IMPATIENT, LIMITS, LOOPBACK, Peer, World
 from tests.unit.transcripts import transcripts
 
+pytestmark = pytest.mark.nightly
+
 impatient = pytest.mark.parametrize("world", [IMPATIENT], indirect=True)
 
 

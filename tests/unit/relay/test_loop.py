@@ -8,6 +8,8 @@ import pytest
 
 from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, EventLoop
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def loop() -> Iterator[EventLoop]:

@@ -10,6 +10,8 @@ from tests.support.stated import stated
 from tests.unit.relay.monitors.monitored import string
 from tests.unit.relay.pump_comparison import ComparedRelay, PumpComparison
 
+pytestmark = pytest.mark.nightly
+
 _SEED = 20261124
 _COUNTS = "counts() { int n; event e(std::string s) /chatter std_msgs/String '{data:s}' { n = n + 1; } }"
 

@@ -21,6 +21,8 @@ from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.transport.loop_channel import LoopLink
 
+pytestmark = pytest.mark.nightly
+
 ROW = TopicTraffic("k", "/chatter", 1, 2, 0, 1)
 
 

@@ -21,6 +21,8 @@ from appliance.relay.relay_limits import MIB
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
+pytestmark = pytest.mark.nightly
+
 SMALL_RELAY = replace(
     LIMITS,
     memory_bytes=64 * MIB,

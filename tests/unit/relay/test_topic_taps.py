@@ -10,6 +10,8 @@ from appliance.relay.topic_taps import MOST_LOOKS, MOST_MESSAGES
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, HEADER, Peer, World
 
+pytestmark = pytest.mark.nightly
+
 TOLD = HEADER | {"message_definition": "string data\n"}
 
 

@@ -13,6 +13,7 @@ RULE = "=" * 80
 Types = dict[str, dict[str, Any]]
 
 
+@pytest.mark.nightly
 def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
     """The full text of every installed message gives the md5sum that nodes compare."""
     for name, entry in genpy_types.items():
@@ -20,6 +21,7 @@ def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
             assert Definitions.from_full_text(name, entry["text"]).md5sum(name) == entry["md5sum"], name
 
 
+@pytest.mark.nightly
 def test_full_texts_come_back_as_they_were(genpy_types: Types) -> None:
     """The full text that is built from definitions equals the output of ROS's generators, byte for byte."""
     for name, entry in genpy_types.items():

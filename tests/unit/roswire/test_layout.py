@@ -4,6 +4,8 @@ import struct
 from itertools import pairwise
 from typing import Any
 
+import pytest
+
 from roswire.definitions import Definitions
 from roswire.message_layout import ArrayPart, FieldLocation, FixedField, FixedPart, MessageLayout, StringPart
 from roswire.message_text import PRIMITIVES
@@ -95,6 +97,7 @@ def without_empty(value: Any) -> Any:
     return value
 
 
+@pytest.mark.nightly
 def test_messages_of_genpy_are_read_by_their_layout(genpy_types: dict[str, dict[str, Any]]) -> None:
     """For every installed message, a serialised example is read completely, and its values are equal."""
     read_types = 0

@@ -42,6 +42,7 @@ def rosmaster() -> Iterator[Oracle]:
         to_oracle.close()
 
 
+@pytest.mark.nightly
 @settings(max_examples=examples(2000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
@@ -55,6 +56,7 @@ def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: 
     assert names.resolve(resolved, "/other/node") == resolved
 
 
+@pytest.mark.nightly
 @settings(max_examples=examples(1000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
@@ -69,6 +71,7 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
         assert resolved == "/" or not resolved.endswith("/")
 
 
+@pytest.mark.nightly
 @settings(max_examples=examples(500))
 @given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:

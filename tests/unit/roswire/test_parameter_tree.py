@@ -4,7 +4,11 @@ import json
 import random
 import subprocess
 
+import pytest
+
 from roswire.parameter_tree import Tree, names_in
+
+pytestmark = pytest.mark.nightly
 
 KEYS = ("a", "b1", "c_d", "/e", "~f", "~", "g/h", "i/", "/", "")
 _ASK = """

@@ -2,9 +2,12 @@
 
 from typing import Any
 
+import pytest
+
 from roswire.definitions import Definitions
 
 
+@pytest.mark.nightly
 def test_md5sums_are_those_of_the_installed_packages(
     standard: Definitions, genpy_types: dict[str, dict[str, Any]]
 ) -> None:

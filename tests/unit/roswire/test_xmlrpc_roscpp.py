@@ -12,6 +12,8 @@ import pytest
 from roswire.xmlrpc import MethodCall, Value, build_fault, build_response, parse_call
 from tests.support.requirements import need_program
 
+pytestmark = pytest.mark.nightly
+
 Peer = Callable[[bytes], MethodCall]
 
 

@@ -21,6 +21,7 @@ def test_plain_address(text: str, plain: str) -> None:
     assert plain_address(text) == ipaddress.ip_address(plain)
 
 
+@pytest.mark.nightly
 def test_listen_on_both_families() -> None:
     """`::` takes IPv4 peers as well."""
     with listen("::", 0) as sock, socket.create_connection(("127.0.0.1", sock.getsockname()[1]), WAIT):
@@ -29,6 +30,7 @@ def test_listen_on_both_families() -> None:
         assert plain_address(address[0]) == ipaddress.ip_address("127.0.0.1")
 
 
+@pytest.mark.nightly
 def test_listen_on_a_port_in_use() -> None:
     """A port in use is an error, and no socket is left open."""
     with listen("127.0.0.1", 0) as sock, pytest.raises(OSError, match="in use"):

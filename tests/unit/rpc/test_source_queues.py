@@ -95,6 +95,7 @@ def port() -> Iterator[Callable[..., Port]]:
         yield opened
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "::"])
 def test_the_kernel_sorts_connections(port: Callable[..., Port], host: str) -> None:
     """Also those that come over IPv4 to a socket of IPv6."""
@@ -105,6 +106,7 @@ def test_the_kernel_sorts_connections(port: Callable[..., Port], host: str) -> N
         both.accepts(source, both.queues.second)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("known", "first"), [("::1", True), ("::/0", True), ("::2", False), ("127.0.0.0/8", False)]
 )
@@ -114,6 +116,7 @@ def test_the_kernel_sorts_connections_of_ipv6(port: Callable[..., Port], known: 
     both.accepts("::1", both.first if first else both.queues.second)
 
 
+@pytest.mark.nightly
 def test_a_full_queue_keeps_no_host_of_the_other_one_out(port: Callable[..., Port]) -> None:
     """Unknown hosts fill their queue: a known host connects at once."""
     both = port("127.0.0.1", "127.0.0.2/32")
@@ -128,6 +131,7 @@ def test_a_full_queue_keeps_no_host_of_the_other_one_out(port: Callable[..., Por
             both.first.accept()[0].close()
 
 
+@pytest.mark.nightly
 def test_a_new_policy_changes_the_queues(port: Callable[..., Port]) -> None:
     """The program is attached again when it is another one."""
     both = port("127.0.0.1", "127.0.0.2/32")
@@ -137,6 +141,7 @@ def test_a_new_policy_changes_the_queues(port: Callable[..., Port]) -> None:
     both.accepts("127.0.0.2", both.queues.second)
 
 
+@pytest.mark.nightly
 def test_the_first_socket_outlives_the_second(port: Callable[..., Port]) -> None:
     """Control ends, and its second socket with it: all connections wait at the first, and the next control sorts."""
     both = port("127.0.0.1", "127.0.0.2/32")
@@ -150,6 +155,7 @@ def test_the_first_socket_outlives_the_second(port: Callable[..., Port]) -> None
     both.queues.second.close()
 
 
+@pytest.mark.nightly
 def test_a_port_with_two_sockets_is_in_use(port: Callable[..., Port]) -> None:
     """A search for a free port passes it by."""
     both = port("127.0.0.1")

@@ -72,6 +72,7 @@ async def test_a_large_call_has_more_time() -> None:
     server.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "chunk", [b"1\r\nx\r\n", b"2000\r\n" + b"x" * 0x2000 + b"\r\n"], ids=["bytes", "blocks"]
 )

@@ -67,6 +67,7 @@ def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
     channel.close()
 
 
+@pytest.mark.nightly
 async def test_the_compiler_is_started_for_the_first_question() -> None:
     """It is started once for all questions, and not if there are no files."""
     scene = Scene(finds, refuses, finds)
@@ -80,6 +81,7 @@ async def test_the_compiler_is_started_for_the_first_question() -> None:
     scene.close()
 
 
+@pytest.mark.nightly
 async def test_a_compiler_that_just_ended_is_replaced() -> None:
     """The next compiler gets the same question."""
     scene = Scene(dies, finds)
@@ -88,6 +90,7 @@ async def test_a_compiler_that_just_ended_is_replaced() -> None:
     scene.close()
 
 
+@pytest.mark.nightly
 async def test_only_texts_that_crash_it_are_refused() -> None:
     """A text that crashes the compiler never comes into force."""
     scene = Scene(dies, dies, finds)
@@ -97,6 +100,7 @@ async def test_only_texts_that_crash_it_are_refused() -> None:
     scene.close()
 
 
+@pytest.mark.nightly
 async def test_a_silent_or_missing_compiler_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -12,6 +12,8 @@ from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import settle
 
+pytestmark = pytest.mark.nightly
+
 NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")
 
 

@@ -21,7 +21,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import RecordingTrail
 from tests.support.stated import parts_here
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 def spec(name: str, *topics: str) -> str:

@@ -26,7 +26,7 @@ from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.unit.specifications.monitor_desk import A, B, Desk, Dialogue, here
 from tests.unit.transcripts import played, transcripts
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 @pytest.fixture

@@ -22,6 +22,8 @@ from appliance.standby.replication_frames import Stored
 from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from tests.support.examples import examples
 
+pytestmark = pytest.mark.nightly
+
 ADDRESSES = {"a": "10.0.0.2", "b": "10.0.0.3"}
 KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
 MEMBERSHIP = Membership(

@@ -28,6 +28,8 @@ from appliance.store.writer_thread import Database, StoreError
 from tests.support.replication import SCHEMA, tables_of
 from tests.support.small_disk import small_disk
 
+pytestmark = pytest.mark.nightly
+
 BEGIN = SnapshotBegin(3, "h", 7)
 
 

@@ -12,7 +12,7 @@ from appliance.standby.replica_sync import ReplicaSync
 from appliance.store.state_file import SCHEMA
 from tests.support.processes import LIMIT
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 @pytest.fixture

@@ -62,7 +62,7 @@ from tests.support.replication import (
 )
 from tests.support.waiting import allowed
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 SECONDS = 2 * LIMIT
 
 

@@ -10,6 +10,8 @@ import pytest
 
 from tests.support.replication import certificates, listening_socket, tables_of
 
+pytestmark = pytest.mark.nightly
+
 
 class Side:
     """One process, which is killed and started again."""

@@ -455,6 +455,7 @@ def test_connections_are_found_in_the_tables_of_the_kernel() -> None:
 SOURCE = Path(program.__file__).read_text()
 
 
+@pytest.mark.nightly
 def test_it_runs_on_python_3_5() -> None:
     """Its syntax and its library are those of Python 3.5: Ubuntu 16.04."""
     ast.parse(SOURCE, feature_version=(3, 5))

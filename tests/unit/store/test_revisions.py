@@ -11,7 +11,7 @@ from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import StoreError
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class RefusedError(Exception):

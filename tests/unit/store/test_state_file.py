@@ -18,6 +18,8 @@ from appliance.store.state_file import (
     StateStore,
 )
 
+pytestmark = pytest.mark.nightly
+
 
 def incarnation(key: str) -> IncarnationRow:
     """A row that differs by its key."""

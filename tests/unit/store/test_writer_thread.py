@@ -27,7 +27,7 @@ from appliance.store.changes import Change, ChangeError, Delete, Put, Tables, jo
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.small_disk import small_disk
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 KILLED = """
 import os, signal, sys

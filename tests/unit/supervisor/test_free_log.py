@@ -11,6 +11,8 @@ from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.roles import Facts, roles_of
 from appliance.supervisor.supervisor import Supervisor
 
+pytestmark = pytest.mark.nightly
+
 
 class _Life:
     """Stands in for a process."""

@@ -8,6 +8,8 @@ import pytest
 
 from appliance.supervisor.roles import ROLES
 
+pytestmark = pytest.mark.nightly
+
 NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", "rosmop.run.engine"}
 """Libraries that only help texts, specifications or a namespace need."""
 

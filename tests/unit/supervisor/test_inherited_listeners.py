@@ -8,6 +8,8 @@ import pytest
 
 from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def kept() -> Iterator[InheritedListeners]:

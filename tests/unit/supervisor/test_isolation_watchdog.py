@@ -58,6 +58,7 @@ def surroundings() -> Surroundings:
     return Surroundings()
 
 
+@pytest.mark.nightly
 async def test_control_learns_of_each_opening_and_closing(surroundings: Surroundings) -> None:
     """A finding is sent with its reason, and so is its end; both have the report."""
     told: list[Message] = []
@@ -69,6 +70,7 @@ async def test_control_learns_of_each_opening_and_closing(surroundings: Surround
     assert told == [report, ProbeFailed("reached"), report, ProbePassed()]
 
 
+@pytest.mark.nightly
 async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surroundings) -> None:
     """An unknown state does not count as closed."""
     told: list[Message] = []
@@ -77,6 +79,7 @@ async def test_a_probe_that_cannot_be_made_counts_as_open(surroundings: Surround
     assert isinstance(told[-1], ProbeFailed)
 
 
+@pytest.mark.nightly
 async def test_a_new_control_receives_the_last_finding(surroundings: Surroundings) -> None:
     """A control that starts after the finding still receives it."""
     surroundings.found = ["reached"]
@@ -86,6 +89,7 @@ async def test_a_new_control_receives_the_last_finding(surroundings: Surrounding
     assert watchdog.news()[-1] == ProbeFailed("reached")
 
 
+@pytest.mark.nightly
 async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surroundings) -> None:
     """The port is closed to others and then probed; if it cannot be closed, that is a finding."""
     surroundings.found = [None]
@@ -96,6 +100,7 @@ async def test_the_master_side_port_is_closed_and_then_probed(surroundings: Surr
     assert surroundings.found == []
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("port", [0, 1])
 async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     surroundings: Surroundings, port: int
@@ -128,6 +133,7 @@ async def test_a_failing_probe_is_a_finding_and_probes_go_on(
     assert str(broken) in failed.reason
 
 
+@pytest.mark.nightly
 def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) -> None:
     """Control waits for the answer, so an unexpected error is also answered."""
     answer = asyncio.run(
@@ -150,6 +156,7 @@ async def test_probes_are_repeated(surroundings: Surroundings) -> None:
     assert [type(one) for one in told[1:6:2]] == [ProbePassed, ProbeFailed, ProbePassed]
 
 
+@pytest.mark.nightly
 async def test_without_isolation_nothing_is_probed() -> None:
     """Isolation `none` is not probed, and is not reported as proved."""
     told: list[Message] = []
@@ -157,6 +164,7 @@ async def test_without_isolation_nothing_is_probed() -> None:
     assert told == [FirewallReported("none", FirewallState())]
 
 
+@pytest.mark.nightly
 def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundings) -> None:
     """Control receives the reason; the supervisor raises nothing."""
     assert asyncio.run(IsolationWatchdog(surroundings, lambda _message: None).endpoint()) == EndpointFound(

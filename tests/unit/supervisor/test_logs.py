@@ -4,6 +4,10 @@ import json
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.nightly
+
 _PROGRAM = """
 import logging, structlog
 from appliance.supervisor.logs import configure_logs

@@ -8,6 +8,8 @@ import pytest
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free, free_port, require_free, spare_ports
 
+pytestmark = pytest.mark.nightly
+
 
 def test_a_free_port_is_free() -> None:
     """The appliance can listen on the chosen port."""

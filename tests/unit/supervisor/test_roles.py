@@ -31,6 +31,7 @@ def test_rosmaster_runs_no_code_of_its_home() -> None:
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
 
 
+@pytest.mark.nightly
 def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
     """Logging each call would cost rosmaster half of its time; its warnings are still logged."""
     role = BY_NAME["rosmaster"]

@@ -45,6 +45,7 @@ FACTS = Facts(Path("/s"), Path("/s/run/config.json"), 12311, "http://127.0.0.1:5
 HERE = Path("/bin/true")
 
 
+@pytest.mark.nightly
 def test_only_sockets_of_granted_families_can_be_opened() -> None:
     """A process that may open only Unix sockets cannot open network sockets, nor can its child programs."""
     done = subprocess.run(

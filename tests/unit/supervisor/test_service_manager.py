@@ -5,6 +5,8 @@ import os
 import socket
 from pathlib import Path
 
+import pytest
+
 from appliance.supervisor.service_manager import ServiceManager
 
 
@@ -16,6 +18,7 @@ def listening(path: Path) -> socket.socket:
     return heard
 
 
+@pytest.mark.nightly
 def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
     """A start reports its steps and times, `READY=1` when nodes may connect, and `STOPPING=1` at an orderly end."""
     with listening(tmp_path / "notify") as heard:
@@ -28,6 +31,7 @@ def test_start_ready_and_stop_are_reported(tmp_path: Path) -> None:
         assert heard.recv(4096).startswith(b"STOPPING=1\n")
 
 
+@pytest.mark.nightly
 def test_the_watchdog_is_fed_twice_in_its_time(tmp_path: Path) -> None:
     """While the loop runs, the watchdog is notified after each half of its interval; a start gets more time."""
     environment = {
@@ -60,6 +64,7 @@ def test_without_a_service_manager_nothing_is_sent() -> None:
     assert manager.watchdog_seconds is None
 
 
+@pytest.mark.nightly
 def test_a_service_manager_that_has_gone_stops_nothing(tmp_path: Path) -> None:
     """A missing socket does not end the appliance."""
     ServiceManager(str(tmp_path / "gone"), None).ready("nobody hears it")

@@ -6,6 +6,10 @@ Each test runs a separate process: a signal to a thread of the test runner would
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.nightly
+
 _BEGIN = """
 import os, signal, threading
 from appliance.supervisor import signals

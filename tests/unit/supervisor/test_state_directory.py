@@ -53,6 +53,7 @@ def test_a_second_user_of_the_directory_is_refused_by_name(tmp_path: Path) -> No
     StateDirectory(tmp_path).close()
 
 
+@pytest.mark.nightly
 def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
     """A socket left by a crash does not stop the next start from listening."""
     state = StateDirectory(tmp_path)
@@ -63,6 +64,7 @@ def test_a_stale_admin_socket_is_replaced(tmp_path: Path) -> None:
     assert not (tmp_path / "admin.sock").exists()
 
 
+@pytest.mark.nightly
 def test_a_path_too_long_for_a_socket_is_a_clear_error(tmp_path: Path) -> None:
     """The kernel accepts at most 107 bytes; the message advises a shorter path."""
     state = StateDirectory(tmp_path / ("x" * 120))

@@ -17,7 +17,7 @@ from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 READY = ControlReady("http://127.0.0.1:11311", 1, "http://127.0.0.1:2", 3, 4, "secret")
 CONTROL = Role(name="control", user="rosrv", part="control", entry="m:f")

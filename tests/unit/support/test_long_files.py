@@ -3,6 +3,8 @@
 import subprocess
 from pathlib import Path
 
+import pytest
+
 TESTS = Path(__file__).parents[2]
 
 
@@ -12,6 +14,7 @@ def test_every_long_file_exists() -> None:
     assert [name for name in names if not name.startswith("#") and not (TESTS.parent / name).is_file()] == []
 
 
+@pytest.mark.nightly
 def test_rules_on_the_source_run_with_make_check() -> None:
     """They are long, but what `make check` accepts must not fail in CI by a word in a comment."""
     command = subprocess.run(

@@ -49,6 +49,7 @@ def test_every_recorded_category_is_known() -> None:
     assert written | {TOPIC, SERVICE, *Category, *Kind} == set(CATEGORIES)
 
 
+@pytest.mark.nightly
 def test_search_on_a_terminal_is_a_table(state: Path) -> None:
     """A terminal gets a table, in which escape codes from unknown hosts have no effect."""
     ours, theirs = pty.openpty()
@@ -68,6 +69,7 @@ def test_search_on_a_terminal_is_a_table(state: Path) -> None:
     assert "\u202e".encode() not in shown
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", [[], ["--deny"]], ids=["amid it", "when its only piece is written"])
 def test_an_export_to_a_full_disk_leaves_no_file(state: Path, tmp_path: Path, what: list[str]) -> None:
     """A partial file would look complete, and block the next export."""
@@ -78,6 +80,7 @@ def test_an_export_to_a_full_disk_leaves_no_file(state: Path, tmp_path: Path, wh
         assert [one.name for one in disk.iterdir()] == ["full"]
 
 
+@pytest.mark.nightly
 def test_tail_follows(state: Path) -> None:
     """`tail` shows the last records and new ones, and ends quietly when interrupted."""
     command = [sys.executable, "-m", "appliance.cli.main", "audit", "tail", "-n", "1", "--deny", "--json"]

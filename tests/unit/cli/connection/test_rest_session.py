@@ -13,6 +13,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from tests.support.command import rosrv
 from tests.support.fake_appliance import TOKEN, FakeAppliance
 
+pytestmark = pytest.mark.nightly
+
 
 def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SSLContext:
     """Return a self-signed certificate for an address, and the context that serves it."""

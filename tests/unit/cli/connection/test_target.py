@@ -11,6 +11,8 @@ import pytest
 
 from tests.support.requirements import need_root
 
+pytestmark = pytest.mark.nightly
+
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 NOBODY = ("/usr/bin/setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
 VERBS = [("status",), ("policy", "reload"), ("token", "list"), ("audit", "search"), ("audit", "verify")]

@@ -122,6 +122,7 @@ def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
     assert "share an index" in refusal(place)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("times", [[1000.0], [1000.0, 1000.0], [1000.0, 1000.000000001], [1000.0, 1001.0]])
 @pytest.mark.parametrize("share", ["0", "0.3", "0.9"])
 def test_a_short_recording_is_learned_from(times: list[float], share: str, tmp_path: Path) -> None:

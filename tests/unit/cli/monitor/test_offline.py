@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
@@ -38,6 +39,7 @@ def last(state: Path) -> MonitorRevisionRow | None:
         store.close()
 
 
+@pytest.mark.nightly
 def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
     """The next start reads the folder; the old revision is stored, and a second reset does nothing."""
     state = state_with(tmp_path, "operator")
@@ -50,6 +52,7 @@ def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
     assert "nothing to discard" in said
 
 
+@pytest.mark.nightly
 def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
     """The error names the verb for a running appliance."""
     state = state_with(tmp_path, "operator")

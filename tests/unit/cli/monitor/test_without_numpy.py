@@ -12,6 +12,8 @@ from rosbags.rosbag1 import Writer
 
 from roswire.standard import standard_definitions
 
+pytestmark = pytest.mark.nightly
+
 SPECIFICATION = """near() { event scan(std::vector<float> r) /scan sensor_msgs/LaserScan '{ranges:r}' {
     if (r.size() > 3 && r[0] < 0.5) { ROS_WARN("near %g", r[0]); return; } } }"""
 PROGRAM = """

@@ -66,6 +66,7 @@ def test_a_valid_setup_passes(place: Place) -> None:
     assert namespaces(f"rosrv-selftest-{os.getpid()}") == []
 
 
+@pytest.mark.nightly
 def test_a_used_port_names_its_program(place: Place) -> None:
     """The failure names the address, the program that uses it, and the remedy."""
     with socket.create_server(("127.0.0.1", 0)) as other:
@@ -80,6 +81,7 @@ def test_a_used_port_names_its_program(place: Place) -> None:
     assert row["advice"]
 
 
+@pytest.mark.nightly
 def test_a_certificate_that_has_ended_fails(place: Place) -> None:
     """The failure has advice; exit status 1."""
     certificate(place.state, days=-1)

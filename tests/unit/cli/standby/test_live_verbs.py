@@ -14,6 +14,8 @@ from tests.support.answers import example
 from tests.support.command import rosrv
 from tests.support.fake_appliance import FakeAppliance
 
+pytestmark = pytest.mark.nightly
+
 AWAY = AdminAnswer[Any](False, error="RVMaster is being restarted", trouble="failed")
 
 

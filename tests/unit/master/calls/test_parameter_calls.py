@@ -68,6 +68,7 @@ def oracle() -> Any:
         process.stdin.close()
 
 
+@pytest.mark.nightly
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
 def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) -> None:
@@ -240,6 +241,7 @@ def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], 
     assert again.weight == there.weight
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
 def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
     """The ROS master keeps a value even if notifying a subscriber fails; the mirror keeps the value as well."""

@@ -253,6 +253,7 @@ async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
     return asked
 
 
+@pytest.mark.nightly
 async def test_a_long_multicall_yields_after_a_few_parts(site: Site) -> None:
     """A multicall of 9,000 reads yields to other requests after every few parts."""
     reads: list[Value] = [part("hasParam", f"/arm/{number}") for number in range(9000)]
@@ -363,6 +364,7 @@ async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
     assert (await site.ask(ADMIN, "getParam", "/admin", "/arm"))[2] == {"speed": 4711}
 
 
+@pytest.mark.nightly
 async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
     """A small request cannot make the appliance hold many large answers: the rest is refused, with one record."""
     site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
@@ -377,6 +379,7 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
     assert [one[0][0] for one in usual] == [1] * 100
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
 async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
     """Each host gets one large answer at a time, and delays no other host."""

@@ -57,6 +57,7 @@ async def test_a_tool_unregisters_with_the_uris_of_lookups() -> None:
     assert (world.hidden.has(Kind.PUBLICATION, "/t"), world.hidden.has(Kind.SERVICE, "/s")) == ([], [])
 
 
+@pytest.mark.nightly
 async def test_reading_a_parameter_does_not_wait_for_the_master() -> None:
     """The mirror answers; only a large namespace is fetched from the ROS master."""
     world = await ControlParts.begun()

@@ -80,6 +80,7 @@ def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation
     )
 
 
+@pytest.mark.nightly
 def test_closed_ports_are_reused_last(first: int) -> None:
     """Closed ports are given out again only after all others."""
     here = places(first)
@@ -91,6 +92,7 @@ def test_closed_ports_are_reused_last(first: int) -> None:
     here.close_unclaimed(set())
 
 
+@pytest.mark.nightly
 def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
     """A restarted control begins after the ports in use, so ports closed before the crash come last."""
     before = places(first)
@@ -105,6 +107,7 @@ def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
     after.close_unclaimed(set())
 
 
+@pytest.mark.nightly
 def test_a_port_for_every_relay(first: int) -> None:
     """An incarnation gets a port for every relay; without a free port, the error says so."""
     here = places(first, relays=3)
@@ -117,6 +120,7 @@ def test_a_port_for_every_relay(first: int) -> None:
     here.close_unclaimed(set())
 
 
+@pytest.mark.nightly
 def test_another_number_of_relays_after_a_restart(first: int) -> None:
     """After a restart, a node has a port for each present relay and keeps the ports that it already had."""
     before = places(first, relays=2)
@@ -133,6 +137,7 @@ def test_another_number_of_relays_after_a_restart(first: int) -> None:
     fewer.close_unclaimed(set())
 
 
+@pytest.mark.nightly
 def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without file descriptors a node gets an error; afterwards the whole range is still available."""
     held = places(first)
@@ -148,6 +153,7 @@ def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytes
     assert sorted(held.unused) == list(range(first, first + 8))
 
 
+@pytest.mark.nightly
 def test_a_port_of_an_earlier_range_is_not_reused(first: int) -> None:
     """A port outside the policy's new range is closed and not used again."""
     before = places(first + 4, count=4)

@@ -30,7 +30,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
 from tests.support.stated import stated
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 HOST = ipaddress.ip_address("10.0.0.5")
 _UNUSED = object()  # a part that is not used
 

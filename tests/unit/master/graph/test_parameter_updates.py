@@ -57,6 +57,7 @@ def in_order(told: list[Any]) -> list[str]:
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 
+@pytest.mark.nightly
 @settings(max_examples=examples(400), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     SUBSCRIBED,

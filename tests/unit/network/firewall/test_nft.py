@@ -125,6 +125,7 @@ def listed(rules: tuple[PacketRule, ...], *, without: int | None = None) -> str:
     )
 
 
+@pytest.mark.nightly
 def test_a_rate_limit_is_in_force_with_all_its_rules_only() -> None:
     """Each family has a rule for hosts with a bucket and a rule for hosts without; the report joins both."""
     rule = PacketRule(
@@ -168,6 +169,7 @@ class Machine(Namespace):
         return subprocess.Popen([sys.executable, "-c", f"print({self.nft!r})"], **options)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("nft", "said"),
     [

@@ -90,6 +90,7 @@ def ended(sock: socket.socket) -> bool:
         return False
 
 
+@pytest.mark.nightly
 def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
@@ -107,6 +108,7 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
         sock.close()
 
 
+@pytest.mark.nightly
 def test_a_presence_that_breaks_is_made_again(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:

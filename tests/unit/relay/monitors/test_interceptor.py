@@ -47,6 +47,8 @@ from tests.unit.relay.monitors.monitored import (
 from tests.unit.relay.world import LOOPBACK, Peer
 from tests.unit.transcripts import transcripts
 
+pytestmark = pytest.mark.nightly
+
 DIALOGUES = transcripts(Path(__file__).with_name("dialogues.txt"))
 
 

@@ -3,7 +3,11 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.support.stated import stated
+
+pytestmark = pytest.mark.nightly
 
 TEXT = "m() { event e(bool x) /t std_msgs/Bool '{data:x}' { } }"
 PROGRAM = """

@@ -19,6 +19,8 @@ from tests.unit.relay.monitors.monitored import (
     string,
 )
 
+pytestmark = pytest.mark.nightly
+
 
 class Trying(Monitored):
     """A relay whose control sends specifications, some of them in shadow mode."""

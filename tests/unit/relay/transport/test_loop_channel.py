@@ -14,6 +14,8 @@ from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, Ups
 from appliance.relay.loop import QUANTUM, EventLoop
 from appliance.relay.transport.loop_channel import LoopLink
 
+pytestmark = pytest.mark.nightly
+
 
 class Ends:
     """A link and its other end."""

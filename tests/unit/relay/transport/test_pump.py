@@ -21,6 +21,8 @@ from appliance.relay.transport.pump import (
     Version,
 )
 
+pytestmark = pytest.mark.nightly
+
 READ = select.EPOLLIN
 _ROOM = 64
 

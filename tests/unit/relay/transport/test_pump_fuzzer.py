@@ -11,6 +11,8 @@ from distribution.checkout import ROOT
 from tests.support.examples import examples
 from tests.support.pump_fuzzer import OUTCOMES
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.mark.timeout(600)
 def test_no_bytes_and_no_order_of_calls_harm_memory() -> None:

@@ -1,0 +1,205 @@
+"""Run all tests and report each: `make nightly`, or the tests of one lane, `make nightly LANE=standby`.
+
+The gate (`make test`) runs only what cannot fail by chance. This program runs everything, with all examples of each
+property, and never stops at a failure. It writes `build/nightly/results.json`: for each test its passes, failures and
+seconds, and for each run its commit, start, end and load average. Runs of the same commit add up.
+
+The exit status is 1 if a test failed that `tests/unsteady.txt` does not list.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.support.sources import ROOT
+
+FOLDER = ROOT / "build" / "nightly"
+RESULTS = FOLDER / "results.json"
+UNSTEADY = ROOT / "tests" / "unsteady.txt"
+_STAGE_SECONDS = 90 * 60.0  # a stage that hangs ends, and counts as failed
+
+LANES = {
+    "console": ("tests/system/console/",),
+    "packages": (
+        "tests/package/",
+        "tests/smoke/",
+        "tests/system/containers/",
+        "tests/system/vm/",
+        "tests/unit/distribution/",
+    ),
+    "standby": ("standby", "two_appliances", "lease", "insertion_at_large"),
+    "fleet": ("fleet", "bundle", "collector", "rollout", "clickhouse"),
+    "recorder": ("recorder", "evidence", "recording"),
+    "language": ("rosmop/", "tests/proofs/", "monitor", "specification", "compiler"),
+}
+"""Parts of a file's path that put it into a lane; the first lane that has one counts. All other files are in `core`."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Tests that run side by side: on `workers` of pytest-xdist, or one after the other."""
+
+    name: str
+    folders: tuple[str, ...]
+    workers: str = ""
+
+    def options(self) -> list[str]:
+        """Return the options for pytest."""
+        return ["-n", self.workers, "--dist", "loadfile", "--no-loadscope-reorder"] if self.workers else []
+
+
+# A worker has no network but a loopback of its own, so tests that fetch packages run without workers, as do those that
+# start many processes themselves.
+STAGES = (
+    Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical"),
+    Stage("nodes", ("tests/integration",), "auto"),
+    Stage(
+        "machine",
+        (
+            "tests/system/vm",
+            "tests/system/test_clickhouse.py",
+            "tests/system/test_examples.py",
+            "tests/system/test_generated_client.py",
+            "tests/system/test_recordings_cluster.py",
+        ),
+    ),
+    Stage("containers", ("tests/smoke", "tests/system/containers")),
+    Stage("namespaces", ("tests/system",), "auto"),
+    Stage("packages", ("tests/package",)),
+)
+
+
+def lane_of(file: str) -> str:
+    """Return the lane of a test file, by its path in the repository."""
+    return next((lane for lane, parts in LANES.items() if any(part in file for part in parts)), "core")
+
+
+def files_of_stages() -> dict[str, list[str]]:
+    """Return the test files of each stage. A file belongs to the first stage that names it most precisely."""
+    found: dict[str, list[str]] = {stage.name: [] for stage in STAGES}
+    roots = {folder: stage.name for stage in STAGES for folder in stage.folders}
+    tests = [ROOT / "tests", ROOT / "rosmop" / "tests"]
+    for path in sorted(path for root in tests for path in root.rglob("test_*.py")):
+        file = path.relative_to(ROOT).as_posix()
+        folder = max((one for one in roots if file == one or file.startswith(f"{one}/")), key=len)
+        found[roots[folder]].append(file)
+    return found
+
+
+def outcomes_of(report: Path) -> Iterator[tuple[str, str, float]]:
+    """Yield id, outcome (passed, failed, skipped) and seconds of each test, from a JUnit report of pytest."""
+    for case in xml.etree.ElementTree.parse(report).iter("testcase"):  # noqa: S314  written by pytest
+        kinds = {child.tag for child in case}
+        outcome = "failed" if kinds & {"failure", "error"} else "skipped" if "skipped" in kinds else "passed"
+        yield f"{case.get('file')}::{case.get('name')}", outcome, float(case.get("time", 0))
+
+
+def unsteady() -> set[str]:
+    """Return the tests that are known to fail by chance; each line has the id, a date and the reason."""
+    lines = UNSTEADY.read_text(encoding="utf-8").splitlines()
+    return {line.split()[0] for line in lines if line and not line.startswith("#")}
+
+
+def run_stage(stage: Stage, files: list[str]) -> tuple[list[tuple[str, str, float]], str]:
+    """Run the files of a stage; return the outcomes, and what went wrong beside them."""
+    report = FOLDER / f"{stage.name}.xml"
+    report.unlink(missing_ok=True)
+    command = [sys.executable, "-m", "pytest", *files, *stage.options(), "--quiet", "--tb=short"]
+    command += [f"--junitxml={report}", "-o", "junit_family=xunit1"]
+    environment = os.environ | {"TESTS_EXAMPLES": "all"}
+    with (FOLDER / f"{stage.name}.log").open("wb") as log:
+        try:
+            status = subprocess.run(
+                command,
+                cwd=ROOT,
+                env=environment,
+                stdout=log,
+                stderr=log,
+                timeout=_STAGE_SECONDS,
+                check=False,
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return [], f"not finished after {_STAGE_SECONDS / 60:.0f} minutes"
+    wrong = "" if status in (0, 1, 5) else f"pytest ended with status {status}"
+    return (list(outcomes_of(report)) if report.exists() else []), wrong
+
+
+def main() -> int:
+    """Run the stages, print a summary, and return the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--lane", choices=["core", *LANES], help="run the tests of one lane only")
+    lane = parser.parse_args().lane
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    results = _earlier(_commit())
+    failed: list[str] = []
+    for stage in STAGES:
+        files = [file for file in files_of_stages()[stage.name] if lane in (None, lane_of(file))]
+        if not files:
+            continue
+        began, load = _moment(), os.getloadavg()[0]
+        outcomes, wrong = run_stage(stage, files)
+        failed += [name for name, outcome, _ in outcomes if outcome == "failed"]
+        failed += [f"{stage.name}: {wrong} (build/nightly/{stage.name}.log)"] if wrong else []
+        _add(results["tests"], outcomes)
+        results["runs"].append(
+            {
+                "stage": stage.name,
+                "lane": lane or "all",
+                "began": began,
+                "ended": _moment(),
+                "load": [load, *os.getloadavg()[:1]],
+            }
+        )
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        count = {
+            kind: sum(1 for _, one, _ in outcomes if one == kind) for kind in ("passed", "failed", "skipped")
+        }
+        print(
+            f"{stage.name}: {count['passed']} passed, {count['failed']} failed, {count['skipped']} skipped",
+            flush=True,
+        )
+    return _report(failed)
+
+
+def _report(failed: list[str]) -> int:
+    known = unsteady()
+    for name in failed:
+        print(f"FAILED {name}" + (" (known to fail by chance)" if name in known else ""))
+    print(f"results: {RESULTS.relative_to(ROOT)}")
+    return int(any(name not in known for name in failed))
+
+
+def _add(tests: dict[str, Any], outcomes: list[tuple[str, str, float]]) -> None:
+    for name, outcome, seconds in outcomes:
+        row = tests.setdefault(name, {"passed": 0, "failed": 0, "skipped": 0, "seconds": []})
+        row[outcome] += 1
+        row["seconds"].append(round(seconds, 3))
+
+
+def _earlier(commit: str) -> dict[str, Any]:
+    if RESULTS.exists():
+        results: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))
+        if results["commit"] == commit:
+            return results
+    return {"commit": commit, "runs": [], "tests": {}}
+
+
+def _commit() -> str:
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def _moment() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""Test the container as a user starts it: `docker compose --profile demo up`, one denial, one reload, one search."""
+
+import ssl
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.docker import Compose, Engine, build_images, project
+from tests.support.requirements import need_root
+from tests.support.rest import Rest
+from tests.support.waiting import eventually
+
+pytestmark = [pytest.mark.real, pytest.mark.timeout(1500)]  # the images are built first
+
+TABLET = "172.29.78.66"
+
+
+@pytest.fixture(scope="module")
+def machine() -> Iterator[Host]:
+    """Return a machine for an engine, which has the images of this checkout."""
+    need_root()
+    build_images()
+    with Lab("rosrv-engine") as lab:
+        yield lab.host("machine", "10.79.0.1/24")
+
+
+@pytest.fixture(scope="module")
+def demo(machine: Host, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
+    """Run the appliance, the LandShark, its operator and a visitor."""
+    with Engine(machine) as engine:
+        compose = engine.compose(project(tmp_path_factory.mktemp("project")), "smoke")
+        compose("--profile", "demo", "up", "--detach", "--no-build")
+        yield compose
+        compose("--profile", "demo", "down", "--volumes", "--timeout", "5")
+
+
+@pytest.fixture(scope="module")
+def rest(machine: Host, demo: Compose, tmp_path_factory: pytest.TempPathFactory) -> Rest:
+    """Return a client with the first token, as a user on the engine's machine has it."""
+    token = demo.exec("appliance", "cat", "/var/lib/rosrv/first-token").stdout.strip()
+    certificate = tmp_path_factory.mktemp("rest") / "certificate.pem"
+    address = ("127.0.0.1", 8443)
+    certificate.write_text(machine.run(lambda: ssl.get_server_certificate(address, timeout=30)))
+    return Rest("https://127.0.0.1:8443", token, certificate)
+
+
+def test_messages_pass_and_a_visitor_is_denied(demo: Compose) -> None:
+    """The operator receives the robot's position; a call of the visitor is denied, with the rule in the audit log."""
+    demo.wait_for_log("ocu", '"position"', timeout=240)
+    denied = eventually(lambda: demo.audit("--deny", "--host", TABLET), demo.story)
+    assert {one["rule"]["file"] for one in denied if one["rule"]} == {"/etc/rosrv/policies/containers.ini"}
+    assert "intact" in demo.exec("appliance", "rosrv", "audit", "verify").stdout
+
+
+def test_a_policy_is_reloaded_over_rest(machine: Host, demo: Compose, rest: Rest) -> None:
+    """A reload makes the edited file the policy in force, and is recorded."""
+    before = machine.run(lambda: rest.get("/v1/policy")).json
+    policy: Path = demo.directory / "policies" / "containers.ini"
+    policy.write_text(policy.read_text() + "\n# edited by its operator\n")
+    answer = machine.run(lambda: rest.post("/v1/policy/reload"))
+    assert answer.status == 200, answer.body
+    after = machine.run(lambda: rest.get("/v1/policy")).json
+    assert after["revision"] > before["revision"]
+    assert after["text"].endswith("# edited by its operator\n")
+    assert eventually(lambda: demo.audit("--event", "policy reloaded"), demo.story)

@@ -1,0 +1,107 @@
+"""Keep a test from what chance can decide: threads, processes, sockets, pauses and real clocks.
+
+A test of the gate must not fail by chance, so it uses none of them, unless it is one of the few marked `real`. Tests
+marked `nightly` also use them, and run with `make nightly`. An audit hook of Python sees processes and sockets, in our
+code and in libraries. Threads, pauses and clocks have no hook in Python 3.11, so their functions are replaced; of the
+reads of a clock, only those by our own code count.
+"""
+
+import functools
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+_FORBIDDEN = {
+    "os.exec": "starts a program",
+    "os.fork": "starts a process",
+    "os.forkpty": "starts a process",
+    "os.posix_spawn": "starts a process",
+    "os.system": "starts a process",
+    "subprocess.Popen": "starts a process",
+    "socket.__new__": "makes a socket",
+}
+_CLOCKS = ("clock_gettime", "clock_gettime_ns", "monotonic", "monotonic_ns", "time", "time_ns")
+_OURS = ("appliance", "rosmop", "roswire", "rosrv_fleet", "tests")
+
+
+class ChanceError(RuntimeError):
+    """A test that must be deterministic did something that chance can decide."""
+
+
+class Watch:
+    """Watches the running test; there is one, because an audit hook cannot be removed."""
+
+    def __init__(self) -> None:
+        self._watched = False
+        self._found: list[str] = []
+
+    def install(self) -> None:
+        """Begin to see audit events and clock reads, which `watching` then forbids."""
+        sys.addaudithook(self._event)
+        for owner, name, what in ((threading.Thread, "start", "starts a thread"), (time, "sleep", "sleeps")):
+            setattr(owner, name, self._forbidding(what, getattr(owner, name)))
+        for name in _CLOCKS:
+            setattr(time, name, self._clock(name, getattr(time, name)))
+
+    @contextmanager
+    def watching(self) -> Iterator[list[str]]:
+        """Forbid chance in a block; yields the list of what was attempted, which is complete at the end."""
+        found: list[str] = []
+        outer = self._found, self._watched
+        self._found, self._watched = found, True
+        try:
+            yield found
+        finally:
+            self._found, self._watched = outer
+
+    def _event(self, event: str, _arguments: tuple[Any, ...]) -> None:
+        if self._watched and event in _FORBIDDEN and not _of_a_loop(event):
+            self._refuse(_FORBIDDEN[event])
+
+    def _forbidding(self, what: str, act: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(act)
+        def acting(*arguments: Any) -> Any:
+            if self._watched:
+                self._refuse(what)
+            return act(*arguments)
+
+        return acting
+
+    def _clock(self, name: str, read: Callable[..., Any]) -> Callable[..., Any]:
+        def reading(*arguments: Any) -> Any:
+            if self._watched and sys._getframe(1).f_globals.get("__name__", "").startswith(_OURS):
+                pass
+            return read(*arguments)
+
+        return reading
+
+    def _refuse(self, what: str) -> None:
+        frame, place = sys._getframe(2), ""
+        while frame is not None and not place:
+            if (
+                str(frame.f_globals.get("__name__", "")).startswith(_OURS)
+                and __file__ != frame.f_code.co_filename
+            ):
+                place = f" in {frame.f_globals['__name__']}.{frame.f_code.co_name}"
+            frame = frame.f_back  # type: ignore[assignment]
+        self._found.append(f"{what}{place}")
+        raise ChanceError(f"this test {what}{place}; only tests marked `real` or `nightly` may")
+
+
+WATCH = Watch()
+
+
+def may_depend_on_chance(item: pytest.Item) -> bool:
+    """Return whether a test is marked as one that uses real threads, processes, sockets or clocks."""
+    return any(item.get_closest_marker(name) for name in ("real", "nightly"))
+
+
+def _of_a_loop(event: str) -> bool:
+    """Return whether an event loop makes the pair of sockets by which threads wake it."""
+    names = {sys._getframe(depth).f_globals.get("__name__") for depth in (3, 4, 5)}
+    return event == "socket.__new__" and "asyncio.selector_events" in names

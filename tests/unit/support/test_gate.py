@@ -1,0 +1,72 @@
+"""The gate and what runs at night: no chance in the gate, no test outside both."""
+
+import re
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.nightly import LANES, STAGES, UNSTEADY, files_of_stages, lane_of, outcomes_of, unsteady
+from tests.steady import largest_chance
+from tests.support.determinism import WATCH, ChanceError
+
+REPORT = """<testsuites><testsuite>
+<testcase file="tests/a.py" name="test_one[x]" time="1.5"/>
+<testcase file="tests/a.py" name="test_two" time="0.1"><failure message="no"/></testcase>
+<testcase file="tests/a.py" name="test_three" time="0.0"><skipped message="later"/></testcase>
+</testsuite></testsuites>"""
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda: threading.Thread(target=print).start(),
+        lambda: subprocess.run(["true"], check=True),
+        lambda: socket.socket().close(),
+        lambda: time.sleep(0),  # noqa: TID251  what is forbidden
+    ],
+    ids=["thread", "process", "socket", "pause"],
+)
+def test_a_deterministic_test_may_not_depend_on_chance(act: Callable[[], object]) -> None:
+    """The attempt is an error, and is reported even if the product catches the error."""
+    with WATCH.watching() as found, pytest.raises(ChanceError):
+        act()
+    assert len(found) == 1
+    assert "test_gate" in found[0]
+
+
+def test_every_test_file_runs_at_night_in_one_stage() -> None:
+    """A new folder of tests without a stage would be an error; every lane and stage has tests."""
+    stages = files_of_stages()
+    files = [file for named in stages.values() for file in named]
+    assert len(files) == len(set(files)) > 500
+    assert all(stages[stage.name] for stage in STAGES)
+    assert {lane_of(file) for file in files} == {"core", *LANES}
+
+
+def test_results_are_read_from_the_report(tmp_path: Path) -> None:
+    """Ids are those that pytest accepts; errors count as failures."""
+    (tmp_path / "report.xml").write_text(REPORT)
+    assert list(outcomes_of(tmp_path / "report.xml")) == [
+        ("tests/a.py::test_one[x]", "passed", 1.5),
+        ("tests/a.py::test_two", "failed", 0.1),
+        ("tests/a.py::test_three", "skipped", 0.0),
+    ]
+
+
+def test_the_bound_of_a_chance() -> None:
+    """Without a failure it is about 3/n; the chance of 5 or fewer failures of 50 at 20 % is nearly 5 %."""
+    assert largest_chance(0, 300) == pytest.approx(3 / 300, rel=0.01)
+    assert largest_chance(5, 50) == pytest.approx(0.2, abs=0.005)
+    assert largest_chance(7, 7) == pytest.approx(1.0)
+
+
+def test_few_tests_are_unsteady_each_with_a_date_and_a_reason() -> None:
+    """At most ten tests may fail by chance."""
+    lines = [line for line in UNSTEADY.read_text().splitlines() if line and not line.startswith("#")]
+    assert len(unsteady()) == len(lines) <= 10
+    assert all(re.fullmatch(r"\S+::\S+ 20\d\d-\d\d-\d\d \S.{20,}", line) for line in lines)
