@@ -1,8 +1,11 @@
-"""`scripts/setup` on a machine where another program installs packages."""
+"""`scripts/setup`: where another program installs packages, and with an environment that exists."""
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
+
+import pytest
 
 from tests.support.requirements import need_root
 
@@ -52,3 +55,63 @@ def test_another_failure_of_apt_ends_it(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "E: Unable to fetch some archives" in done.stderr
     assert (tmp_path / "calls").read_text().splitlines() == ["update -qq"]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Return a checkout whose environment has fake programs; `calls` lists how uv was called."""
+    folder = tmp_path / "a checkout"
+    for name in ("scripts/setup", "pyproject.toml", "appliance/__init__.py"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(_REPOSITORY / name, folder / name)
+    for lock in _REPOSITORY.glob("requirements*.lock"):
+        shutil.copy(lock, folder)
+    (folder / "packages.txt").touch()
+    (folder / "packages-develop.txt").touch()
+    (folder / ".venv/lib/python3.11/site-packages").mkdir(parents=True)
+    programs = {
+        "pip": f'echo "WARNING: of pip"; echo "pip 23 from {folder}/.venv/lib"',
+        "uv": 'echo "WARNING: of uv"; echo "$*" >> calls; ! [ -e broken ]',
+    }
+    (folder / ".venv/bin").mkdir()
+    for name in ("pip", "uv", "python", "rosrv"):
+        (folder / ".venv/bin" / name).write_text(f"#!/bin/sh\n{programs.get(name, 'true')}\n")
+        (folder / ".venv/bin" / name).chmod(0o755)
+    return folder
+
+
+def set_up(checkout: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run `scripts/setup` of this checkout, for a user with umask 077."""
+    command = [checkout / "scripts/setup", *options]
+    return subprocess.run(command, capture_output=True, text=True, umask=0o077, timeout=60, check=False)
+
+
+def test_it_does_nothing_twice(checkout: Path) -> None:
+    """A second run prints and installs nothing, even over a symbolic link; the programs' own warnings are hidden."""
+    done = set_up(checkout)
+    assert (done.returncode, "WARNING" in done.stderr, "ready in" in done.stderr) == (0, False, True)
+    calls = (checkout / "calls").read_text()
+    (checkout.parent / "link").symlink_to(checkout)
+    assert [set_up(checkout.parent / "link", option).stderr for option in ("--run", "--run")] == ["", ""]
+    assert (checkout / "calls").read_text() == calls
+    assert (checkout / ".venv/.setup-stamp").stat().st_mode & 0o777 == 0o644
+
+
+def test_the_demo_keeps_the_packages_of_a_developer(checkout: Path) -> None:
+    """After a change of the lock files `--run` installs packages and removes none."""
+    set_up(checkout)
+    with (checkout / "pyproject.toml").open("a") as project:
+        project.write("# changed\n")
+    (checkout / "calls").unlink()
+    assert set_up(checkout, "--run").returncode == 0
+    assert [line.split()[1] for line in (checkout / "calls").read_text().splitlines()] == ["install"] * 2
+
+
+def test_a_failure_prints_the_whole_output(checkout: Path) -> None:
+    """The command and everything that it printed, and the next run tries again."""
+    (checkout / "broken").touch()
+    done = set_up(checkout)
+    assert (done.returncode, "this command failed: .venv/bin/uv pip sync" in done.stderr) == (1, True)
+    assert "WARNING: of uv" in done.stderr
+    (checkout / "broken").unlink()
+    assert "ready in" in set_up(checkout).stderr
