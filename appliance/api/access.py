@@ -15,7 +15,6 @@ import asyncio
 import hashlib
 import hmac
 import secrets
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from typing import cast
 
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
+from appliance.base import clock
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.settings import is_loopback
@@ -74,7 +74,7 @@ class TokenAuthenticator:
     def quota_class(self, peer: str) -> QuotaClass:
         """Return a peer's class: registered for this machine, or after a recent valid token; else unknown."""
         shown = self._shown.get(peer)
-        lately = shown is not None and time.monotonic() - shown < _KNOWN_SECONDS
+        lately = shown is not None and clock.now() - shown < _KNOWN_SECONDS
         return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
 
     def state(self, tokens: Iterable[TokenKept]) -> None:
@@ -87,7 +87,7 @@ class TokenAuthenticator:
     def still_good(self, bearer: Bearer) -> bool:
         """Whether a previously valid token may still be used."""
         kept = self._tokens.get(bearer.id)
-        return kept is not None and time.time() < kept.expires  # a rotation may have brought its end forward
+        return kept is not None and clock.wall() < kept.expires  # a rotation may have brought its end forward
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
@@ -104,14 +104,14 @@ class TokenAuthenticator:
             if parsed is None
             else await self._matches(text, parsed[1], kept, host)
         ):
-            if time.time() < kept.expires:
+            if clock.wall() < kept.expires:
                 self._remember(peer_key(host))
                 self._report_use(kept.id)
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
             raise self._refusal("the token has expired: ask for a new one (rosrv token add)")
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)
-        failures.take(host, time.monotonic())
+        failures.take(host, clock.now())
         raise self._refusal("the token is wrong or revoked")
 
     async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
@@ -128,13 +128,13 @@ class TokenAuthenticator:
         return True
 
     def _remember(self, peer: str) -> None:
-        self._shown[peer] = time.monotonic()
+        self._shown[peer] = clock.now()
         self._shown.move_to_end(peer)
         if len(self._shown) > _MOST_KNOWN:
             self._shown.popitem(last=False)
 
     def _report_use(self, token: str) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if now - self._reported.get(token, -USE_SECONDS) >= USE_SECONDS:
             self._reported[token] = now
             self._used(token)
@@ -146,7 +146,7 @@ class TokenAuthenticator:
 
 
 def _require_patience(failures: Buckets, host: str) -> None:
-    seconds = failures.wait(host, time.monotonic())
+    seconds = failures.wait(host, clock.now())
     if seconds:
         text = "too many requests from this host came without a valid token"
         raise too_many("too-many-failures", text, seconds)

@@ -1,12 +1,12 @@
 """Derive alarms (present conditions that need attention) from the status: for the console, REST, `rosrv status`."""
 
 import datetime
-import time
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
 
+from appliance.base import clock
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
 from appliance.channel.standby_summary import PATIENCE_SECONDS, standby_troubles
@@ -165,7 +165,7 @@ def _failing(process: ProcessInfo) -> str:
 
 
 def _rolls_back(what: str, deadline: float, noun: str) -> str:
-    return f"{what} back in {max(0, round(deadline - time.time()))} s unless confirmed: rosrv {noun} confirm"
+    return f"{what} back in {max(0, round(deadline - clock.wall()))} s unless confirmed: rosrv {noun} confirm"
 
 
 def _moment(seconds: float) -> str:

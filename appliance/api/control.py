@@ -11,7 +11,6 @@ Invariants:
 import asyncio
 import contextlib
 import math
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import structlog
 
 from appliance.api.access import Bearer
+from appliance.base import clock
 from appliance.channel.admin import CHANGES, ORDERS, A, AdminAnswer, AdminRequest, decode, operation_of
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
@@ -117,7 +117,7 @@ class ControlLink:
         changes = type(request) in ORDERS
         longest = seconds + _GRACE_SECONDS if changes else seconds
         try:
-            answer = await self._asked(request, bearer, time.monotonic() + seconds, longest)
+            answer = await self._asked(request, bearer, clock.now() + seconds, longest)
         except TimeoutError:
             raise ControlAwayError(
                 f"the appliance did not answer within {longest:g} s{_UNKNOWN if changes else ''}"

@@ -11,7 +11,6 @@ Invariants:
 
 import base64
 import binascii
-import time
 from typing import Annotated
 
 import msgspec
@@ -27,6 +26,7 @@ from appliance.api.route_roles import answered
 from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
 from appliance.api.streams import peer_of
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.field_docs import Moment, doc
@@ -168,7 +168,7 @@ class _Patience:
 
     def require(self, peer: str) -> None:
         """Raise `ProblemError` (429) if this peer must wait."""
-        now = time.monotonic()
+        now = clock.now()
         seconds = self._one.wait(peer, now)
         if self._one.touched(peer, now):
             seconds = max(seconds, self._all.wait(_ALL, now))
@@ -176,7 +176,7 @@ class _Patience:
             raise too_many("too-many-failures", "too many wrong enrolment tokens were sent", seconds)
 
     def failed(self, peer: str) -> None:
-        now = time.monotonic()
+        now = clock.now()
         self._one.take(peer, now)
         self._all.take(_ALL, now)
 

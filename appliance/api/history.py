@@ -6,7 +6,6 @@ clients, so more clients cost RVMaster nothing. The age and the number of sample
 
 import asyncio
 import contextlib
-import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Annotated, NamedTuple
@@ -14,6 +13,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from appliance.api.control import ControlAwayError, ControlLink
+from appliance.base import clock
 from appliance.channel.admin import MetricsWanted
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.measures import Measures
@@ -113,7 +113,7 @@ class SampleHistory:
         status, sample, away, active = None, None, None, ""
         try:
             body = await self._measures()
-            status, sample = body.status, sample_of(body, time.time())
+            status, sample = body.status, sample_of(body, clock.wall())
         except ControlAwayError as error:
             away, active = str(error), error.active
         if sample is not None:

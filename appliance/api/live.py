@@ -5,7 +5,6 @@ A page that follows sends one request and gets every change; the audit log has o
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator
 from typing import Annotated
 
@@ -23,6 +22,7 @@ from appliance.api.route_roles import VIEWER, Viewer, ask, only_standby
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import StreamResponse, Streams, peer_of
+from appliance.base import clock
 from appliance.channel.admin import GraphWanted
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.status import Status
@@ -113,10 +113,10 @@ async def _follow(services: Services, bearer: Bearer, graph: bool) -> AsyncItera
             if seen.active:  # a new request gets the active appliance's address
                 return
             yield _state_event(seen)
-            if graph and seen.away is None and time.monotonic() >= graph_due:
-                began = time.monotonic()
+            if graph and seen.away is None and clock.now() >= graph_due:
+                began = clock.now()
                 drawn = await _graph(services, bearer)
-                graph_due = time.monotonic() + (time.monotonic() - began) * _SHARE
+                graph_due = clock.now() + (clock.now() - began) * _SHARE
                 if drawn is not None:
                     yield drawn
 

@@ -2,7 +2,6 @@
 
 import math
 import os
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Viewer, ask
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
+from appliance.base import clock
 from appliance.channel.admin import MetricsWanted, StandbyWanted
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
@@ -214,7 +214,7 @@ def _bundles(bundles: BundlesState | None) -> dict[str, _Samples]:
         names = ("version", "refused", "changed", "checked_seconds", "rejected")
         return {f"rosrv_bundle_{name}": [] for name in names}
     number = bundles.in_force.rpartition("/")[2].removesuffix(".tar")
-    checked = -1.0 if bundles.checked is None else time.time() - bundles.checked
+    checked = -1.0 if bundles.checked is None else clock.wall() - bundles.checked
     return {
         "rosrv_bundle_version": [((), int(number or 0))],
         "rosrv_bundle_refused": [((), bool(bundles.refused))],
@@ -230,7 +230,7 @@ _PORTS = {"open": 1, "closed": 0, "unknown": -1}
 def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
     """Return the samples of hosts with tunnels; revoked hosts are only counted."""
     enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
-    now = time.time()
+    now = clock.wall()
     return {
         "rosrv_tunnel_up": [((host.name,), host.remote is not None) for host in enrolled],
         "rosrv_tunnel_age_seconds": [((host.name,), host.seconds or 0) for host in enrolled],

@@ -5,7 +5,6 @@ the additional fields from the same types.
 """
 
 import functools
-import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,6 +12,7 @@ import msgspec
 
 from appliance.api.problems import ProblemError
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel.answers.field_docs import UNIT
 
@@ -56,7 +56,7 @@ def describe(schema: dict[str, Any]) -> None:
 def given(text: str) -> int:
     """Parse a time; return nanoseconds since the epoch. Raises `ProblemError` (422)."""
     try:
-        return parse_timestamp(text, time.time_ns())
+        return parse_timestamp(text, clock.wall_ns())
     except (OverflowError, ValueError) as error:
         raise ProblemError(422, "bad-input", str(error)) from error
 

@@ -30,6 +30,7 @@ from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.request_gate import RequestGate
 from appliance.api.services import Services
+from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
@@ -150,7 +151,7 @@ class _Api:
         names = [*self._settings.api_names]
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
             names.append(address[0])
-        return self._settings.state / "api", names, datetime.datetime.now(datetime.UTC)
+        return self._settings.state / "api", names, clock.utc_now()
 
     async def _flush(self) -> None:
         while True:

@@ -15,7 +15,6 @@ Order: rate → Host → Origin → size of the body → token. Invariants:
 import asyncio
 import ipaddress
 import re
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -27,6 +26,7 @@ from appliance.api.access import Bearer, TokenAuthenticator
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect, too_many
 from appliance.api.rates import Buckets
+from appliance.base import clock
 from appliance.channel.messages.api import ClientRequest
 from appliance.channel.rest_meaning import is_dry_run
 from appliance.configuration.settings import ApiLimits
@@ -118,7 +118,7 @@ class RequestGate:
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
         host = scope["client"][0]
         rate = self._page_rate if is_console(scope["path"]) else self._rate
-        wait = rate.take(host, time.monotonic())
+        wait = rate.take(host, clock.now())
         if wait:
             raise too_many("too-many-requests", "too many requests from this host", wait)
         headers = Headers(scope=scope)
@@ -182,7 +182,7 @@ class _Answer:
         self._scope = scope
         self._send = send
         self._journal = journal
-        self._started = time.monotonic_ns()
+        self._started = clock.now_ns()
         self._begun = self._ended = False
         self.bearer: Bearer | None = None
 
@@ -218,7 +218,7 @@ class _Answer:
             status=status,
             reason=self._scope.get(REASON, ""),
             dry=path in _QUESTIONS or is_dry_run(self._scope["query_string"].decode("latin-1")),
-            duration_us=(time.monotonic_ns() - self._started) // 1000,
+            duration_us=(clock.now_ns() - self._started) // 1000,
         )
 
 

@@ -8,11 +8,11 @@ Use this module from one thread only; `folded`, `summarised` and `room` may be c
 """
 
 import dataclasses
-import time
 from collections import deque
 from collections.abc import Callable
 
 from appliance.audit.record import AuditRecord
+from appliance.base import clock
 from appliance.quotas.pool import Bounds, Pool, QuotaClass
 from appliance.quotas.table import AUDIT_BYTES, AUDIT_RESERVE
 
@@ -46,7 +46,7 @@ class Budget:
         *,
         bounds: Bounds = AUDIT_BYTES.bounds,
         reserve: Bounds = AUDIT_RESERVE.bounds,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
     ) -> None:
         self.quota_class = quota_class
         self._plenty, self._scarce = bounds, dataclasses.replace(bounds, host=reserve.host)

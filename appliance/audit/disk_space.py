@@ -1,9 +1,10 @@
 """Watch the free space on the log's disk."""
 
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
+
+from appliance.base import clock
 
 _LOOK_SECONDS = 0.5
 _AGAIN = 1.25  # times the reserve must be free before space is no longer scarce, so that alarms do not flap
@@ -27,7 +28,7 @@ class DiskSpace:
 
         Return None if nothing changed. Raises `OSError`.
         """
-        now = time.monotonic()
+        now = clock.now()
         if now - self._looked < _LOOK_SECONDS:
             return None
         self._looked = now

@@ -1,12 +1,12 @@
 """Define the words of a search: the options of `rosrv audit search`, and the parameters of the collector's REST."""
 
-import time
 from typing import Annotated
 
 import typer
 
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.base.timestamps import TimestampError, parse_timestamp
 
 Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
@@ -71,7 +71,7 @@ def filter_given(
 
 def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
     """Return the times of --since and --until. Raises `TimestampError`."""
-    now = time.time_ns()
+    now = clock.wall_ns()
     begin = None if since is None else parse_timestamp(since, now)
     end = None if until is None else parse_timestamp(until, now)
     if begin is not None and end is not None and begin > end:

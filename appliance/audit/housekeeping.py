@@ -7,7 +7,6 @@
 """
 
 import sqlite3
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.signatures import Signatures
 from appliance.audit.waiters import Waiter, answer
+from appliance.base.clock import now
 from appliance.signing.signed_statements import parse_checkpoint
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
@@ -64,7 +64,7 @@ class Housekeeping:
         self._make = make
         self._hold = hold
         self._paused_until = self._asked_at = 0.0  # monotonic seconds
-        self._sealed_at = time.monotonic()
+        self._sealed_at = now()
         self.writer: ChainWriter | None = None
         self.unsealed = 0  # records after the last checkpoint
         self._failing: str | None = None
@@ -84,13 +84,13 @@ class Housekeeping:
 
     def attempt(self, action: Callable[[], None]) -> None:
         """Run a step; after a failed one, skip all steps for a while."""
-        if time.monotonic() < self._paused_until:
+        if now() < self._paused_until:
             return
         try:
             action()
         except WRITE_ERRORS as error:
             self._failing = f"{self._path}: {error}"
-            self._paused_until = time.monotonic() + _HOUSE_SECONDS
+            self._paused_until = now() + _HOUSE_SECONDS
         else:
             self._failing = None
 
@@ -115,16 +115,16 @@ class Housekeeping:
         """Index records and remove old ones while no record waits; the last one was written at time `quiet_since`."""
         if self.writer is not None and not busy():
             # Committing the index for a single record is too expensive: wait for more records or for a quiet period.
-            quiet = time.monotonic() - quiet_since >= _IDLE_SECONDS / 2
+            quiet = now() - quiet_since >= _IDLE_SECONDS / 2
             if quiet or self.writer.text_lag >= _TEXT_STEP:
                 self.attempt(lambda: self._index(busy))
-        if self.writer is not None and time.monotonic() >= self.remover.due:
+        if self.writer is not None and now() >= self.remover.due:
             self.attempt(self._retain)
 
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _seal_is_due(self) -> bool:
-        waited = time.monotonic() - self._sealed_at
+        waited = now() - self._sealed_at
         return self.unsealed >= self._checkpoints.records or (
             self.unsealed > 0 and (waited >= self._checkpoints.seconds or bool(self._waiting))
         )
@@ -152,7 +152,7 @@ class Housekeeping:
         writer = self.writer
         if writer is None:
             return
-        self._sealed_at = time.monotonic()
+        self._sealed_at = now()
         checkpoint, text = writer.seal(self._clock())
         detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
         writer.append([self._make("checkpoint", Severity.DEBUG, "", detail)])
@@ -166,7 +166,7 @@ class Housekeeping:
 
     def ask_signatures(self) -> None:
         """Request all missing signatures."""
-        self._asked_at = time.monotonic()
+        self._asked_at = now()
         if self.writer is not None:
             self._signatures.ask(self.writer)
 

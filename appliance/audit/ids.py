@@ -7,8 +7,9 @@ clock is set back, it continues from the last id. After a restart, it continues 
 
 import secrets
 import threading
-import time
 from collections.abc import Callable
+
+from appliance.base import clock
 
 ID_LENGTH = 20
 _TIME_DIGITS = 16
@@ -17,7 +18,7 @@ _TIME_DIGITS = 16
 class IdSource:
     """A source of ids, each greater than the previous id and than `after`; thread-safe."""
 
-    def __init__(self, after: str = "", clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, after: str = "", clock: Callable[[], int] = clock.wall_ns) -> None:
         self._last = int(after[:_TIME_DIGITS], 16) if after else 0
         self._suffix = secrets.token_hex((ID_LENGTH - _TIME_DIGITS) // 2)
         self._clock = clock

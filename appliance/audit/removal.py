@@ -4,7 +4,6 @@ Every removal is recorded in the same transaction. Records of a signed log are r
 over exactly these records. A refused removal is tried again later (`unremoved` gives the reason).
 """
 
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,6 +11,7 @@ from appliance.audit.log_writer import ChainWriter, RemovedRange
 from appliance.audit.record import AuditRecord
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.signatures import RemovalSigner, Signatures
+from appliance.base import clock
 from appliance.signing.signed_statements import Removal, limit_of_removal
 
 _AT_ONCE = 512
@@ -53,7 +53,7 @@ class Remover:
 
     def step(self, writer: ChainWriter) -> bool:
         """Remove one step of records, or request the signature for it; return whether records were removed."""
-        now = time.monotonic()
+        now = clock.now()
         self.due = now + _LOOK_SECONDS
         if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
             return False
@@ -103,7 +103,7 @@ class Remover:
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None
-            self._refused = time.monotonic() + _REFUSED_SECONDS
+            self._refused = clock.now() + _REFUSED_SECONDS
             waits = early and not wanted.by_size
             self.unremoved = None if waits else f"old records are not removed: the signer refuses: {reason}"
 

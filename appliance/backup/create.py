@@ -16,7 +16,6 @@ import os
 import sqlite3
 import stat
 import tarfile
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -34,6 +33,7 @@ from appliance.backup.contents import (
     is_passing,
     trouble_with,
 )
+from appliance.base import clock
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 
@@ -107,7 +107,7 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
             if name == AUDIT_LOG:
                 last = _last_checkpoint(copy)
             entry = tarfile.TarInfo(name)
-            entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(time.time()), mode
+            entry.size, entry.mtime, entry.mode = copy.stat().st_size, int(clock.wall()), mode
             with copy.open("rb") as content:
                 archive.addfile(entry, content)
             copy.unlink()

@@ -14,7 +14,6 @@ Invariants:
    off.
 """
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +21,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 
 _DAY = 86_400_000_000_000
@@ -42,10 +42,6 @@ class _Kept(msgspec.Struct):
     since: int = 0  # `lived` when the gap was first seen
 
 
-def _monotonic() -> int:
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # also counts while the machine is suspended
-
-
 class AgeClock:
     """A callable clock that returns nanoseconds since the epoch, as if the system clock had never been wrong.
 
@@ -58,8 +54,8 @@ class AgeClock:
         path: Path,
         begin: Callable[[], int | None] = lambda: None,
         *,
-        wall: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], int] = _monotonic,
+        wall: Callable[[], int] = clock.wall_ns,
+        monotonic: Callable[[], int] = clock.since_boot_ns,
     ) -> None:
         self._path = path
         self._wall = wall

@@ -1,8 +1,9 @@
 """Locate the files that ship with the program (examples, policies, monitors) and dpkg's database."""
 
 import sys
-import time
 from pathlib import Path
+
+from appliance.base import clock
 
 _CHECKOUT = Path(__file__).resolve().parents[2]
 # In a checkout: its top folder. Otherwise: where the wheel and the Debian package install the files.
@@ -14,5 +15,5 @@ _DAY = 86_400.0
 
 def before_program() -> float:
     """Return how many seconds the system clock is behind the date of the program's files; 0 for less than a day."""
-    before = Path(__file__).stat().st_mtime - time.time()
+    before = Path(__file__).stat().st_mtime - clock.wall()
     return before if before > _DAY else 0.0

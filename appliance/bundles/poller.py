@@ -8,13 +8,13 @@ Invariants:
 """
 
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.bundles.verified_bundles import (
     BundleFolderError,
     BundleRejectedError,
@@ -61,7 +61,7 @@ class Poller:
     interval: float
     stated: Callable[[], BundleStated | None]
     offer: Callable[[BundleOffered], object]
-    clock: Callable[[], float] = time.time
+    clock: Callable[[], float] = clock.wall
     progress: BundlePollReported = field(default_factory=BundlePollReported)
     _failures: int = 0
     _reported: RobotReport | None = None
@@ -123,7 +123,7 @@ class Poller:
             stated.health.failing,
             self.progress.trouble,
         )
-        now = time.monotonic()
+        now = clock.now()
         pressing = self._reported is None or _fate_of(report) != _fate_of(self._reported)
         if now < (self._retry_at if pressing else self.report_due):
             return

@@ -9,12 +9,12 @@ import contextvars
 import random
 import socket
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.input_files import read_given
 from appliance.bundles.poller import Poller
 from appliance.bundles.verified_bundles import VerifiedBundles
@@ -78,14 +78,14 @@ class PollLoop:
 
     def _poll(self) -> None:
         spread = min(_LONGEST_SPREAD, _SPREAD * self._poller.interval)
-        due = time.monotonic() + _some_of(spread)
+        due = clock.now() + _some_of(spread)
         while not self._ending.is_set():
-            began = time.monotonic()
+            began = clock.now()
             if began >= due:
-                due = time.monotonic() + self._poller.step()
+                due = clock.now() + self._poller.step()
             else:
                 self._poller.report()
-            if self._wake.wait(max(0.0, min(_TICK_SECONDS, due - time.monotonic()))):
+            if self._wake.wait(max(0.0, min(_TICK_SECONDS, due - clock.now()))):
                 self._wake.clear()
                 due = min(due, began + _LEAST_SECONDS + _some_of(spread))
 

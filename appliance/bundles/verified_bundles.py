@@ -13,7 +13,6 @@ Invariants:
 """
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from tuf.api.exceptions import (
 from tuf.api.metadata import TargetFile
 from tuf.ngclient import FetcherInterface, Updater, UpdaterConfig
 
+from appliance.base import clock
 from appliance.bundles.bundle_archive import LONGEST, BundleArchiveError, unpack
 from appliance.bundles.terms import BundlePath, TermsError, terms_of
 from appliance.channel.messages import BundleContents
@@ -49,7 +49,7 @@ class BundleTooEarlyError(Exception):
     """The robot's ring may not take the selected bundle yet; `at` is when (seconds since the epoch)."""
 
     def __init__(self, path: BundlePath, at: float) -> None:
-        super().__init__(f"{path} is for this robot's ring in {max(0.0, at - time.time()):.0f} s")
+        super().__init__(f"{path} is for this robot's ring in {max(0.0, at - clock.wall()):.0f} s")
         self.at = at
 
 
@@ -111,7 +111,7 @@ class VerifiedBundles:
         site: str,
         group: str,
         robot: str,
-        clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] = clock.wall,
     ) -> None:
         """`root` is the root metadata that the operator trusts."""
         self._metadata = folder / "metadata"

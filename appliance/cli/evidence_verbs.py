@@ -3,7 +3,6 @@
 import errno
 import os
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +12,7 @@ import typer
 
 from appliance.audit.filter_options import Since, Until
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
@@ -56,7 +56,7 @@ def export_evidence(
     with Errors():
         if (recording is None) is (since is None) or (recording is not None and until is not None):
             raise usage_error("give a recording, or --since (and --until)")
-        now = time.time_ns()
+        now = clock.wall_ns()
         span = TimeSpan(parse_timestamp(since or "0s", now), parse_timestamp(until or "0s", now))
         size, part = 0, name_to_make(output)
         if os.path.lexists(output):

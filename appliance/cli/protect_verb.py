@@ -6,13 +6,13 @@ receives the result of a check. Exit status: 0 done, or closed; 1 a port is open
 
 import json
 import sys
-import time
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal, NoReturn
 from urllib.parse import urlsplit
 
 import typer
 
+from appliance.base import clock
 from appliance.channel.admin import HostPorts, StatusWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -176,7 +176,7 @@ def _check(checked: _CheckTarget, running: Appliance) -> None:
     if running.said:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address
-        body = running.ask_or_exit(HostPorts(name, state, found, time.time()))
+        body = running.ask_or_exit(HostPorts(name, state, found, clock.wall()))
         sys.stderr.write(f"rosrv: reported to the appliance: the ports of {body.name} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)

@@ -3,7 +3,6 @@
 import hashlib
 import os
 import shutil
-import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +12,7 @@ import msgspec
 import typer
 
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
@@ -286,7 +286,7 @@ def _read(what: Callable[[], _T]) -> _T:
 def _moment_given(option: str, text: str | None) -> int | None:
     """Return nanoseconds since the epoch. Exits with status 2 if `text` is not a time."""
     try:
-        return None if text is None else parse_timestamp(text, time.time_ns())
+        return None if text is None else parse_timestamp(text, clock.wall_ns())
     except ValueError as error:
         raise usage_error(f"{option}: {error}") from None
 

@@ -1,7 +1,6 @@
 """`rosrv status`: the running appliance on one screen."""
 
 import datetime
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +13,7 @@ from rich.text import Text
 
 from appliance.api.alarms import activity, open_alarms
 from appliance.api.moments import in_full
+from appliance.base import clock
 from appliance.base.actors import DISK
 from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
@@ -317,7 +317,7 @@ def doubted_clock(clock: ClockState) -> str | None:
 
 def age(since: float, now: float | None = None) -> str:
     """Return the age of a time (seconds since the epoch) in at most two units."""
-    seconds = max(0, int((time.time() if now is None else now) - since))
+    seconds = max(0, int((clock.wall() if now is None else now) - since))
     days, rest = divmod(seconds, 86_400)
     hours, rest = divmod(rest, 3_600)
     minutes, left = divmod(rest, 60)

@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.output import say_json
 from rosmop.tool.terminal import printable
@@ -61,7 +61,7 @@ class _Looks:
 
     def _away(self, error: NotRunningError) -> StatusView:
         if self._away_since is None:
-            self._away_since = time.time_ns()
+            self._away_since = clock.wall_ns()
         since = rfc3339(self._away_since)
         text = f"not running since {since[_MINUTES]}Z: {printable(str(error))}"
         return StatusView(
@@ -111,10 +111,10 @@ def _redraw(looks: _Looks, seconds: float, console: Console) -> None:
         with Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
                 view = looks.next()
-                now = f"{rfc3339(time.time_ns())[_MINUTES]}Z, every {seconds:g} s until Ctrl-C"
+                now = f"{rfc3339(clock.wall_ns())[_MINUTES]}Z, every {seconds:g} s until Ctrl-C"
                 live.update(Group(Text(now, style="dim"), view.screen), refresh=True)
-                end = time.monotonic() + seconds
-                while (left := end - time.monotonic()) > 0:
+                end = clock.now() + seconds
+                while (left := end - clock.now()) > 0:
                     if signal.sigtimedwait({signal.SIGWINCH}, left) is not None:
                         live.refresh()
     finally:

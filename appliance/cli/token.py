@@ -1,10 +1,10 @@
 """`rosrv token add|rotate|list|revoke`: access tokens for REST and their roles."""
 
-import datetime
 from typing import Annotated
 
 import typer
 
+from appliance.base import clock
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
@@ -119,7 +119,7 @@ def list_tokens(appliance: Appliance) -> None:
 
     Example: rosrv token list
     """
-    now = datetime.datetime.now(datetime.UTC).timestamp()
+    now = clock.wall()
     body = appliance.ask_or_exit(TokenList())
     for row in body.tokens:
         if appliance.as_json:

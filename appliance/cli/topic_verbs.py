@@ -1,7 +1,6 @@
 """`rosrv topic echo|info|publishers`: a topic's messages, and its publishers and subscribers, now or in the past."""
 
 import re
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -13,6 +12,7 @@ from appliance.api.moments import in_full
 from appliance.audit.publishers import publishers_at
 from appliance.audit.query import Filter
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic, TopicMessage
@@ -95,7 +95,7 @@ def publishers(
     if not is_global_name(topic):
         raise usage_error(f"{topic!r} is not a resolved ROS name, such as /cmd_vel")
     with Errors():
-        now = time.time_ns()
+        now = clock.wall_ns()
         then = now if at == "now" else parse_timestamp(at, now)
         if then > now:
             raise usage_error(f"--at {at} is in the future")

@@ -9,13 +9,14 @@ Invariants:
 """
 
 import ssl
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpcore
+
+from appliance.base import clock
 
 _EXCHANGE_SECONDS = 60.0  # a collector answers late when a thousand robots ask at once
 _SILENT_SECONDS = 90.0  # the collector sends a comment on the event stream every 30 s
@@ -163,10 +164,10 @@ class _Deadline:
 
     def begin(self, seconds: float) -> None:
         self.seconds = seconds
-        self._end = time.monotonic() + seconds
+        self._end = clock.now() + seconds
 
     def left(self) -> float:
-        left = self._end - time.monotonic()
+        left = self._end - clock.now()
         if left <= 0:
             raise httpcore.TimeoutException
         return left

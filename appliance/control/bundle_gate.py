@@ -14,12 +14,12 @@ Invariants:
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
 from appliance.channel.answers.status import BundlesState
@@ -234,7 +234,7 @@ class BundleGate:
             self._refuse(trial.path, trial.sha256, reason)
             return
         policy, monitors = self._policies.revision, self._monitors.revision
-        await self._keep(BundleRecord(trial.path, trial.sha256, time.time(), policy, monitors))
+        await self._keep(BundleRecord(trial.path, trial.sha256, clock.wall(), policy, monitors))
         self._trail.happened(
             "bundle in force",
             f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s",
@@ -253,16 +253,16 @@ class BundleGate:
 
     async def _watched(self, before: RobotHealth) -> str:
         """Watch the robot for the time of the trial; return why it is not healthy, or an empty text."""
-        deadline = time.monotonic() + self._fleet.bundles.confirm_seconds
+        deadline = clock.now() + self._fleet.bundles.confirm_seconds
         there = (self._policies.revision, self._monitors.revision)
         while True:
             if there != (self._policies.revision, self._monitors.revision):
                 return "an operator changed the policy or the specifications during the trial"
             reason = self._health().worse_than(before)
-            if reason or time.monotonic() >= deadline:
+            if reason or clock.now() >= deadline:
                 return reason
             self._state()
-            await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - time.monotonic())))
+            await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _refuse(self, path: str, sha256: str, reason: str) -> None:
         refused = RefusedBundle(path, sha256, reason[:4000])

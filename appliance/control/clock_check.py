@@ -9,9 +9,9 @@ Four conditions are reported:
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 
+from appliance.base import clock
 from appliance.base.shipped import before_program
 from appliance.channel.answers.status import ClockState
 from appliance.telemetry.audit_trail import AuditTrail
@@ -30,7 +30,7 @@ class ClockCheck:
         self,
         trail: AuditTrail,
         behind: Callable[[], float],
-        started: Callable[[], float] = lambda: time.time() - time.clock_gettime(time.CLOCK_BOOTTIME),
+        started: Callable[[], float] = lambda: clock.wall() - clock.since_boot(),
     ) -> None:
         """Begin the check. `started()` returns the machine's start by its present clock, in seconds since the epoch."""
         self._trail = trail

@@ -7,12 +7,12 @@ Invariants:
 3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
 """
 
-import time
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
+from appliance.base import clock
 from appliance.base.age_clock import AgeClock
 from appliance.policy.model import Address, address_of
 from appliance.store.host_tables import HostBlockRow
@@ -23,13 +23,13 @@ _NOTE_SHOWN = 60  # characters; the reason of a decision is bounded
 
 
 class BlockTable:
-    """All blocks, by canonical address; `clock()` is the age clock."""
+    """All blocks, by canonical address; `age()` is the age clock."""
 
-    def __init__(self, store: StateStore, clock: Callable[[], int]) -> None:
+    def __init__(self, store: StateStore, age: Callable[[], int]) -> None:
         self._store = store
-        self._clock = clock
+        self._age = age
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
-        self._now, self._wall = clock() if self._rows else 0, time.time()
+        self._now, self._wall = age() if self._rows else 0, clock.wall()
         self.reasons: Mapping[Address, str] = self._described()
 
     @classmethod
@@ -46,7 +46,7 @@ class BlockTable:
 
     def read_clock(self) -> None:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
-        self._now, self._wall = self._clock(), time.time()
+        self._now, self._wall = self._age(), clock.wall()
 
     def until(self, row: HostBlockRow) -> float | None:
         """Return the end of a block by the present system clock, in seconds since the epoch; None: it has no end."""
@@ -55,7 +55,7 @@ class BlockTable:
     def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:
         """Store a block from now on, in place of an earlier block of the host."""
         ends = None if seconds is None else self._now + int(seconds * _SECOND)
-        row = HostBlockRow(str(address), time.time(), ends, who, note)
+        row = HostBlockRow(str(address), clock.wall(), ends, who, note)
         self._store.hosts.save_block(row)
         self._rows.pop(address, None)
         self._rows[address] = row

@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.standby.process import boot_time
 
 _HAND_OVER_SECONDS = 5.0
 
@@ -56,7 +56,7 @@ class LeaseClient:
 
     def active(self) -> bool:
         """Whether this appliance may answer now."""
-        return self.state is not None and boot_time() < self.state.until
+        return self.state is not None and clock.since_boot() < self.state.until
 
     async def until_active(self) -> None:
         """Wait until this appliance may answer. If the lease has ended, the supervisor ends this process."""

@@ -7,7 +7,6 @@ gives all other orders to the active appliance.
 import asyncio
 import socket
 import ssl
-import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
@@ -62,7 +62,7 @@ class PassiveControl:
         self._lifeline = lifeline
         self._lease = lease
         self._folder = settings.state / "control"
-        self._since = time.time()
+        self._since = clock.wall()
         self._replica = Replica(
             self._folder / "state.db",
             SCHEMA,
@@ -82,7 +82,7 @@ class PassiveControl:
         )
         self._epoch = 0
         self._connected = False
-        self._away_since = time.monotonic()
+        self._away_since = clock.now()
         self._reason = ""
         self._rest = PassiveRest(
             StandbyAdministration(self, orders=False), ReplicatedTokens(self._folder / "state.db")
@@ -157,7 +157,7 @@ class PassiveControl:
             behind_bytes=0,
             waiting_seconds=None,
             reason="" if self._connected else self._reason,
-            trouble_seconds=None if self._connected else round(time.monotonic() - self._away_since, 3),
+            trouble_seconds=None if self._connected else round(clock.now() - self._away_since, 3),
         )
         wait = self._settings.availability.wait
         return state_of(
@@ -205,7 +205,7 @@ class PassiveControl:
                     _log.info("the active appliance is not followed", reason=self._reason)
             finally:
                 if self._connected:
-                    self._connected, self._away_since = False, time.monotonic()
+                    self._connected, self._away_since = False, clock.now()
             await asyncio.sleep(_AGAIN_SECONDS)
 
     async def _prepare_tunnels(self) -> None:

@@ -2,13 +2,13 @@
 
 import asyncio
 import sqlite3
-import time
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import structlog
 
+from appliance.base import clock
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
@@ -52,11 +52,11 @@ class ReplicatedTokens:
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
         row = (self._rows or {}).get(token_id)
-        return row if row is not None and row.usable(time.time()) else None
+        return row if row is not None and row.usable(clock.wall()) else None
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens."""
-        now = time.time()
+        now = clock.wall()
         return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(now)]
 
 

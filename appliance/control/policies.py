@@ -9,7 +9,6 @@ change is answered once it is on disk and the relays have carried it out: revoke
 
 import asyncio
 import contextlib
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import NamedTuple
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.input_files import read_given_text
 from appliance.base.withdrawal import take_effect
@@ -326,7 +326,7 @@ class Policies(Revisions[RevisionRow]):
     ) -> Loaded:
         take_effect()
         before = self.revision
-        row = RevisionRow(before + 1, policy.text, policy.file, time.time(), who, note, signature)
+        row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
         self._trail.happened(

@@ -1,13 +1,13 @@
 """Answer queries about the appliance: status, graph, live registrations, measurements. Queries change nothing."""
 
 import asyncio
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import msgspec
 
 import appliance
+from appliance.base.clock import now, wall
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
     Graph,
@@ -78,7 +78,7 @@ class Queries:
     blocks: Callable[[], BlocksState]
     standby: Callable[[], StandbyState | None]
     bundles: Callable[[], BundlesState | None]
-    started: float = field(default_factory=time.time)
+    started: float = field(default_factory=wall)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
@@ -139,12 +139,12 @@ class Queries:
 
     def _record_look(self, topic: str, who: str) -> None:
         """Record only the first of equal queries within `ONE_LOOK`, because a plot in the console polls."""
-        now = time.monotonic()
-        for key in [key for key, since in self._shown.items() if now - since >= ONE_LOOK]:
+        moment = now()
+        for key in [key for key, since in self._shown.items() if moment - since >= ONE_LOOK]:
             del self._shown[key]
         if (who, topic) in self._shown:
             return
-        self._shown[who, topic] = now
+        self._shown[who, topic] = moment
         self.trail.happened(
             "topic looked into",
             f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",

@@ -1,11 +1,11 @@
 """Pass operators' orders to the flight recorder. Record these orders and the recorder's reports in the audit log."""
 
 import asyncio
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
+from appliance.base import clock
 from appliance.channel import admin, messages
 from appliance.channel.answers.recording_answers import (
     OPERATORS,
@@ -119,7 +119,7 @@ class RecordingOrders:
             "recording ordered", reason, who=who, before=before, after=after, **caller
         )
         charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
-        trigger = Trigger(time.time_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
+        trigger = Trigger(clock.wall_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
         begun = await self._ask(
             lambda number: messages.RecordingRequested(number, trigger, before, after),
             messages.RecordingStarted,
@@ -163,7 +163,7 @@ class RecordingOrders:
     async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
         """Make a temporary recording of the messages in memory."""
         self._require()
-        now = time.time_ns()
+        now = clock.wall_ns()
         since, until = request.since or 0, now if request.until is None else request.until
         record = self._trail.happened(
             "recording ordered",
@@ -237,7 +237,7 @@ class RecordingOrders:
                 about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
                 if planned:
                     about["recording"] = planned
-                    self._plan.missed(trigger.charged_to, planned, reason, time.time_ns())
+                    self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns())
                 self._trail.happened("recording missed", reason, more=about)
             case messages.RecordingRemoved(_number, recording, who, reason):
                 self._kept.pop(recording.id, None)

@@ -11,13 +11,13 @@ import asyncio
 import contextlib
 import os
 import socket
-import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
@@ -28,7 +28,6 @@ from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.standby.link_certificates import replication_context
 from appliance.standby.membership import Membership
-from appliance.standby.process import boot_time
 from appliance.standby.replication_frames import Introduction, ReplicationError
 from appliance.standby.replication_sender import ReplicationSender
 from appliance.standby.replication_transport import ReplicationListener
@@ -101,7 +100,7 @@ def state_of(
     obstacle: str,
 ) -> StandbyState:
     """Return the state of this appliance for operators."""
-    now = boot_time()
+    now = clock.since_boot()
     return StandbyState(
         name=membership.name,
         address=membership.address,
@@ -155,7 +154,7 @@ class Replication:
         self._lease = lease
         self._database = database
         self._wait = wait
-        self._since = time.time()
+        self._since = clock.wall()
         self.switchover_wanted = asyncio.Event()
         self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
         self._listener = ReplicationListener(
@@ -254,7 +253,9 @@ class Replication:
         """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
         lease = self._lease.state
         heard = lease.heard if lease is not None else None
-        return self.sender.lag().connected and heard is not None and boot_time() - heard < _ANSWER_SECONDS
+        return (
+            self.sender.lag().connected and heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
+        )
 
     def require_ready(self) -> None:
         """Raise `HandOverError`, with the reason, unless the standby could take over now."""
@@ -315,7 +316,7 @@ class Replication:
         if self._absent:
             waiting = 0.0
         elif waiting is not None:
-            waiting = boot_time() - (asyncio.get_running_loop().time() - waiting)
+            waiting = clock.since_boot() - (asyncio.get_running_loop().time() - waiting)
         report = messages.ReplicationReported(
             permission=self._permission,
             caught_up=lag.caught_up and not self.sender.alone,

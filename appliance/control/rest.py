@@ -13,7 +13,6 @@ These invariants ensure that a flooded or compromised api cannot block RVMaster:
 """
 
 import asyncio
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.base.withdrawal import awaited
 from appliance.channel import messages
 from appliance.channel.admin import (
@@ -141,7 +141,7 @@ class RestLink:
 
         def given_up() -> bool:
             gone = withdrawn.get(made.number, False) or channel is not self._link.channel
-            return gone or time.monotonic() > made.until
+            return gone or clock.now() > made.until
 
         with awaited(given_up):
             answer = await self._answer(made)

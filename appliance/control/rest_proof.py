@@ -16,12 +16,12 @@ Browsers and scripts connect to the api process, so it may be compromised. Invar
 
 import asyncio
 import hashlib
-import time
 from typing import Protocol
 
 import msgspec
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
@@ -72,7 +72,7 @@ class RequestAuthenticator:
 
     def challenge(self) -> Challenge:
         """Return a new challenge for an order, with its lifetime in seconds."""
-        return Challenge(self._challenges.give(time.monotonic()), SECONDS)
+        return Challenge(self._challenges.give(clock.now()), SECONDS)
 
     async def asker(self, made: RequestMade) -> str:
         """Return the author of a request: the name of its token, or a fixed name if it needs no token.
@@ -153,7 +153,7 @@ class RequestAuthenticator:
             )
             if not is_signed(row.keys.verifying, stated, signature):
                 raise BadProofError("the proof does not fit this request: another request was signed")
-            self._challenges.take(challenge, time.monotonic())
+            self._challenges.take(challenge, clock.now())
         except (BadProofError, ChallengeRefusedError) as error:
             raise UnprovenError(str(error), row.name) from None
 

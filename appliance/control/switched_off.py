@@ -6,11 +6,11 @@ count the running time of the appliance, so they do not depend on the system clo
 """
 
 import asyncio
-import time
 from collections.abc import Iterator
 
 import msgspec
 
+from appliance.base import clock
 from appliance.channel.answers.status import SwitchedOff
 from appliance.control.policies import Policies
 from appliance.policy.sections import DECIDERS
@@ -32,7 +32,7 @@ class _Age(msgspec.Struct):
 
 def off_now(monitors: SpecificationManager, policies: Policies) -> Iterator[SwitchedOff]:
     """Yield all switched-off protection, with the present time as its start."""
-    now = time.time()
+    now = clock.wall()
     for name, to in monitors.switches.switched_off().items():
         if to is False:
             again, until = f"rosrv monitor enable {name}", monitors.returns.until(name)
@@ -76,9 +76,9 @@ class SwitchedOffWatch:
     async def watch(self) -> None:
         """Check every minute."""
         while True:
-            before = time.monotonic()
+            before = clock.now()
             await asyncio.sleep(_LOOK_SECONDS)
-            self.look(time.monotonic() - before)
+            self.look(clock.now() - before)
 
     def look(self, seconds: float) -> None:
         """Add `seconds` to the ages, and record an alarm for each forgotten protection."""
@@ -106,7 +106,7 @@ class SwitchedOffWatch:
             self._ages = {what: self._ages.get(what) or _Age(one.since) for what, one in off.items()}
             self._save()
         for what, one in off.items():
-            if one.until is None or one.until + _LOOK_SECONDS < time.time():
+            if one.until is None or one.until + _LOOK_SECONDS < clock.wall():
                 self._ages[what].seconds += seconds
 
     def _save(self) -> None:

@@ -5,10 +5,10 @@ The api also reports uses of tokens; a compromised api can report wrong ones.
 """
 
 import contextlib
-import time
 from collections.abc import Callable
 from typing import cast
 
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
@@ -41,7 +41,7 @@ class TokenOrders:
         self._untold = bool(settings.get(_UNTOLD))
         self._uses = store.token_uses()
         self._stored: dict[str, float] = {}  # by token: when its last use was stored (monotonic)
-        self._uses_since = float(settings.get(_USES_SINCE) or time.time())
+        self._uses_since = float(settings.get(_USES_SINCE) or clock.wall())
         if _USES_SINCE not in settings:
             store.save_setting(_USES_SINCE, str(self._uses_since))
         self._rotating: set[str] = set()  # names
@@ -53,19 +53,19 @@ class TokenOrders:
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens. The api checks `expires`."""
-        now = time.time()
+        now = clock.wall()
         return [kept_by_api(row) for row in self._rows.values() if row.usable(now)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
         row = self._rows.get(token_id)
-        return row if row is not None and row.usable(time.time()) else None
+        return row if row is not None and row.usable(clock.wall()) else None
 
     def used(self, token_id: str) -> None:
         """Note that a token is used now. The time is stored unless the disk is full."""
         if token_id not in self._rows:
             return
-        self._uses[token_id], now = time.time(), time.monotonic()
+        self._uses[token_id], now = clock.wall(), clock.now()
         if now - self._stored.get(token_id, -_LEAST_SECONDS) < _LEAST_SECONDS:
             return
         with contextlib.suppress(StoreError):  # the next use is stored
@@ -79,7 +79,7 @@ class TokenOrders:
             return None
         self._untold = True
         self._store.save_setting(_UNTOLD, "yes")
-        if self._named(FIRST_NAME, time.time()):
+        if self._named(FIRST_NAME, clock.wall()):
             await self.revoke(admin.TokenRevoke(FIRST_NAME))
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
@@ -94,7 +94,7 @@ class TokenOrders:
 
         Raises `TokenRefusedError` and `StoreError`.
         """
-        name, now = request.name, time.time()
+        name, now = request.name, clock.wall()
         _require_lifetime(request.seconds)
         if self._named(name, now):
             raise TokenRefusedError(
@@ -128,7 +128,7 @@ class TokenOrders:
         The new token and the ends of the earlier ones are stored at once. If they cannot be stored, the earlier ones
         stay valid. Raises `TokenRefusedError` and `StoreError`.
         """
-        name, now = request.name, time.time()
+        name, now = request.name, clock.wall()
         earlier = self._require_named(name, now)
         last = max(earlier, key=lambda row: row.expires)
         seconds = last.expires - last.created if request.seconds is None else request.seconds
@@ -171,12 +171,12 @@ class TokenOrders:
 
     async def revoke(self, request: admin.TokenRevoke, who: str = "") -> answers.Token:
         """End all valid tokens of a name now. Raises `TokenRefusedError` and `StoreError`."""
-        ended = [self._end(row, who) for row in self._require_named(request.name, time.time())]
+        ended = [self._end(row, who) for row in self._require_named(request.name, clock.wall())]
         await self._store.settled()
         return self._shown(ended[-1])
 
     def _end(self, row: TokenRow, who: str, reason: str = "was revoked") -> TokenRow:
-        revoked = row._replace(revoked=time.time())
+        revoked = row._replace(revoked=clock.wall())
         self._keep(revoked)
         self._trail.happened(
             "token revoked",

@@ -17,7 +17,6 @@ import io
 import itertools
 import json
 import sqlite3
-import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -29,6 +28,7 @@ from appliance.audit.chain import StoredColumns
 from appliance.audit.chain_proofs import ChainProof, ChainReader
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.signatures import pinned_key_path
+from appliance.base import clock
 from appliance.channel.admin import (
     A,
     AdminAnswer,
@@ -95,7 +95,7 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterat
         bag = wanted.folder / wanted.id / "recording.bag"
         wanted = TimeSpan(recording.began, recording.ended + 1)
     _given(ask(LogSealed()))
-    span = TimeSpan(wanted.since, min(wanted.until, time.time_ns()))
+    span = TimeSpan(wanted.since, min(wanted.until, clock.wall_ns()))
     bundle = _Bundle(log, span, ask, recording, bag)
     manifest = bundle.manifest()
     text = json.dumps(manifest, indent=1).encode() + b"\n"

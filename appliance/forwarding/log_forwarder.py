@@ -10,7 +10,6 @@ Invariants:
 5. If the log was restored from a copy, new records that reuse sequence numbers of sent records are also sent.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from appliance.audit.query import Filter
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import LogEntry
 from appliance.audit.search import search
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
 from appliance.forwarding.receiver import Receiver
@@ -75,7 +75,7 @@ class LogForwarder:
     receiver: Receiver
     formatter: Formatter
     chosen: Chosen
-    clock: Callable[[], int] = time.time_ns
+    clock: Callable[[], int] = clock.wall_ns
     progress: ForwardingReported = field(default_factory=ForwardingReported)
     _position: ForwardingPosition | None = None
     _saved: ForwardingPosition | None = None
@@ -167,7 +167,7 @@ class LogForwarder:
         return pause
 
     def _save(self, at_most_every: float) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if self._position is None or self._position == self._saved or now - self._saved_at < at_most_every:
             return
         save_position(self.kept, self._position)

@@ -17,11 +17,12 @@ import socket
 import ssl
 import struct
 import termios
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
+
+from appliance.base import clock
 
 _CONNECT_SECONDS = 5.0
 _SEND_SECONDS = 10.0
@@ -146,10 +147,10 @@ def _require_open(connection: socket.socket) -> None:
 
 
 def _await_acknowledgement(connection: socket.socket) -> None:
-    deadline = time.monotonic() + _SEND_SECONDS
+    deadline = clock.now() + _SEND_SECONDS
     pause, longest = _LOOK_SECONDS
     while _unacknowledged(connection):
-        if time.monotonic() > deadline:
+        if clock.now() > deadline:
             raise TimeoutError(f"the receiver took nothing for {_SEND_SECONDS:g} s")
         readable, _, _ = select.select([connection], [], [], pause)
         if readable:

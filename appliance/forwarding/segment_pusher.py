@@ -14,7 +14,6 @@ Invariants:
 import gzip
 import os
 import random
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,6 +26,7 @@ import structlog
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.log_database import LogUnreadableError, reading
 from appliance.audit.segments import SegmentSummary, next_segment, write_segment
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
 from appliance.collector.connection import CollectorConnection, CollectorError
@@ -69,7 +69,7 @@ class SegmentPusher:
     collector: CollectorConnection
     receipt_key: bytes
     jitter: Callable[[], float] = random.random
-    clock: Callable[[], int] = time.time_ns
+    clock: Callable[[], int] = clock.wall_ns
     progress: ForwardingReported = field(default_factory=ForwardingReported)
     _position: PushPosition | None = None
     _failures: int = 0

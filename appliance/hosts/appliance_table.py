@@ -7,10 +7,10 @@ stays on its appliance. There are at most two rows; the certificate of an applia
 
 import asyncio
 import contextlib
-import time
 
 import structlog
 
+from appliance.base import clock
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.revoked_certificates import RevokedCertificates
@@ -64,7 +64,7 @@ class ApplianceTable:
     def certificate(self, key: str) -> bytes:
         """Return the valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""
         row = self._rows.get(key)
-        return row.certificate.encode() if row is not None and row.expires > time.time() else b""
+        return row.certificate.encode() if row is not None and row.expires > clock.wall() else b""
 
     def is_served(self, pin: str) -> None:
         """Note the pin of this appliance's REST server, for the kits that the other one makes."""
@@ -96,7 +96,7 @@ class ApplianceTable:
                 _log.warning("both appliances have the same address for hosts; set ipsec.endpoint on each")
                 return
             row = self._rows.get(other.key)
-            if row is None or row.expires < time.time() + _RENEWED_DAYS * 86_400:
+            if row is None or row.expires < clock.wall() + _RENEWED_DAYS * 86_400:
                 await self._certify(other, authority, row)
             elif (row.endpoint, row.pin) != (other.endpoint, other.pin):
                 self._save(row._replace(endpoint=other.endpoint, pin=other.pin))
@@ -105,7 +105,7 @@ class ApplianceTable:
     async def _certify(
         self, other: Introduction, authority: SharedAuthority, before: ApplianceRow | None
     ) -> None:
-        now = time.monotonic()
+        now = clock.now()
         if before is None and now < self._replaceable + _REPLACED_SECONDS:
             _log.warning("the other appliance changes its tunnel key too often; it gets no certificate yet")
             return

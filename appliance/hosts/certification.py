@@ -8,11 +8,11 @@ Invariants:
 
 import asyncio
 import contextlib
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
@@ -213,7 +213,7 @@ class Certification:
 
     def each_hour(self) -> None:
         """Replace ended certificates by their stored successors; record once each certificate that ends soon."""
-        now = time.time()
+        now = clock.wall()
         self.table.revoked.forget_ended()
         for row in self.table.enrolled():
             if row.expires <= now:

@@ -1,10 +1,10 @@
 """Keep the results of port checks from other machines: are a machine's ROS ports closed to all but the appliance?"""
 
 import ipaddress
-import time
 from collections.abc import Callable
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import PortsReport
 from appliance.hosts.certification import Certification
@@ -33,7 +33,7 @@ class PortChecks:
         """Store and record the result of a check. Raises `HostRefusedError`, `HostsChangedError`."""
         self._table.require(request.expected)
         key, state = self._known_machine(request.name), request.state
-        now = time.time()
+        now = clock.wall()
         checked = now if request.checked is None else request.checked
         if checked > now + _CLOCKS_DIFFER:
             raise HostRefusedError("the time of the check is more than a day in the future")

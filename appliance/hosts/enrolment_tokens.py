@@ -12,8 +12,8 @@ import hashlib
 import hmac
 import re
 import secrets
-import time
 
+from appliance.base import clock
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -34,7 +34,7 @@ class EnrolmentTokens:
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
         """Return the valid tokens by the names of their hosts."""
-        now = time.time()
+        now = clock.wall()
         for name in [name for name, row in self._rows.items() if row.expires <= now]:
             self.forget(name)
         return dict(self._rows)
@@ -47,7 +47,7 @@ class EnrolmentTokens:
         self, name: str, *, seconds: float, address: str, days: float, kit: dict[str, str], who: str
     ) -> tuple[EnrolmentTokenRow, str]:
         """Make a token; return its row and its text. The text cannot be read again."""
-        token_id, now = secrets.token_hex(6), time.time()
+        token_id, now = secrets.token_hex(6), clock.wall()
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row

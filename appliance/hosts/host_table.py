@@ -10,8 +10,8 @@ import datetime
 import ipaddress
 import itertools
 import re
-import time
 
+from appliance.base import clock
 from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.revoked_certificates import RevokedCertificates
@@ -182,7 +182,7 @@ class HostTable:
 
     def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
         """Make this the only certificate of a host."""
-        before, now = self.rows.get(name), time.time()
+        before, now = self.rows.get(name), clock.wall()
         if before is not None and before.revoked is None:
             self._revoke_certificates(before)
         enrolled = before.enrolled if before is not None and before.revoked is None else now
@@ -195,7 +195,7 @@ class HostTable:
         """Store the certificate that will follow a host's present one."""
         row = self.certificates.get(name)
         before = row.certificate if row is not None else ""
-        since = row.made if row is not None else time.time()
+        since = row.made if row is not None else clock.wall()
         if row is not None and row.next is not None:
             self.revoked.add(name, row.next.serial, row.next.expires)
         following = NextCertificate(made.serial, made.expires, made.certificate.decode())
@@ -210,7 +210,7 @@ class HostTable:
         following = certificate.next
         self.revoked.add(name, row.serial, row.expires)
         taken = self._set(row._replace(serial=following.serial, expires=following.expires))
-        self._set_certificate(CertificateRow(name, time.time(), following.certificate))
+        self._set_certificate(CertificateRow(name, clock.wall(), following.certificate))
         self.changed()
         return taken
 
@@ -219,7 +219,7 @@ class HostTable:
         row = self.enrolled_row(name)
         self._revoke_certificates(row)
         self.changed()
-        return self._set(row._replace(revoked=time.time()))
+        return self._set(row._replace(revoked=clock.wall()))
 
     def keep_ports(self, row: PortsRow) -> None:
         """Keep the result of a check of a machine's ports. Raises `HostRefusedError`."""

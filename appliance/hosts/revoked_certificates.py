@@ -9,9 +9,9 @@ Invariants:
    them. Before certificates of enrolled hosts exceed the limit, `require_room` rejects further replacements.
 """
 
-import time
 from collections.abc import Iterable, Set
 
+from appliance.base import clock
 from appliance.store.host_tables import HostTables, RevokedCertificateRow
 
 AFTER_END_SECONDS = 86_400.0  # tolerated difference between clocks
@@ -31,14 +31,14 @@ class RevokedCertificates:
 
     def add(self, name: str, serial: str, expires: float) -> None:
         """Add a revoked certificate, once."""
-        row = RevokedCertificateRow(serial, name, time.time(), expires)
+        row = RevokedCertificateRow(serial, name, clock.wall(), expires)
         if serial not in self._rows:
             self._rows[serial] = row
             self._kept.save_revoked(row)
 
     def forget_ended(self) -> None:
         """Delete certificates that ended so long ago that even a wrong clock would not accept them."""
-        before = time.time() - _KEPT_SECONDS
+        before = clock.wall() - _KEPT_SECONDS
         ended = [row.serial for row in self._rows.values() if row.expires < before]
         for serial in ended:
             del self._rows[serial]
@@ -74,7 +74,7 @@ class RevokedCertificates:
         return min(row.expires for row in rows) + AFTER_END_SECONDS
 
     def _not_ended(self) -> list[RevokedCertificateRow]:
-        before = time.time() - AFTER_END_SECONDS
+        before = clock.wall() - AFTER_END_SECONDS
         return [row for row in self._rows.values() if row.expires >= before]
 
 

@@ -12,8 +12,8 @@
 
 import asyncio
 import ipaddress
-import time
 
+from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import KitParts, NewCertificate, Renewed
@@ -121,10 +121,10 @@ class HostSelfService:
 
     def _require_patience(self, name: str, life: float) -> None:
         wait = life / _RENEWALS
-        since = time.time() - self._renewals.get(name, -wait)
+        since = clock.wall() - self._renewals.get(name, -wait)
         if 0 <= since < wait:  # `since` is negative after the clock was set back; the host then need not wait
             raise HostRefusedError(f"{name} renewed {span(since)} ago: try again in {span(wait - since)}")
 
     def _note_renewal(self, name: str) -> None:
-        self._renewals[name] = time.time()
+        self._renewals[name] = clock.wall()
         self._certification.store.save_setting(_RENEWED + name, repr(self._renewals[name]))

@@ -8,8 +8,8 @@ A single appliance always uses its own key.
 """
 
 import datetime
-import time
 
+from appliance.base import clock
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.store.host_tables import AuthorityRow, HostTables
@@ -84,7 +84,7 @@ class SharedAuthority:
             return self._row.revocations.encode()
         signed = await self._signer.revocations(revoked)
         if self._shared:
-            self._save(AuthorityRow(certificate.decode(), signed.decode(), time.time()))
+            self._save(AuthorityRow(certificate.decode(), signed.decode(), clock.wall()))
         return signed
 
     def _save(self, row: AuthorityRow) -> None:

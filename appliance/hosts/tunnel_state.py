@@ -11,11 +11,11 @@ Invariants:
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 
 import structlog
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
@@ -51,7 +51,7 @@ class SignedRevocations:
     async def signed(self) -> bytes:
         """Return the list in PEM. Raises `AuthorityError`."""
         async with self._one_at_a_time:
-            state = (self._table.revision, int(time.time() // _SIGNED_SECONDS))
+            state = (self._table.revision, int(clock.wall() // _SIGNED_SECONDS))
             if state != self._state:
                 rows = self._table.listed_as_revoked()
                 self._signed = await self._authority.revocations([(row.serial, row.moment) for row in rows])
@@ -90,7 +90,7 @@ class Tunnels:
         self._dirty = asyncio.Event()
         # The number of the last statement. Reports may still have numbers of an earlier process; a start from the clock
         # avoids the same numbers.
-        self._number = time.time_ns()
+        self._number = clock.wall_ns()
         self._wake = asyncio.Event()
         self._changes = 0  # number of changes that charon must get
         self._stated: dict[int, int] = {}  # by unconfirmed statement: the last change that it includes
@@ -192,18 +192,18 @@ class Tunnels:
 
     def _until_it_changes(self) -> float:
         """Return the seconds until the next certificate ends, at most an hour. charon does not close its tunnel."""
-        now = time.time()
+        now = clock.wall()
         ends = [row.expires - now for row in self._table.admitted() if row.expires > now]
         return min([_RESTATE_SECONDS, *(end + _JUST_AFTER_SECONDS for end in ends)])
 
     async def until_taken(self) -> bool:
         """Wait until charon has confirmed the last `state_anew`; return False if it does not in time."""
         wanted = self._changes
-        deadline = time.monotonic() + _TAKEN_SECONDS
+        deadline = clock.now() + _TAKEN_SECONDS
         while self._taken_changes < wanted:
             self._wake.clear()
             try:
-                await asyncio.wait_for(self._wake.wait(), deadline - time.monotonic())
+                await asyncio.wait_for(self._wake.wait(), deadline - clock.now())
             except TimeoutError:
                 return False
         return True
@@ -214,7 +214,7 @@ class Tunnels:
             return
         authority = await self._authority.certificate()
         revocations = await self.revocations.signed()
-        now = time.time()
+        now = clock.wall()
         hosts = [
             messages.TunnelHost(row.name, row.address, row.serial)
             for row in self._table.admitted()
@@ -295,13 +295,13 @@ class Tunnels:
             self._went_down(name, "closed")
         elif name not in self.seen:
             self.seen[name] = messages.TunnelSeen(name, remote, 0, 0, 0)
-            self.last[name] = time.time()
+            self.last[name] = clock.wall()
             self._trail.happened(
                 "tunnel up", f"{name} is connected from {remote}", host=row.address, name=name, remote=remote
             )
 
     def _reported(self, rows: list[messages.TunnelSeen]) -> None:
-        now = time.time()
+        now = clock.wall()
         standing = {row.name: row for row in rows if row.name in self._table.rows}
         for name in set(self.seen) - set(standing):
             self._went_down(name, "gone")

@@ -1,10 +1,10 @@
 """Show operators the hosts: a row for each, its difference from hosts.yaml, and what needs attention."""
 
 import math
-import time
 from collections.abc import Mapping
 from typing import cast
 
+from appliance.base import clock
 from appliance.channel.answers.host_answers import Host, Machine, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
@@ -42,7 +42,7 @@ class HostView:
         row, seen = self._table.rows.get(name), self._tunnels.seen.get(name)
         promised = awaited.address if awaited else declared.address if declared else None
         certificate = self._table.certificates.get(name)
-        now = time.time()
+        now = clock.wall()
         return Host(
             name=name,
             address=row.address if row else promised,
@@ -139,7 +139,7 @@ class HostView:
         return "expired" if row.expires <= now else "down"
 
     def _troubles(self) -> list[str]:
-        now, found = time.time(), []
+        now, found = clock.wall(), []
         if self._table.admitted() and not self._tunnels.enclosed:
             found.append(f"enrolled hosts cannot connect: {self._tunnels.obstacle}")
         for row in self._table.enrolled():

@@ -15,7 +15,6 @@ import contextlib
 import datetime
 import re
 import secrets
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.ipsec.authority_key import Kind, load_key, make_key, write_key
 from appliance.ipsec.key_files import SignerKeyError
@@ -100,7 +100,7 @@ class CertificateAuthority:
         if not 0 < days <= LONGEST_DAYS:
             raise RequestRefusedError(f"a certificate is valid for at most {LONGEST_DAYS} days")
         public_key = _key_of(request)
-        now = datetime.datetime.now(datetime.UTC)
+        now = clock.utc_now()
         if proof or former:
             require_proof(request, proof, former, name=name, authority=self._certificate, now=now)
         end = min(now + datetime.timedelta(days=days), self._certificate.not_valid_after_utc)
@@ -131,7 +131,7 @@ class CertificateAuthority:
 
     def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
         """Return the signed revocation list (PEM) of serial numbers (hexadecimal) and revocation times (epoch)."""
-        now = datetime.datetime.now(datetime.UTC)
+        now = clock.utc_now()
         builder = (
             x509.CertificateRevocationListBuilder()
             .issuer_name(self._certificate.subject)
@@ -150,7 +150,7 @@ class CertificateAuthority:
         return builder.sign(self._key, self._hash).public_bytes(Encoding.PEM)
 
     def _next_list(self) -> int:
-        self._list_number = max(self._list_number + 1, time.time_ns())
+        self._list_number = max(self._list_number + 1, clock.wall_ns())
         # A full disk must not prevent a revocation; this process remembers the number.
         with contextlib.suppress(OSError):
             write_whole(self._list_path, b"%d" % self._list_number, 0o600)
@@ -185,7 +185,7 @@ def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: byte
     key = make_key(kind)
     serial = x509.random_serial_number()
     subject = _subject(f"ROSRV appliance authority {serial % 0x1000000:06x}")
-    now = datetime.datetime.now(datetime.UTC)
+    now = clock.utc_now()
     certificate = (
         x509.CertificateBuilder()
         .subject_name(subject)

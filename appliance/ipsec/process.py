@@ -17,7 +17,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -26,6 +25,7 @@ from typing import Any, TypeVar
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -157,12 +157,12 @@ class TunnelProcess:
         self._tell(messages.CharonStarted(self._version, vici.proposals.key_exchange))
 
     async def _connect(self, path: Path) -> ViciClient:
-        deadline = time.monotonic() + _START_SECONDS
+        deadline = clock.now() + _START_SECONDS
         while True:
             try:
                 return ViciClient(path)
             except CharonError:
-                if time.monotonic() > deadline:
+                if clock.now() > deadline:
                     raise
             await asyncio.sleep(0.05)
 
@@ -193,7 +193,7 @@ class TunnelProcess:
         )
 
     def _may_tell(self) -> bool:
-        second, count = int(time.monotonic()), self._second[1]
+        second, count = int(clock.now()), self._second[1]
         self._second = (second, count + 1 if second == self._second[0] else 1)
         return self._second[1] <= REFUSALS_PER_SECOND
 

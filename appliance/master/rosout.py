@@ -5,10 +5,10 @@ only the first report of each kind in a second has its text, as the relay sends 
 published per second, with the number of omitted reports. As with a node's own logger, DEBUG is omitted.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.base import clock
 from appliance.channel.messages import MonitorEvent, OwnHeaderStated, OwnPublished
 from roswire.definitions import Definitions
 from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
@@ -31,7 +31,7 @@ class Rosout:
     node: str
     publish: Callable[[OwnPublished], None]
     file_of: Callable[[str], str]
-    clock: Callable[[], float] = time.monotonic
+    clock: Callable[[], float] = clock.now
     _sequence: int = 0
     _second: int = 0
     _published: int = 0

@@ -6,10 +6,11 @@ program hangs if it uses no processor time and waits for neither a processor nor
 
 import logging
 import subprocess
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+
+from appliance.base import clock
 
 STILL_SECONDS = 20.0
 LONGEST_SECONDS = 600.0  # limit even for a program that progresses, such as an endless loop
@@ -29,11 +30,11 @@ class ProcessActivity:
     def __init__(self, pid: int) -> None:
         self._stat = Path("/proc", str(pid), "stat")
         self._seen: tuple[str, ...] = ()
-        self._since = time.monotonic()
+        self._since = clock.now()
 
     def stalled_seconds(self) -> float:
         """Return the seconds since it last progressed or waited for processor or disk; call this every second or so."""
-        now = time.monotonic()
+        now = clock.now()
         try:
             fields = self._stat.read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         except OSError:  # it has ended
@@ -60,12 +61,12 @@ def communicate(process: "subprocess.Popen[str]", text: str, what: str) -> tuple
 
     Raises `TimeoutError` if it hangs, after it is killed.
     """
-    began, progress, said = time.monotonic(), ProcessActivity(process.pid), _SAY_SECONDS
+    began, progress, said = clock.now(), ProcessActivity(process.pid), _SAY_SECONDS
     # Send the input here: a second call of `Popen.communicate` would not continue it.
     with ThreadPoolExecutor(1, "communicate") as pool:
         talk = pool.submit(process.communicate, text)
         while not wait((talk,), _LOOK_SECONDS).done:
-            waited, still = time.monotonic() - began, progress.stalled_seconds()
+            waited, still = clock.now() - began, progress.stalled_seconds()
             if still > STILL_SECONDS or waited > LONGEST_SECONDS:
                 process.kill()
                 how = f"made no progress for {still:.0f} seconds" if still > STILL_SECONDS else "did not end"

@@ -21,12 +21,12 @@ import select
 import signal
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, TypeVar
 
+from appliance.base import clock
 from appliance.base.user_errors import UserError
 
 DIRECTORY = Path("/run/netns")
@@ -364,8 +364,8 @@ def _signal_and_wait(descriptors: dict[int, int], number: signal.Signals, limit:
             waiting.discard(descriptor)
         else:
             poll.register(descriptor, select.POLLIN)
-    deadline = time.monotonic() + limit
-    while waiting and (left := deadline - time.monotonic()) > 0:
+    deadline = clock.now() + limit
+    while waiting and (left := deadline - clock.now()) > 0:
         for descriptor, _ in poll.poll(left * 1000):
             poll.unregister(descriptor)
             waiting.discard(descriptor)

@@ -12,7 +12,6 @@ Invariants:
 """
 
 import shutil
-import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -24,6 +23,7 @@ from appliance.audit.ids import IdSource
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import Follower, export, search
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.configuration.settings import RecorderRules
@@ -59,7 +59,7 @@ class Recorder:
         *,
         memory: int,
         reserve: int,
-        clock: Callable[[], int] = time.time_ns,
+        clock: Callable[[], int] = clock.wall_ns,
     ) -> None:
         self._rules = rules
         self._store = store

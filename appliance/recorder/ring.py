@@ -28,12 +28,12 @@ data only at its next check. This is harmless: the reader reads data that is som
 """
 
 import struct
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from appliance.base import clock
 from roswire.tcpros import encode_header
 
 SMALLEST = 1 << 20
@@ -231,7 +231,7 @@ class RingWriter:
         topic_share: float,
         host_share: float,
         seconds: float,
-        clock: Callable[[int], int] = lambda judged: judged or time.time_ns(),
+        clock: Callable[[int], int] = lambda judged: judged or clock.wall_ns(),
     ) -> None:
         self.geometry = geometry(len(memory))
         self.block, self.data = self.geometry.block, self.geometry.data

@@ -32,6 +32,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
+from appliance.base import clock
 from appliance.quotas.table import RELAY_TURN
 from appliance.relay.transport.pump import LITTLE, Pump, PumpedConnection
 
@@ -130,7 +131,7 @@ class EventLoop:
         self._processor_time = processor_time
         self._since = _UNKNOWN  # when the running handler began
         self._alone = False  # whether the running handler's descriptor is the only ready one
-        self.clock = time.monotonic
+        self.clock = clock.now
 
     def watch(
         self,

@@ -2,9 +2,9 @@
 
 import mmap
 import os
-import time
 from collections.abc import Callable, Mapping
 
+from appliance.base import clock
 from appliance.channel.messages import RingGiven
 from appliance.quotas.table import RECORDER_MEMORY
 from appliance.recorder.excluded_topics import fits, left_out_because
@@ -39,7 +39,7 @@ class RecorderRing:
 
     def _clock(self, judged: int) -> int:
         now = self._now()
-        ahead = time.time_ns() - now - self._set
+        ahead = clock.wall_ns() - now - self._set
         if abs(ahead) > _STEP:
             self._set += ahead
         return (judged or now) + self._set

@@ -7,11 +7,11 @@ header. The data for control is bounded: `roswire/message_view.py` cuts long val
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
+from appliance.base import clock
 from appliance.channel.messages import LookWanted, Message, MessageSeen
 from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.transport.frames import Batch
@@ -59,7 +59,7 @@ class TopicTaps:
             end = position + 4 + int.from_bytes(batch.view[position : position + 4], "little")
             data = bytes(batch.view[position + 4 : end])
             kind, fields, why = reader.read(data)
-            self._tell(MessageSeen(number, topic.key, time.time_ns(), kind[:200], len(data), fields, why))
+            self._tell(MessageSeen(number, topic.key, clock.wall_ns(), kind[:200], len(data), fields, why))
             position = end
 
 

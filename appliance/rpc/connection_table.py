@@ -16,11 +16,11 @@ Invariants:
 
 import asyncio
 import math
-import time
 from collections.abc import Callable
 from enum import StrEnum
 from typing import Generic, Protocol
 
+from appliance.base import clock
 from appliance.quotas.pool import Bounds, Holder, Pool, QuotaClass
 from appliance.quotas.queue import Queue
 from appliance.quotas.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
@@ -81,7 +81,7 @@ class ConnectionTable(Generic[Holder]):
         arriving: Bounds = RVMASTER_ARRIVALS.bounds,
         connection_class: Callable[[Holder], QuotaClass] | None = None,
         patience: Patience = _of_ros,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock.now,
     ) -> None:
         self._quota_class = quota_class
         self._connection_class = of_connections = connection_class or quota_class
@@ -153,7 +153,7 @@ class ConnectionTable(Generic[Holder]):
         """Expire connections past their deadline, once a second, until cancelled."""
         while True:
             await asyncio.sleep(1.0)
-            now = time.monotonic()
+            now = clock.now()
             for connection in [connection for connection in self._of if connection.deadline < now]:
                 connection.expire()
 

@@ -12,13 +12,13 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
 import httptools
 
+from appliance.base import clock
 from appliance.policy.model import Address, address_of
 from appliance.rpc.connection_table import ConnectionTable, Stage
 
@@ -64,7 +64,7 @@ class Front(asyncio.BaseProtocol, ABC):
 
     def allow(self, seconds: float) -> None:
         """Set the deadline: the connection must make progress within this time."""
-        self.deadline = time.monotonic() + seconds
+        self.deadline = clock.now() + seconds
 
     @abstractmethod
     def reject(self, status: bytes, what: str) -> None:

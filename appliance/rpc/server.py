@@ -16,7 +16,6 @@
 import asyncio
 import socket
 import struct
-import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
@@ -25,6 +24,7 @@ from typing import NamedTuple, cast
 
 import structlog
 
+from appliance.base import clock
 from appliance.policy.model import Address
 from appliance.rpc.acceptor import BACKLOG, Acceptor
 from appliance.rpc.connection_table import ConnectionTable, Stage
@@ -347,7 +347,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
             self._refuse_request(self._refusal)
             return
         keep = self.server.keep and self.parser.should_keep_alive()
-        request = HttpRequest(self.peer, self._url.decode("latin-1"), bytes(self._body), time.monotonic_ns())
+        request = HttpRequest(self.peer, self._url.decode("latin-1"), bytes(self._body), clock.now_ns())
         if self.is_quiet and not self._pending and self._answered_at_once(request, keep=keep):
             if self._held:
                 self._release(self._held)

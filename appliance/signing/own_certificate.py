@@ -9,6 +9,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
+from appliance.base import clock
+
 _EARLIER = datetime.timedelta(days=1)  # the peer's clock may be behind
 
 
@@ -21,7 +23,7 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
     private = ec.generate_private_key(ec.SECP256R1())
     public = private.public_key()
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now = datetime.datetime.now(datetime.UTC)
+    now = clock.utc_now()
     usage = x509.KeyUsage(True, False, False, False, False, True, False, False, False)
     builder = x509.CertificateBuilder(
         subject,

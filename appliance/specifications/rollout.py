@@ -9,12 +9,12 @@ former relay. If the monitor's actions depend on its state, the monitor holds it
 
 import asyncio
 import itertools
-import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
 from appliance.channel.messages import Message
@@ -104,7 +104,7 @@ class Rollout:
     # Answers by relay and statement.
     _waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = field(default_factory=dict)
     # Relays may outlive control, so no number may be repeated.
-    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(time.monotonic_ns()))
+    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(clock.now_ns()))
     _refusals: dict[int, list[str]] = field(default_factory=dict)
     _began: set[str] = field(default_factory=set)  # monitors that began again by the present change
     _held: dict[int, dict[str, str]] = field(default_factory=dict)

@@ -21,7 +21,6 @@ Invariants:
 import asyncio
 import datetime
 import json
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +29,7 @@ import msgspec
 import structlog
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin, messages
@@ -648,7 +648,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 before.files, before.definitions, before.signatures, self.switches.said
             )
             self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
-        row = MonitorRevisionRow(last.revision + 1, text_of(sources), time.time(), who, note)
+        row = MonitorRevisionRow(last.revision + 1, text_of(sources), clock.wall(), who, note)
         self._put_in_force(row, within)
         self._enforce(sources, checked)
         added, changed, removed = sources.difference(before)

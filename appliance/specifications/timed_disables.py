@@ -11,12 +11,12 @@ Invariants:
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.store.state_file import StateStore
@@ -62,7 +62,7 @@ class TimedDisables:
         """Resume the time limits of monitors that are still disabled after a start."""
         text = self._store.settings().get(_SETTING, "{}")
         kept = msgspec.json.decode(text, type=dict[str, _Return])
-        now = time.time()
+        now = clock.wall()
         self._kept = {
             name: msgspec.structs.replace(one, until=min(one.until, now + one.seconds))
             for name, one in kept.items()
@@ -72,7 +72,7 @@ class TimedDisables:
 
     def begin(self, back: Mapping[str, Switch], seconds: float) -> None:
         """Limit the time of these monitors: after `seconds`, apply the switches in `back`."""
-        until = time.time() + seconds
+        until = clock.wall() + seconds
         self._kept |= {
             name: _Return(until, seconds, self._kept[name].back if name in self._kept else to)
             for name, to in back.items()
@@ -98,7 +98,7 @@ class TimedDisables:
 
     async def _run(self) -> None:
         while self._kept:
-            now = time.time()
+            now = clock.wall()
             due = {name: one.back for name, one in self._kept.items() if one.until <= now}
             if due:
                 await self._bring_back(due)

@@ -12,12 +12,12 @@ import asyncio
 import contextlib
 import secrets
 import socket
-import time
 from pathlib import Path
 from typing import Any
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -44,11 +44,6 @@ _BATCH = 64  # datagrams between two ticks
 _log = structlog.get_logger()
 
 
-def boot_time() -> float:
-    """Return the seconds since the boot; they also count while the machine sleeps."""
-    return time.clock_gettime(time.CLOCK_BOOTTIME)
-
-
 def main(lifeline_fd: int, membership: Path) -> None:
     """Keep the lease until the supervisor ends the process."""
     found = load_membership(membership)
@@ -66,7 +61,7 @@ class LeaseProcess:
         self._stored = stored_epoch(epoch_file)
         session = secrets.token_hex(16)
         own, other = membership.name, membership.other
-        self._lease = ApplianceLease(own, other, session, self._stored, boot_time())
+        self._lease = ApplianceLease(own, other, session, self._stored, clock.since_boot())
         self._witness = WitnessChannel(own, bytes.fromhex(membership.witness_key), session)
         self._peer = PeerChannel(own, other, bytes.fromhex(membership.peer_key))
         self.supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
@@ -80,7 +75,7 @@ class LeaseProcess:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._report = messages.ReplicationReported(0, False, None)
         self._present = False
-        self._absent_since = boot_time()
+        self._absent_since = clock.since_boot()
         self._permission = 0
         self._alone = False
         self._held = 0.0
@@ -99,7 +94,7 @@ class LeaseProcess:
         self.child.attach(messages.Ready())
         while not self.child.ended.is_set():
             self.tick()
-            now = boot_time()
+            now = clock.since_boot()
             delay = max(0.005, min(self._lease.next_event(now) - now, _CONTROL_SECONDS))
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
@@ -111,7 +106,7 @@ class LeaseProcess:
 
     def tick(self) -> None:
         """Do what is due."""
-        lease, report, now = self._lease, self._report, boot_time()
+        lease, report, now = self._lease, self._report, clock.since_boot()
         current = report.permission == self._permission
         waiting = report.waiting_since
         if lease.answers_alone:
@@ -165,17 +160,17 @@ class LeaseProcess:
         if address == self._membership.witness:
             found = self._witness.read(datagram)
             if found is not None:
-                self._answered, self._answer = boot_time(), found[1]
+                self._answered, self._answer = clock.since_boot(), found[1]
                 self._after(self._lease.answered(*found))
         elif address == self._membership.other_address:
             message = self._peer.read(datagram)
             if message is not None:
-                self._after(self._lease.received(boot_time(), message))
+                self._after(self._lease.received(clock.since_boot(), message))
 
     # --- supervisor and control ---
 
     def _tell_supervisor(self) -> None:
-        lease, now = self._lease, boot_time()
+        lease, now = self._lease, clock.since_boot()
         until = lease.valid_until if lease.is_active(now) else 0.0
         if until == self._held:
             return
@@ -186,7 +181,7 @@ class LeaseProcess:
             self.supervisor.send(messages.LeaseEnded())
 
     def _tell_control(self) -> None:
-        lease, now = self._lease, boot_time()
+        lease, now = self._lease, clock.since_boot()
         active = lease.is_active(now)
         answer = self._answer
         state = messages.LeaseState(
@@ -213,7 +208,7 @@ class LeaseProcess:
 
     def _withdraw(self) -> None:
         if self._present:
-            self._present, self._absent_since = False, boot_time()
+            self._present, self._absent_since = False, clock.since_boot()
 
     def control_said(self, message: Any) -> None:
         """Take a message of control."""
@@ -235,7 +230,7 @@ class LeaseProcess:
     def _hand_over(self) -> None:
         reason = ""
         try:
-            due = self._lease.switch_over(boot_time())
+            due = self._lease.switch_over(clock.since_boot())
         except LeaseError as error:
             reason, due = str(error), ()
         self.child.tell(messages.HandOverAnswered(reason))

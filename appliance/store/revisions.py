@@ -2,13 +2,13 @@
 
 import asyncio
 import contextlib
-import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Callable
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import structlog
 
+from appliance.base import clock
 from appliance.base.actors import DISK
 from appliance.base.withdrawal import require_awaited
 from appliance.store.state_file import StateStore
@@ -107,7 +107,7 @@ class Revisions(ABC, Generic[R]):
             back_to, deadline, length = (*kept.split(), "inf")[:3]  # version 0.1.0 did not store the length
             within = float(length)
             # Wait at most the whole length: the clock may have been set back since.
-            self._limit(int(back_to), min(float(deadline), time.time() + within), within)
+            self._limit(int(back_to), min(float(deadline), clock.wall() + within), within)
 
     # --- reading ---
 
@@ -152,7 +152,7 @@ class Revisions(ABC, Generic[R]):
         """Store a revision and put it in force; unless confirmed, roll it back after `within` seconds."""
         if within is not None:  # set the limit first, because control may die during the change
             back_to = self.revision if self.confirm_by is None else self._back_to
-            self._limit(back_to, time.time() + within, within)
+            self._limit(back_to, clock.wall() + within, within)
         self._save(row)
         self.in_force = row
         if within is None:
@@ -174,7 +174,7 @@ class Revisions(ABC, Generic[R]):
         self.going_back = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
 
     async def _run(self, back_to: int, deadline: float) -> None:
-        await asyncio.sleep(max(0.0, deadline - time.time()))
+        await asyncio.sleep(max(0.0, deadline - clock.wall()))
         while True:
             try:
                 await self._go_back(back_to)

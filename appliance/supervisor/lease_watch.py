@@ -5,8 +5,9 @@ on: also if the process of the lease hangs, dies, or is not scheduled.
 """
 
 import asyncio
-import time
 from collections.abc import Callable
+
+from appliance.base import clock
 
 
 class LeaseWatch:
@@ -60,4 +61,4 @@ class LeaseWatch:
             self._timer = asyncio.get_running_loop().call_later(left, self._check)
 
     def _left(self) -> float:
-        return self._until - time.clock_gettime(time.CLOCK_BOOTTIME)
+        return self._until - clock.since_boot()

@@ -12,13 +12,13 @@ file exists.
 import os
 import secrets
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import StateGiven
 
@@ -47,7 +47,7 @@ class MonitorMemory:
     def __init__(self, state: Path, relays: int) -> None:
         self._folder = state / FOLDER
         self._boot = _this_boot()
-        self._offset = time.time_ns() - time.monotonic_ns()
+        self._offset = clock.wall_ns() - clock.now_ns()
         self._own: list[int] = []
         self._earlier: list[int] = []
         self._ended = _Ended("", 0)
@@ -85,7 +85,9 @@ class MonitorMemory:
         try:
             for descriptor in self._own:
                 os.fsync(descriptor)
-            write_whole(self._folder / _ENDED, msgspec.json.encode(_Ended(self._boot, time.time_ns())), 0o600)
+            write_whole(
+                self._folder / _ENDED, msgspec.json.encode(_Ended(self._boot, clock.wall_ns())), 0o600
+            )
         except OSError as error:
             log.warning("the state of monitors is not saved", reason=str(error))
         for descriptor in (*self._own, *self._earlier):

@@ -10,11 +10,9 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from typing import Any
 import msgspec
 
 import appliance
+from appliance.base import clock
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Walled
 from appliance.network.hang_detection import ProcessActivity
@@ -65,8 +64,8 @@ class ProcessHandle:
         self.index = index
         self.ready = False
         self.is_program = bool(plan.argv)
-        self.since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        self.started = time.monotonic()
+        self.since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        self.started = clock.now()
         self.answered: float | None = None
         self.sandbox: Walled | None = None
         self.congestion = ""  # the congestion control of a relay's sockets
@@ -140,7 +139,7 @@ class ProcessHandle:
 
     def note_answer(self) -> None:
         """Note that the process answered."""
-        self.answered = time.monotonic()
+        self.answered = clock.now()
 
     def discount_pause(self, seconds: float) -> None:
         """Add `seconds` to the deadline of the answer: the supervisor did not run (a suspended machine)."""
@@ -151,7 +150,7 @@ class ProcessHandle:
     @property
     def is_hanging(self) -> bool:
         """Whether the process hangs."""
-        now = time.monotonic()
+        now = clock.now()
         # A role of the appliance may answer once, and then take long to load policy and specifications.
         starting = self.answered is None or not (self.ready or self.is_program)
         since = self.started if self.answered is None or starting else self.answered

@@ -2,11 +2,11 @@
 
 import asyncio
 import os
-import time
 from dataclasses import dataclass
 
 import msgspec
 
+from appliance.base import clock
 from appliance.supervisor.child_entry import LaunchPlan
 from appliance.supervisor.process_handle import ProcessHandle, program_environment
 from appliance.supervisor.roles import Facts, Role
@@ -58,13 +58,13 @@ class ProcessSlot:
         """Note the end of the process; return its run time in seconds."""
         self.process = None
         self.since = process.since
-        lived = time.monotonic() - process.started
+        lived = clock.now() - process.started
         self.short_runs = self.short_runs + 1 if lived < STABLE_SECONDS and not self.pardoned else 0
         return lived
 
     def recovers(self) -> bool:
         """Reset the failures if the process has run long enough; return whether this call reset them."""
-        lasts = self.process is not None and time.monotonic() - self.process.started >= STABLE_SECONDS
+        lasts = self.process is not None and clock.now() - self.process.started >= STABLE_SECONDS
         if not (lasts and self.is_failing):
             return False
         self.short_runs, self.reason, self.output = 0, "", ()

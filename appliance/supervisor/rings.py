@@ -7,12 +7,12 @@ and not during an incident, and a relay never waits for pages.
 
 import fcntl
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import ByteSize
 
+from appliance.base import clock
 from appliance.channel.messages import RingGiven
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.excluded_topics import known_sums
@@ -32,7 +32,7 @@ class RecorderRings:
                 f"({left.human_readable()}): set a smaller value, or stop programs that use memory"
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
-        since, sums = time.time_ns(), known_sums(rules.never)
+        since, sums = clock.wall_ns(), known_sums(rules.never)
         self._rings: list[tuple[RingGiven, int, int]] = []  # with the writable and the read-only descriptor
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)

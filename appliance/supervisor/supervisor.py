@@ -17,16 +17,15 @@ import asyncio
 import os
 import signal
 import socket
-import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 import msgspec
 import structlog
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
@@ -142,7 +141,7 @@ class Supervisor:
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
         self._clock = messages.ClockRead(clock_is_synchronised())
-        self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        self._since = clock.utc_now().isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
         """Start all processes, keep them running, and end them on SIGTERM or SIGINT; SIGHUP reloads the policy.
@@ -196,7 +195,7 @@ class Supervisor:
 
     async def until_answering(self, slot: ProcessSlot) -> None:
         """Wait until the process of this slot answers over HTTP; keep waiting if the process restarts."""
-        began = time.monotonic()
+        began = clock.now()
         while self._gets_on(began, [slot]) and not self.stopping.is_set():
             process = slot.process
             if process is not None and await self.answers(1.0) and slot.process is process:
@@ -208,13 +207,13 @@ class Supervisor:
 
     async def until_ready(self) -> None:
         """Wait until all processes are ready; log the pending ones, and give up when they make no progress."""
-        began = time.monotonic()
+        began = clock.now()
         while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
                 await asyncio.wait_for(self.stopping.wait(), _LOOK_SECONDS)
             late = [slot for slot in self.slots if slot.is_late]
             words = ", ".join(slot.role.name for slot in late) or "the firewall around control's ports"
-            waited = round(time.monotonic() - began)
+            waited = round(clock.now() - began)
             if self.is_ready or self._parked or self.stopping.is_set():
                 return
             if not self._gets_on(began, late):
@@ -226,7 +225,7 @@ class Supervisor:
 
     def _gets_on(self, began: float, slots: list[ProcessSlot]) -> bool:
         """Whether a start may continue: for some minutes always, then up to a limit while processes make progress."""
-        waited = time.monotonic() - began
+        waited = clock.now() - began
         if waited < _START_SECONDS:
             return True
         still = min((slot.process.stalled_seconds for slot in slots if slot.process is not None), default=0.0)
@@ -509,20 +508,20 @@ class Supervisor:
     # --- watching -----------------------------------------------------------------------------------------
 
     async def _watch(self) -> None:
-        before = time.monotonic()
+        before = clock.now()
         while True:
             await asyncio.sleep(1.0)
-            now = time.monotonic()
+            now = clock.now()
             slept, before = now - before - 1.0, now
             for slot in self.slots:
                 if slot.process is not None:
                     self._look_at(slot, slot.process, slept)
                 if slot.recovers():
                     self._tell_processes()
-            clock = messages.ClockRead(clock_is_synchronised())
-            if clock != self._clock:
-                self._clock = clock
-                self._tell_control(clock)
+            read = messages.ClockRead(clock_is_synchronised())
+            if read != self._clock:
+                self._clock = read
+                self._tell_control(read)
 
     def _look_at(self, slot: ProcessSlot, process: ProcessHandle, slept: float) -> None:
         if slept > 1.0:

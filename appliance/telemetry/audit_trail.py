@@ -1,12 +1,12 @@
 """Make audit records of events in control, and block answers while the log cannot be written."""
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from appliance.audit.events import SEVERITIES
 from appliance.audit.log import AuditLog
 from appliance.audit.record import AuditRecord, RuleReference, Severity
+from appliance.base import clock
 from appliance.policy.model import Decision, Rule
 from appliance.quotas.pool import QuotaClass
 from appliance.telemetry.metrics import Meter
@@ -99,7 +99,7 @@ class AuditTrail:
             detail["node"] = asker.node
         if decision.needs:
             detail["needs"] = decision.needs
-        now = time.time_ns()
+        now = clock.wall_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._recordings("decision", word, severity, asker.host, now)
         record = AuditRecord(
@@ -115,12 +115,12 @@ class AuditTrail:
             rule=rule_reference(decision.rule),
             revision=self.revision,
             reason=decision.reason,
-            duration_us=(time.monotonic_ns() - asker.arrived) // 1000,
+            duration_us=(clock.now_ns() - asker.arrived) // 1000,
             unknown=self._marked(asker.host, word, detail),
             detail=detail,
             folds=reads and word == "allow",
         )
-        self.meter.decided(category, word, (time.monotonic_ns() - asker.arrived) / 1e9)
+        self.meter.decided(category, word, (clock.now_ns() - asker.arrived) / 1e9)
         return self._log.record(record)
 
     def happened(
@@ -146,7 +146,7 @@ class AuditTrail:
         `reads`: the event changed nothing, so repetitions are only counted. `whole`: every record is kept, even if the
         host is beyond its quota.
         """
-        now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
+        now, severity = clock.wall_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
         unknown = self._marked(host, decision, detail)
         return self._log.record(

@@ -1,8 +1,9 @@
 """Count the events of the last minute by name, for the status."""
 
-import time
 from collections import Counter, deque
 from collections.abc import Callable
+
+from appliance.base import clock
 
 _SECONDS = 60
 
@@ -13,7 +14,7 @@ class LastMinute:
     The caller limits the number of names.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = clock.now) -> None:
         self._clock = clock
         self._seconds: deque[tuple[int, Counter[str]]] = deque(maxlen=_SECONDS)
 

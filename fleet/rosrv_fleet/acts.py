@@ -7,7 +7,6 @@ Invariants:
 """
 
 import contextlib
-import datetime
 import errno
 import fcntl
 import json
@@ -16,6 +15,8 @@ import pwd
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from appliance.base import clock
 
 FILE = "acts.ndjson"
 
@@ -41,7 +42,7 @@ def recorded(data: Path, act: str, about: str, detail: str = "", who: str = "") 
 
 
 def _append(data: Path, fields: dict[str, str]) -> None:
-    time = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
+    time = clock.utc_now().isoformat(timespec="milliseconds")
     line = json.dumps({"time": time} | fields).encode() + b"\n"
     with contextlib.ExitStack() as opened:
         folder = os.open(data, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

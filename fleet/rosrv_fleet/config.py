@@ -4,12 +4,14 @@ Each part of the collector has a section here. Relative paths are relative to th
 """
 
 import os
-from datetime import UTC, date, datetime, timedelta
+from datetime import date, timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import yaml
+
+from appliance.base import clock
 
 _DATA = Path("/var/lib/rosrv-fleet")
 _Positive = Annotated[int, msgspec.Meta(gt=0)]
@@ -77,7 +79,7 @@ class RetentionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_
 
     def oldest_day(self) -> date | None:
         """Return the first day of arrival (UTC) that the index keeps; None: it keeps all."""
-        return None if self.index_days is None else datetime.now(UTC).date() - timedelta(self.index_days)
+        return None if self.index_days is None else clock.utc_now().date() - timedelta(self.index_days)
 
     def keeps(self, day: date) -> bool:
         """Whether the index keeps a day of arrival (UTC) now."""

@@ -10,12 +10,12 @@ import errno
 import ipaddress
 import resource
 import socket
-import time
 from collections import Counter
 from typing import Any
 
 import structlog
 
+from appliance.base import clock
 from rosrv_fleet.config import Limits
 
 _OTHER_FILES = 256  # open files that are not connections: uploads, the database, workers
@@ -82,8 +82,8 @@ class ClientConnections:
             del self._owners[owner]
 
     def _refused(self, owner: str, most: int) -> bool:
-        if time.monotonic() - self._logged > _LOG_SECONDS:
-            self._logged = time.monotonic()
+        if clock.now() - self._logged > _LOG_SECONDS:
+            self._logged = clock.now()
             _log.warning("connections are refused", owner=owner, limit=most)
         return False
 

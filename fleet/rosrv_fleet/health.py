@@ -1,9 +1,8 @@
 """Report the state of robots and of the collector, from the store alone."""
 
-import time
-
 import msgspec
 
+from appliance.base import clock
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.robots import Robot
 from rosrv_fleet.segment_store import StoreFullError
@@ -67,7 +66,7 @@ def health_of(collector: Collector) -> FleetHealth:
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:
     newest = collector.store.newest(robot.name)
-    now, silent_after = time.time_ns(), collector.config.silent_seconds
+    now, silent_after = clock.wall_ns(), collector.config.silent_seconds
     ends = robot.certificate_ends - now / _SECOND
     if newest is None:
         since_added = (now - robot.added) / _SECOND

@@ -13,13 +13,13 @@ Invariants:
 import hashlib
 import re
 import secrets
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.robots import EnrolmentError, changing
@@ -60,7 +60,7 @@ class Invitations:
 
     def add(self, name: str, group: str, seconds: float) -> tuple[PendingRobot, str]:
         """Make an invitation that replaces earlier ones of the robot; return its token. Raises `OSError`."""
-        pending = PendingRobot(name=name, group=group, expires=time.time() + seconds)
+        pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds)
         token = f"rosrv-join_{secrets.token_urlsafe(32)}"
         with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
             self._remove(name)
@@ -79,7 +79,7 @@ class Invitations:
         """Remove the invitations of a robot, and expired ones."""
         for file in self._folder.glob("*.json"):
             pending = _read(file)
-            if pending is None or pending.name == name or pending.expires <= time.time():
+            if pending is None or pending.name == name or pending.expires <= clock.wall():
                 file.unlink()
 
     @contextmanager
@@ -92,7 +92,7 @@ class Invitations:
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):
             pending = _read(self._file(token)) if _TOKEN.fullmatch(token) else None
-            if pending is None or pending.expires <= time.time() or pending.request not in ("", digest):
+            if pending is None or pending.expires <= clock.wall() or pending.request not in ("", digest):
                 raise InvalidInvitationError
             if pending.request:
                 yield pending

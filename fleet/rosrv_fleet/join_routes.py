@@ -4,7 +4,6 @@ The certificate's own signature proves that the sender has its private key. A ro
 request, and gets the same answer. Every wrong token gets the same answer, and an address that sends many has to wait.
 """
 
-import time
 from collections import deque
 
 import msgspec
@@ -12,6 +11,7 @@ import structlog
 from fastapi import APIRouter, HTTPException, Request, Response
 from starlette.concurrency import run_in_threadpool
 
+from appliance.base import clock
 from appliance.configuration.fleet_membership import JOIN_PATH, JoinRequest
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
@@ -74,11 +74,11 @@ class _WrongTokens:
 
     def require_patience(self, address: str) -> None:
         """Raise `HTTPException` (429) if this address must wait."""
-        while self._sent and time.monotonic() - self._sent[0][0] > 60.0:
+        while self._sent and clock.now() - self._sent[0][0] > 60.0:
             self._sent.popleft()
         if sum(sender == address for _time, sender in self._sent) >= _WRONG_PER_MINUTE:
             raise HTTPException(429, "too many wrong invitations were sent", {"Retry-After": "60"})
 
     def add(self, address: str) -> None:
         """Count a wrong token."""
-        self._sent.append((time.monotonic(), address))
+        self._sent.append((clock.now(), address))

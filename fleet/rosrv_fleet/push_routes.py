@@ -2,7 +2,6 @@
 
 import asyncio
 import math
-import time
 from collections.abc import AsyncIterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import asynccontextmanager
@@ -15,6 +14,7 @@ from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi import Path as PathParameter
 from starlette.requests import ClientDisconnect
 
+from appliance.base import clock
 from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from rosrv_fleet.access import robot_of
@@ -204,5 +204,5 @@ class _Uploads:
     def _receipt(self, place: SegmentPlace, first: int, last: int) -> SegmentReceipt:
         return SegmentReceipt(
             robot=place.robot, log=place.log, number=place.number, segment=place.name, first=first, last=last,
-            time=time.time_ns(),
+            time=clock.wall_ns(),
         ).signed(self._collector.receipt_key)  # fmt: skip

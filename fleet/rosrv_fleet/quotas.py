@@ -4,7 +4,6 @@ The used bytes are on the disk, one file for each robot, so that a restart gives
 evenly, by the quota in a day. The files are not synced: a power cut may lose the last changes.
 """
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +11,7 @@ from typing import NamedTuple
 import msgspec
 import structlog
 
+from appliance.base import clock
 from rosrv_fleet.config import Limits
 from rosrv_fleet.robots import make_folder
 
@@ -46,7 +46,7 @@ class _Refusals(NamedTuple):
 class RobotQuotas:
     """The quotas of robots in a folder. One call for a robot at a time."""
 
-    def __init__(self, folder: Path, limits: Limits, clock: Callable[[], float] = time.time) -> None:
+    def __init__(self, folder: Path, limits: Limits, clock: Callable[[], float] = clock.wall) -> None:
         make_folder(folder)
         self._folder = folder
         self._limits = limits
@@ -55,7 +55,7 @@ class RobotQuotas:
 
     def check(self, robot: str) -> None:
         """Raise `OverQuotaError` while the robot has used its quota, or has to pause. Raises `OSError`."""
-        rest = self._refusals.get(robot, _Refusals(0, 0.0)).until - time.monotonic()
+        rest = self._refusals.get(robot, _Refusals(0, 0.0)).until - clock.now()
         if rest > 0:
             raise OverQuotaError("uploads of this robot were refused: it has to pause", rest)
         used, limits = self._used(robot), self._limits
@@ -85,7 +85,7 @@ class RobotQuotas:
         """Make the robot pause after a refused upload that took `seconds` of processor time."""
         count = self._refusals.get(robot, _Refusals(0, 0.0)).times + 1
         pause = min(_LONGEST_PAUSE, max(_FIRST_PAUSE * 2.0 ** min(count, 14), _REST * seconds))
-        self._refusals[robot] = _Refusals(count, time.monotonic() + pause)
+        self._refusals[robot] = _Refusals(count, clock.now() + pause)
 
     def stored(self, robot: str) -> None:
         """Shorten the next pause of the robot after a stored upload."""

@@ -8,13 +8,13 @@ passed.
 """
 
 import threading
-import time
 import zlib
 from datetime import date
 
 import structlog
 from psycopg import sql
 
+from appliance.base import clock
 from rosrv_fleet.config import RetentionConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.failures import failure_of
@@ -71,7 +71,7 @@ class Pruner:
         trouble = None
         if self._retention.segment_days is not None:
             by = f"retention.segment_days: {self._retention.segment_days}"
-            before = time.time_ns() - self._retention.segment_days * _DAY
+            before = clock.wall_ns() - self._retention.segment_days * _DAY
             for robot in self._robots.known():
                 for log in self._store.logs(robot):
                     if self._ending.is_set():

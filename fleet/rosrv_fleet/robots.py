@@ -11,7 +11,6 @@ import os
 import re
 import ssl
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,7 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding, load_pem_public_key
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.bundles.terms import TermsError, role_of
 from rosrv_fleet.acts import recorded
@@ -131,16 +131,16 @@ class Robots:
         A robot whose file became unreadable keeps its last valid state; `unreadable` has the reasons by name.
         """
         with self._lock:
-            now = time.time_ns()
+            now = clock.wall_ns()
             changed = self._folder.stat().st_mtime_ns if self._folder.is_dir() else 0
-            if changed != self._seen and time.monotonic() >= self._again:
+            if changed != self._seen and clock.now() >= self._again:
                 files = self._folder.iterdir() if changed else ()
                 self._read(sorted(file for file in files if file.suffix == ".json"))
                 # A second change within the clock's step would go unnoticed, so a folder that was fresh before the
                 # reading is read again; and a repaired file does not change the folder.
                 fresh = now - changed <= 1_000_000_000
                 self._seen = -1 if fresh or self.unreadable else changed
-                self._again = time.monotonic() + 1.0 if self.unreadable else 0.0
+                self._again = clock.now() + 1.0 if self.unreadable else 0.0
             return self._robots
 
     def _read(self, files: list[Path]) -> None:
@@ -218,7 +218,7 @@ class Robots:
     def remove(self, name: str) -> None:
         """Reject a robot's connections from now on; its segments stay. Raises `EnrolmentError` and `OSError`."""
         with changing(self._folder):
-            self._keep(msgspec.structs.replace(self.named(name), removed=time.time_ns()), "robot remove")
+            self._keep(msgspec.structs.replace(self.named(name), removed=clock.wall_ns()), "robot remove")
 
     def named(self, name: str) -> Robot:
         """Return the robot with this name. Raises `EnrolmentError`."""
@@ -246,7 +246,7 @@ class Robots:
 def _new_robot(name: str, key: bytes, certificate: bytes, group: str) -> Robot:
     check_name(name)
     return Robot(
-        name=name, key=_log_key(key), certificate=_certificate(certificate), added=time.time_ns(),
+        name=name, key=_log_key(key), certificate=_certificate(certificate), added=clock.wall_ns(),
         group=str(RobotGroup.parse(group)) if group else "",
     )  # fmt: skip
 

@@ -30,7 +30,6 @@ import shutil
 import sys
 import tempfile
 import threading
-import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +38,7 @@ from typing import IO, NamedTuple
 import msgspec
 
 from appliance.audit.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.robots import make_folder
 from rosrv_fleet.stored_files import read_stored
@@ -400,7 +400,7 @@ class SegmentStore:
                 for kind in ("gaps", "forks")
             )
             made = RemovalNote(
-                ends=[self.header(one) for one in last], time=time.time_ns(), by=by,
+                ends=[self.header(one) for one in last], time=clock.wall_ns(), by=by,
                 segments=len(old) + (note.segments if note else 0), gaps=gaps + (note.gaps if note else 0),
                 forks=forks + (note.forks if note else 0),
             )  # fmt: skip

@@ -7,11 +7,11 @@ import enum
 import hashlib
 import re
 import secrets
-import time
 from pathlib import Path
 
 import msgspec
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.robots import changing
@@ -72,7 +72,7 @@ class OperatorTokens:
             )
         text = secrets.token_urlsafe(32)
         digest = hashlib.sha256(text.encode()).hexdigest()
-        made = OperatorToken(name=name, role=role, hash=digest, added=time.time_ns())
+        made = OperatorToken(name=name, role=role, hash=digest, added=clock.wall_ns())
         with changing(self._file.parent):
             tokens = self.all()
             if any(one.name == name for one in tokens):

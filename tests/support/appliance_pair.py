@@ -3,16 +3,15 @@
 import asyncio
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractContextManager, asynccontextmanager
 from pathlib import Path
-from types import SimpleNamespace
-from unittest import mock
 
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
 from appliance.audit.log import AuditLog
+from appliance.base.clock import using
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.control.signer_requests import SignerRequests
@@ -20,6 +19,7 @@ from appliance.control.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import decision
+from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
 
 SECOND = 1_000_000_000
@@ -106,10 +106,9 @@ class Member:
             following.cancel()
             await asyncio.gather(following, return_exceptions=True)
 
-    def timed(self) -> "mock._patch[object]":
-        """Return a patch that gives records of the trail this machine's time."""
-        times = SimpleNamespace(time_ns=self.clock, monotonic_ns=lambda: 0)
-        return mock.patch("appliance.telemetry.audit_trail.time", times)
+    def timed(self) -> AbstractContextManager[None]:
+        """Return a block in which records of the trail have this machine's time."""
+        return using(VirtualClock(wall=self.clock() / SECOND))
 
     async def decide(self, count: int, seconds: float) -> None:
         """Record decisions over some seconds."""

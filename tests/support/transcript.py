@@ -15,7 +15,7 @@ A line at the margin is an action; the indented lines below it are its input or 
     file NAME               these lines are a file
     control VERB            the answer of the appliance to this request, as YAML; omitted fields are empty or zero
     control VERB TROUBLE    its rejection: an error, and findings
-    now TIME                the time that `time.time` returns
+    now TIME                the time of the system clock, and no time passes
     rest STATUS [PROBLEM]   every answer over REST: a body, or the detail of a problem; `Retry-After=7` is a header
     $ COMMAND               `-> ` a request that reached the appliance, standard output, `2> ` standard error,
                             `[2]` the exit status unless it is 0
@@ -41,15 +41,16 @@ import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
-from unittest import mock
 
 import pytest
 import yaml
 
 from appliance import __version__
+from appliance.base.clock import using
 from appliance.channel.admin import Trouble
 from tests.support.command import ROSRV, rosrv
 from tests.support.fake_appliance import TOKEN, FakeAppliance
+from tests.support.virtual_clock import VirtualClock
 
 Done = subprocess.CompletedProcess[str]
 Runner = Callable[..., Done]
@@ -210,8 +211,7 @@ def _frozen(now: float | None) -> Iterator[None]:
     if now is None:
         yield
     else:
-        nanoseconds = int(now) * 10**9
-        with mock.patch("time.time", lambda: now), mock.patch("time.time_ns", lambda: nanoseconds):
+        with using(VirtualClock(wall=int(now))):
             yield
 
 

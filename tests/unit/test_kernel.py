@@ -22,6 +22,7 @@ OUTSIDE = frozenset(
         "audit.ids",
         "audit.lock_holders",
         "base.atomic_files",
+        "base.clock",
         "base.input_files",
         "base.validation_messages",
         "channel.channel",

@@ -1,4 +1,4 @@
-"""Durations use the monotonic clock, because the machine's date may be set while a robot runs."""
+"""Durations use the monotonic clock, because the date may be set while a robot runs; all clocks have one source."""
 
 import ast
 from pathlib import Path
@@ -30,8 +30,8 @@ READERS = {
     "a span that goes on over restarts of the machine, which has no other clock": [
         "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
     ],
-    "whether the wall clock can be believed": [
-        "base/age_clock.py", "base/shipped.py", "control/clock_check.py",
+    "whether the wall clock can be believed, and where it is read": [
+        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/alarms.py", "api/moments.py", "audit/filter_options.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
@@ -41,23 +41,48 @@ READERS = {
 }  # fmt: skip
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 
-_WALL = {("time", "time"), ("time", "time_ns"), ("time", "CLOCK_REALTIME")} | {
-    (of, call) for of in ("datetime", "date") for call in ("now", "utcnow", "today")
+_WALL = {"wall", "wall_ns", "utc_now"}
+_DIRECT = {
+    "base/clock.py": "offers the clocks of the operating system to the rest",
+    "standby/witness.py": "is copied to a machine without the appliance",
+    "audit/log.py": "has a thread, which `clock.using` does not reach",
+}
+_CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
+    f"{clock}{unit}" for clock in ("monotonic", "perf_counter", "clock_gettime") for unit in ("", "_ns")
 }
 
 
-def _reads_wall_clock(path: Path) -> bool:
+def _reads(path: Path) -> tuple[bool, bool]:
+    """Whether a file reads the wall clock, and whether it reads any clock but that of `base/clock.py`."""
+    wall = direct = False
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module == "time":
-            return True  # a bare `time()` does not reveal which clock is used
-        if isinstance(node, ast.Attribute):
-            of = node.value.attr if isinstance(node.value, ast.Attribute) else getattr(node.value, "id", "")
-            if (of, node.attr) in _WALL:
-                return True
-    return False
+        match node:
+            case ast.ImportFrom(module="time"):
+                direct = True  # a bare `time()` does not reveal which clock is used
+            case ast.ImportFrom(module="appliance.base.clock", names=names):
+                wall = wall or any(alias.name in _WALL for alias in names)
+            case ast.Attribute(value=ast.Name(id="clock"), attr=name):
+                wall = wall or name in _WALL
+            case ast.Attribute(value=ast.Name(id="time"), attr=name):
+                direct = direct or name in _CLOCKS
+                wall = wall or name in ("time", "time_ns")
+            case ast.Attribute(value=ast.Name(id=of) | ast.Attribute(attr=of), attr=name):
+                direct = direct or (of in ("datetime", "date") and name in ("now", "utcnow", "today"))
+    return wall, direct
 
 
 def test_only_these_files_read_the_wall_clock() -> None:
     """In any other file, a timeout, expiry or duration would be wrong after the clock is set."""
-    found = {str(path.relative_to(ROOT)) for path in product_files() if _reads_wall_clock(path)}
+    found = {str(path.relative_to(ROOT)) for path in product_files() if _reads(path)[0]}
     assert found == {f"appliance/{file}" for files in READERS.values() for file in files}
+
+
+def test_every_other_file_reads_its_clocks_from_base_clock() -> None:
+    """A test and a simulation set all clocks of a machine in one place."""
+    found = {
+        str(path.relative_to(top))
+        for top in (ROOT / "appliance", ROOT / "fleet/rosrv_fleet")
+        for path in top.rglob("*.py")
+        if _reads(path)[1]
+    }
+    assert found == _DIRECT.keys()

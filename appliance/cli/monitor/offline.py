@@ -1,12 +1,12 @@
 """`rosrv monitor reset`: return a stopped appliance to the folder's specifications."""
 
 import os
-import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from appliance.base import clock
 from appliance.cli.connection.target import DEFAULT_STATE
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.specifications.specification_revisions import forget_revision
@@ -55,7 +55,7 @@ def _forget(home: Path) -> int | None:
     try:
         store = StateStore(home, failed=troubles.append)
         try:
-            revision = forget_revision(store, time.time())
+            revision = forget_revision(store, clock.wall())
         finally:
             store.close()
         if troubles:

@@ -1,7 +1,6 @@
 """Read a period from the running appliance's flight recorder: its recordings and its memory."""
 
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from appliance.audit.record_format import rfc3339
+from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import Recording, Recordings
@@ -44,7 +44,7 @@ class Piece(NamedTuple):
 
 def span_of(since: str | None, until: str | None) -> Span:
     """Return the period of --since and --until. Exits with status 2 if it is invalid."""
-    now = time.time_ns()
+    now = clock.wall_ns()
     try:
         span = Span(
             0 if since is None else parse_timestamp(since, now),
@@ -82,7 +82,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
         until = min(row.ended, span.until)
         if since <= until:
             found.append((Span(since, until), row))
-    memory = time.time_ns() - int(known.before * _SECOND)
+    memory = clock.wall_ns() - int(known.before * _SECOND)
     missing = [gap for gap in gaps([part for part, _row in found], span) if gap.until > memory]
     lent = _lent(appliance, Span(missing[0].since, span.until)) if missing else None
     if lent is not None:

@@ -2,7 +2,6 @@
 
 import os
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +11,7 @@ import typer
 from appliance.audit.filter_options import Since
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
+from appliance.base import clock
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -66,7 +66,7 @@ def learn_policy(
 
 def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
     try:
-        start = None if since is None else parse_timestamp(since, time.time_ns())
+        start = None if since is None else parse_timestamp(since, clock.wall_ns())
         passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
         for entry in appliance.audit().export(passed):
             record = entry.record

@@ -1,9 +1,7 @@
 """Check the files of the operator and the appliance: policy, specifications, hosts, state directory."""
 
-import datetime
 import os
 import stat
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,6 +10,7 @@ from cryptography import x509
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import search
+from appliance.base import clock
 from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program
 from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, run_check, skip, warn
@@ -189,13 +188,13 @@ def _clock(state: Path) -> Iterator[SelftestFinding]:
     except LogUnreadableError as error:
         yield fail("audit log", str(error), "rosrv audit verify")
         return
-    ahead = entries[0].record.time / 1e9 - time.time() if entries else 0.0
+    ahead = entries[0].record.time / 1e9 - clock.wall() if entries else 0.0
     if ahead > _AHEAD_SECONDS:
         yield fail(
             "clock", f"the last record of the audit log is {ahead:.0f} s in the future", "set the clock"
         )
     else:
-        yield ok("clock", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%MZ"))
+        yield ok("clock", clock.utc_now().strftime("%Y-%m-%d %H:%MZ"))
 
 
 def _certificates(state: Path) -> Iterator[SelftestFinding]:
@@ -211,7 +210,7 @@ def _certificates(state: Path) -> Iterator[SelftestFinding]:
                 "restore it, or remove it: a new one is created",
             )
             continue
-        left = certificate.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
+        left = certificate.not_valid_after_utc - clock.utc_now()
         if left.days < 0:
             yield fail("certificate", f"{path} has expired", "remove it and restart: a new one is created")
         elif left.days < _SOON_DAYS:

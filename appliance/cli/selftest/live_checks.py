@@ -7,6 +7,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
+from appliance.base import clock
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.connection.admin_client import NotRunningError
@@ -98,7 +99,7 @@ def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
     """Make a ROS master API call; the appliance must answer and audit it."""
     before = _last(appliance)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"
-    began, refusal = time.monotonic(), ""
+    began, refusal = clock.now(), ""
     try:
         call(master, "getPid", caller)
         text = "a call was allowed"
@@ -110,7 +111,7 @@ def check_call(appliance: Appliance, master: str) -> Iterator[SelftestFinding]:
             "RVMaster", f"{master} does not answer: {error}", "check this machine's network and firewall"
         )
         return
-    text += f" in {(time.monotonic() - began) * 1000:.1f} ms"
+    text += f" in {(clock.now() - began) * 1000:.1f} ms"
     if before is None:
         yield skip("RVMaster", f"{text}; this user may not read the audit log")
         return
@@ -138,9 +139,9 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
     Poll for some seconds, with growing pauses. Raises `LogUnreadableError` or `NotRunningError` if the last query
     failed.
     """
-    source, deadline, pause = appliance.audit(), time.monotonic() + _RECORD_SECONDS, _FIRST_PAUSE
+    source, deadline, pause = appliance.audit(), clock.now() + _RECORD_SECONDS, _FIRST_PAUSE
     while True:
-        is_last = time.monotonic() > deadline
+        is_last = clock.now() > deadline
         try:
             page = source.search(Filter(), None, 1000, newest_first=True)
         except (LogUnreadableError, NotRunningError):
@@ -157,7 +158,7 @@ def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> b
 
 
 def _message(master: str) -> Iterator[SelftestFinding]:
-    began = time.monotonic()
+    began = clock.now()
     try:
         message = message_through_the_relay(master)
     except ProbeError as error:
@@ -174,7 +175,7 @@ def _message(master: str) -> Iterator[SelftestFinding]:
         if message.endswith(b"selftest"):
             yield ok(
                 "relay",
-                f"a message came through in {(time.monotonic() - began) * 1000:.0f} ms, registration included",
+                f"a message came through in {(clock.now() - began) * 1000:.0f} ms, registration included",
             )
         else:
             yield fail(

@@ -1,13 +1,13 @@
 """`rosrv standby status|promote`: the running appliance and the other one."""
 
 import threading
-import time
 from functools import partial
 from typing import Annotated
 
 import typer
 from rich.console import Console
 
+from appliance.base import clock
 from appliance.channel.admin import StandbyPromote, StandbyWanted
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
@@ -107,8 +107,8 @@ def _look(appliance: Appliance) -> StatusView:
 
 def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
     """Return the state once the appliance with this name holds the lease; None if it does not in time."""
-    pause, until = threading.Event(), time.monotonic() + _SWITCH_SECONDS
-    while time.monotonic() < until:
+    pause, until = threading.Event(), clock.now() + _SWITCH_SECONDS
+    while clock.now() < until:
         try:
             answer = appliance.ask(StandbyWanted())
         except NotRunningError:

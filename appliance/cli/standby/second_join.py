@@ -1,11 +1,11 @@
 """`rosrv standby join FILE` on the other appliance, whose state becomes a copy of the first one's."""
 
 import os
-import time
 from pathlib import Path
 
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
+from appliance.base import clock
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.standby.first_join import existing_membership
 from appliance.ipsec.sealed_authority import SealedAuthority, keep_sealed
@@ -83,7 +83,7 @@ def _join(membership: Membership, state: Path, *, again: bool) -> Path | None:
     backup = None
     if (state / "control" / "state.db").exists():
         path.parent.mkdir(mode=0o700, exist_ok=True)
-        backup = path.with_name(f"before-{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime(time.time()))}.tar.gz")
+        backup = path.with_name(f"before-{clock.utc_now():%Y%m%dT%H%M%SZ}.tar.gz")
         try:
             back_up(state, backup)
         except BackupError as error:

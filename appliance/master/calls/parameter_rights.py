@@ -1,9 +1,9 @@
 """Check the parameters in answers and updates. They may contain more than the decision on the call covered."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.base import clock
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import denial_text
 from appliance.master.graph.registry import Incarnation
@@ -42,7 +42,7 @@ class ParameterRights:
         decision = self._to_read(incarnation.host, incarnation.name, key, value)
         if not decision.allowed:
             peer = Peer(incarnation.host, str(incarnation.host), incarnation.told)
-            self.recorded(Caller(peer, incarnation.name, time.monotonic_ns()), "paramUpdate", key, decision)
+            self.recorded(Caller(peer, incarnation.name, clock.now_ns()), "paramUpdate", key, decision)
         return decision.allowed
 
     def to_find(self, caller: Caller, key: str) -> Decision:

@@ -3,11 +3,11 @@
 The Master API and the proxy endpoints are served in the same way, with different tables of calls.
 """
 
-import time
 from dataclasses import dataclass
 
 import structlog
 
+from appliance.base import clock
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.call_execution import Execution, ServedRequest
@@ -66,7 +66,7 @@ class Pipeline:
         try:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
-            seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
+            seconds = (clock.now_ns() - visit.caller.arrived) / 1e9
             self.trail.meter.called(call.method if known else "unknown", seconds)
             if weigh(answer, self.offload) < self.offload:
                 return build_response(answer)

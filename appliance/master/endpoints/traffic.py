@@ -1,6 +1,5 @@
 """Keep and record the connections and the traffic that the relays report."""
 
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,6 +8,7 @@ from itertools import zip_longest
 import msgspec
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
@@ -113,7 +113,7 @@ class RelayTraffic:
     def flow(self, key: str, resource: str) -> Flow:
         """Return the traffic of a topic or service of an incarnation."""
         traffic = self.traffic.get((key, resource), Traffic())
-        flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
+        flows = clock.now() - traffic.seconds < _STILL_SECONDS
         return Flow(
             messages=traffic.messages,
             bytes=traffic.bytes,
@@ -137,7 +137,7 @@ class RelayTraffic:
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         """Add a relay's counters. Counters of a forgotten node are ignored."""
-        now = time.monotonic()
+        now = clock.now()
         for row in rows:
             if self._registry.by_key(row.key) is not None:
                 self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)

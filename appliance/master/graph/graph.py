@@ -10,11 +10,11 @@ them. Later calls of the ROS master's notification threads are ignored, because 
 """
 
 import sys
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 from appliance.audit.record import Severity
+from appliance.base import clock
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
@@ -145,7 +145,7 @@ class RosGraph:
         other = by.host != incarnation.host
         return [
             *_at_master(incarnation, lost),
-            *self.registry.replace(incarnation, time.monotonic()),
+            *self.registry.replace(incarnation, clock.now()),
             TellNode(incarnation, NodeCall("shutdown", (reason,))),
             *self._tell_withdrawn(lost),
             *self._close(incarnation),
@@ -161,7 +161,7 @@ class RosGraph:
         """Suspend the registrations of a node that no longer answers, until it returns."""
         return [
             *_at_master(incarnation, incarnation.in_order()),
-            *self.registry.overshadow(incarnation, time.monotonic()),
+            *self.registry.overshadow(incarnation, clock.now()),
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
             DropCalls(incarnation),
@@ -177,7 +177,7 @@ class RosGraph:
         for service in incarnation.resources(Kind.SERVICE):
             if self._others_offer(incarnation, service):
                 effects += self.unregistered(incarnation, Kind.SERVICE, service)
-        effects += self.registry.revive(incarnation, time.monotonic())
+        effects += self.registry.revive(incarnation, clock.now())
         effects.append(PlaceNode(incarnation))
         for registration in incarnation.in_order():
             effects.append(RegisterAtMaster(incarnation, registration))

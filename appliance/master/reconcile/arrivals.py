@@ -4,9 +4,9 @@ An incarnation with a registering call under way is not evicted. Otherwise, two 
 room for only one, would evict each other forever.
 """
 
-import time
 from dataclasses import dataclass
 
+from appliance.base import clock
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts, NoPortError
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
@@ -41,7 +41,7 @@ class Arrivals:
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
         if incarnation is not None and incarnation.life is Life.LIVE:
-            incarnation.touched = time.monotonic()
+            incarnation.touched = clock.now()
             incarnation.told = self.addresses.address_for(caller.peer)
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
@@ -72,8 +72,8 @@ class Arrivals:
             relay_port=relay_port,
             more_relay_ports=tuple(more),
             own=caller.own,
-            changed=time.monotonic(),
-            touched=time.monotonic(),
+            changed=clock.now(),
+            touched=clock.now(),
         )
         self.enactor.carry_out(self.registry.add(incarnation))
         return incarnation

@@ -3,11 +3,11 @@
 After a restart, `restore` reads the registry from the store.
 """
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import assert_never
 
+from appliance.base import clock
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_ports import NodePorts
 from appliance.master.endpoints.proxy_endpoints import ProxyEndpoints
@@ -195,7 +195,7 @@ def restore(registry: Registry, store: StateStore) -> int:
             relay_port=row.relay_port,
             own=row.own,
             life=Life(row.life),
-            changed=time.monotonic(),  # the stored time may be from before a restart of the machine
+            changed=clock.now(),  # the stored time may be from before a restart of the machine
             more_relay_ports=row.more_relay_ports,
         )
         for row in incarnations

@@ -9,12 +9,12 @@ a lost node is checked more often at first.
 
 import asyncio
 import enum
-import time
 from collections.abc import Callable, Collection
 from dataclasses import KW_ONLY, InitVar, dataclass, field
 
 import structlog
 
+from appliance.base import clock
 from appliance.configuration.settings import LivenessSection
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RELAY_NAME
@@ -118,7 +118,7 @@ class Watchlist:
 
         Return None if the node missed no update, or if its updates were repeated in the last `_MADE_UP_SECONDS`.
         """
-        missed, now = self._missed.get(node.key), time.monotonic()
+        missed, now = self._missed.get(node.key), clock.now()
         if missed is None or (missed.made_up is not None and now - missed.made_up < _MADE_UP_SECONDS):
             return None
         self._missed[node.key] = MissedUpdates(made_up=now)
@@ -174,7 +174,7 @@ class Liveness:
     async def _look_at_lost(self) -> None:
         while True:
             await asyncio.sleep(_RECENTLY_LOST_SECONDS)
-            now = time.monotonic()
+            now = clock.now()
             for incarnation in self.registry.all():
                 if incarnation.life is Life.SHADOW and now - incarnation.changed < _RECENT_SECONDS:
                     self.look_at(incarnation)
@@ -202,7 +202,7 @@ class Liveness:
 
     async def probe(self, incarnation: Incarnation) -> Probe:
         """Call a node now to find out whether it is there."""
-        now = time.monotonic()
+        now = clock.now()
         since = self._answered.setdefault(incarnation.key, now)
         patience = max(0.0, self.settings.silent - (now - since)) + self.settings.interval
         try:
@@ -219,7 +219,7 @@ class Liveness:
 
     def revive(self, incarnation: Incarnation) -> None:
         """Restore a shadow with all its registrations, because its node registers again."""
-        self._answered[incarnation.key] = time.monotonic()
+        self._answered[incarnation.key] = clock.now()
         self._processes.pop(incarnation.key, None)
         self._bring_back(incarnation)
 
@@ -239,7 +239,7 @@ class Liveness:
             self._turns.leave(incarnation.host)
         if self.registry.by_key(incarnation.key) is not incarnation:
             return
-        now = time.monotonic()
+        now = clock.now()
         since = self._answered.setdefault(incarnation.key, now)
         if there:
             self._answered[incarnation.key] = now
@@ -314,13 +314,13 @@ class Liveness:
 
     def _lose(self, incarnation: Incarnation, why: str) -> None:
         if not incarnation.registrations and not incarnation.shelf:
-            if time.monotonic() - incarnation.touched > _IDLE_SECONDS:
+            if clock.now() - incarnation.touched > _IDLE_SECONDS:
                 self._forget(incarnation)
             return
         self.enactor.carry_out(self.graph.lost(incarnation, why))
 
     def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
-        age = time.monotonic() - incarnation.changed
+        age = clock.now() - incarnation.changed
         if incarnation.life is Life.REPLACED:
             if refused or age > _REPLACED_SECONDS:
                 self._forget(incarnation)

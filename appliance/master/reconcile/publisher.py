@@ -7,12 +7,12 @@ messages (`NodePlaced.monitors`).
 
 import asyncio
 import ipaddress
-import time
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import KW_ONLY, dataclass
 
 import structlog
 
+from appliance.base import clock
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.graph import RosGraph
@@ -90,7 +90,7 @@ class OwnPublisher:
 
     def _caller(self) -> Caller:
         peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
-        return Caller(peer, self.name, time.monotonic_ns(), own=True)
+        return Caller(peer, self.name, clock.now_ns(), own=True)
 
     def _mine(self) -> list[Incarnation]:
         return [incarnation for incarnation in self.registry.live() if incarnation.of_monitors]

@@ -21,6 +21,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from appliance.base import clock
 from appliance.channel.messages import (
     MonitorRow,
     SpecificationsRefused,
@@ -81,7 +82,7 @@ class Interceptor:
         self.budget = budget
         self.over = loop.over
         self._reporter = reporter
-        self.offset = time.time_ns() - time.monotonic_ns()
+        self.offset = clock.wall_ns() - clock.now_ns()
         self.monitors: MonitorSet | None = None
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
@@ -154,8 +155,7 @@ class Interceptor:
         if before is None:
             outcome = start_outcome(result, message, self._keeper, now, restarted=first and message.restarted)
         else:
-            incomplete = self.shadow.settle()
-            outcome = result.succeed(before, now, incomplete)
+            outcome = result.succeed(before, now, self.shadow.settle())
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
         for monitor in result.monitors:
@@ -416,7 +416,7 @@ class Interceptor:
 
     def now(self) -> int:
         """Return the time of monitors, in nanoseconds."""
-        return self.offset + time.monotonic_ns()
+        return self.offset + clock.now_ns()
 
     def schedule(self) -> None:
         """Schedule `_advance` for the next tick or deadline, or earlier."""

@@ -8,13 +8,13 @@ Invariants:
   not reused if the machine's clock was set after it was written. A state that is not reused is `lost`, with the reason.
 """
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import msgspec
 
+from appliance.base import clock
 from appliance.channel.messages import SpecificationsStated, StateGiven, StateLeft
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, StoredState, read
 
@@ -124,7 +124,7 @@ class StateKeeper:
             )
         if head.boot != given.ended_boot:
             return "the machine stopped (a power cut, a reset) before the appliance did"
-        if given.offset + time.monotonic_ns() < given.ended_at:
+        if given.offset + clock.now_ns() < given.ended_at:
             return "the machine's clock was set back while the appliance was stopped"
         return ""
 
@@ -221,7 +221,7 @@ class StateKeeper:
             groups.append(_GroupHead(entry.group.names, msgspec.Raw(entry.group.layout)))
             if entry.parts:
                 groups += [_GroupHead([name], _NO_CELLS) for name in entry.group.part_names]
-        head = _Head(self._given.boot, self.offset, self.offset + time.monotonic_ns(), groups, lost)
+        head = _Head(self._given.boot, self.offset, self.offset + clock.now_ns(), groups, lost)
         return msgspec.msgpack.encode(head)
 
 

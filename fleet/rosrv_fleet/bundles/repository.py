@@ -35,6 +35,7 @@ from tuf.api.metadata import (
 )
 from tuf.api.serialization.json import JSONSerializer
 
+from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.bundles.bundle_archive import pack
 from appliance.bundles.terms import BundlePath, Terms, custom_of, role_of
@@ -47,7 +48,7 @@ S = TypeVar("S", Root, Targets, Snapshot)
 
 
 def _utc_now() -> datetime.datetime:
-    return datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    return clock.utc_now().replace(microsecond=0)
 
 
 class RepositoryError(Exception):

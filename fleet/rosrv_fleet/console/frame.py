@@ -1,7 +1,6 @@
 """The frame of every page of the console, and its parts. Every text is escaped here or by its caller."""
 
 import datetime
-import time
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Literal, NamedTuple
@@ -10,6 +9,7 @@ from urllib.parse import urlencode
 from fastapi.responses import HTMLResponse
 
 from appliance.audit.record_format import printable
+from appliance.base import clock
 from rosrv_fleet.tokens import OperatorToken
 
 # With `no-referrer`, browsers send `Origin: null` with the console's own forms.
@@ -129,7 +129,7 @@ def ago(seconds: float) -> str:
 
 def since(at: float) -> str:
     """Return how long ago a time (seconds since the epoch) was."""
-    return ago(time.time() - at)
+    return ago(clock.wall() - at)
 
 
 def moment(at: float) -> str:

@@ -3,7 +3,6 @@
 import asyncio
 import hashlib
 import shutil
-import time
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +14,7 @@ from fastapi import Path as PathParameter
 from fastapi.responses import FileResponse
 from starlette.requests import ClientDisconnect
 
+from appliance.base import clock
 from rosrv_fleet.access import holder_of, name_of
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.collector import Collector
@@ -134,7 +134,7 @@ class _Additions:
         except BrokenProcessPool as error:
             raise _later("the verification ended early: add the bundle again", 5) from error
         about = StoredEvidence(
-            id=digest, robot=robot.name, bytes=size, added=time.time_ns(), by=who, **msgspec.structs.asdict(content)
+            id=digest, robot=robot.name, bytes=size, added=clock.wall_ns(), by=who, **msgspec.structs.asdict(content)
         )  # fmt: skip
         await asyncio.to_thread(collector.evidence.keep, upload, about)
         return about, True

@@ -1,11 +1,11 @@
 """The metrics of bundles and rollouts: labels are site, group and a few states, so robots cannot fill Prometheus."""
 
-import time
 from collections.abc import Iterator
 
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector as MetricSource
 
+from appliance.base import clock
 from rosrv_fleet.rollouts.operator_routes import group_state
 from rosrv_fleet.rollouts.service import BundleService
 
@@ -42,7 +42,7 @@ class RolloutMetrics(MetricSource):
             service.advancing and not service.trouble,
         )  # fmt: skip
         if service.publication is not None:
-            left = service.publication.expires.timestamp() - time.time()
+            left = service.publication.expires.timestamp() - clock.wall()
             yield GaugeMetricFamily(
                 "rosrv_fleet_metadata_expiry_seconds", "until the signed metadata expire", left
             )

@@ -10,7 +10,6 @@ health of robots.
 
 import asyncio
 import datetime
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ import msgspec
 import structlog
 from tuf.api.metadata import Metadata
 
+from appliance.base import clock
 from appliance.bundles.poller import RobotReport
 from appliance.bundles.terms import BundlePath, TermsError
 from rosrv_fleet.bundles.keys import KeyFileError, load_online_key
@@ -73,7 +73,7 @@ class BundleService:
         key: Path,
         store: RolloutStore,
         members: Members,
-        clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] = clock.wall,
     ) -> None:
         self.folder = folder
         self.store = store

@@ -12,12 +12,13 @@ from typing import Any
 
 import pytest
 
+from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.standby.lease import PromiseRequest
 from appliance.standby.membership import Membership
 from appliance.standby.peer_link import PeerChannel
-from appliance.standby.process import LeaseProcess, boot_time
+from appliance.standby.process import LeaseProcess
 from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_root
@@ -50,7 +51,7 @@ class Site:
         self._thread = threading.Thread(target=lambda: self.hosts[OWN].run(self._run))
         self.record = LeaseRecord(1, "", ("a", "b"), "boot")
         self._rules = Witness(
-            record=self.record, save=self._save, admit=lambda _: None, boot="boot", clock=boot_time
+            record=self.record, save=self._save, admit=lambda _: None, boot="boot", clock=clock.since_boot
         )
         peers = {"a": AppliancePeer(OWN, KEY), "b": AppliancePeer(OTHER, b"\xbb" * 32)}
         self.gate = WitnessGate(self._rules, peers, "nonce")
@@ -152,7 +153,7 @@ def test_a_grant_is_reported_with_its_end_and_its_epoch_is_on_the_disk(site: Sit
     site.until(site.held)
     assert site.reports[-1].epoch == site.record.epoch == 2
     assert int(site.epoch.read_text()) == 2
-    assert site.reports[-1].until <= boot_time() + 0.8 * 1.2
+    assert site.reports[-1].until <= clock.since_boot() + 0.8 * 1.2
     first = site.reports[-1].until
     site.until(lambda: site.held() and site.reports[-1].until > first)
 
@@ -163,7 +164,7 @@ def test_without_answers_no_extension_follows(site: Site) -> None:
     site.until(site.held)
     site.until(lambda: not site.held(), serving=False)
     held = [report.until for report in site.reports if isinstance(report, messages.LeaseHeld)]
-    assert max(held) <= boot_time()
+    assert max(held) <= clock.since_boot()
 
 
 def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
@@ -220,8 +221,8 @@ def test_it_claims_only_while_control_is_ready(site: Site) -> None:
     """A control that could not serve withdraws its presence; once it could, the lease is claimed."""
     site.start()
     site.control.send(messages.ControlUnready())
-    later = boot_time() + 3 * EXPIRY
-    site.until(lambda: boot_time() > later)
+    later = clock.since_boot() + 3 * EXPIRY
+    site.until(lambda: clock.since_boot() > later)
     assert not site.held() and site.record.epoch == 1
     site.control.send(messages.ControlPresent())
     site.until(site.held)

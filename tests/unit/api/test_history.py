@@ -10,8 +10,10 @@ import pytest
 from appliance.api import history
 from appliance.api.control import ControlAwayError
 from appliance.api.history import SampleHistory, sample_of
+from appliance.base.clock import using
 from appliance.channel.answers.measures import Measures
 from tests.support.answers import example
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
 
@@ -82,10 +84,15 @@ async def test_samples_stay_in_order_when_the_clock_is_set_back(monkeypatch: Any
     """Samples later than the new time are removed, so that rates and curves never run backwards."""
     monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
     times = [1000.0, 1010.0, 8200.0, 1005.0, 1015.0]
-    clock = iter(times)
-    monkeypatch.setattr("time.time", lambda: next(clock, 1020.0))
-    async with sampling(unchanging) as samples:
-        await until(samples, len(times))
+    machine, later = VirtualClock(), iter(times)
+
+    async def measures() -> Measures:
+        machine.set_wall(next(later, 1020.0))
+        return body()
+
+    with using(machine):
+        async with sampling(measures) as samples:
+            await until(samples, len(times))
     assert [one.time for one in samples.samples(1000) if one.time != 1020.0] == [1005.0, 1015.0]
 
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock, PolicyReload
 from appliance.channel.answers.host_answers import BlockEnded, HostBlocked
@@ -25,6 +26,7 @@ from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 NODE, ROBOT, OTHER = "10.0.0.5", "10.0.0.1", "10.0.0.7"
@@ -228,29 +230,30 @@ async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
 ) -> None:
     """The host may register again without a restart; a system clock that is set forward ends no block."""
     monkeypatch.setattr(block_orders, "_LOOK_SECONDS", 0.01)
-    clock, wall = Clock(), time.time
-    async with control(tmp_path, clock) as made:
-        node = made.node("/talker")
-        await made.register(node, Kind.PUBLICATION, "/scan")
-        await made.block(NODE, 3600)
-        await made.block(OTHER)
-        monkeypatch.setattr(time, "time", lambda: wall() + 1e6)
-        clock.advance(3599.9)
-        await until(clock.read_again())
-        assert await made.blocked() == [NODE, OTHER]
-        clock.advance(0.1)
-        await until(lambda: made.denial(NODE) is None)
-        await made.settle()
-        assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
-        assert await made.blocked() == [OTHER]
-        assert (
-            made.records.events[-2:].count(("host block ended", None)) == 1
-            or (
-                "host block ended",
-                None,
+    clock, machine = Clock(), VirtualClock()
+    with using(machine):
+        async with control(tmp_path, clock) as made:
+            node = made.node("/talker")
+            await made.register(node, Kind.PUBLICATION, "/scan")
+            await made.block(NODE, 3600)
+            await made.block(OTHER)
+            machine.set_wall(4e9)
+            clock.advance(3599.9)
+            await until(clock.read_again())
+            assert await made.blocked() == [NODE, OTHER]
+            clock.advance(0.1)
+            await until(lambda: made.denial(NODE) is None)
+            await made.settle()
+            assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
+            assert await made.blocked() == [OTHER]
+            assert (
+                made.records.events[-2:].count(("host block ended", None)) == 1
+                or (
+                    "host block ended",
+                    None,
+                )
+                in made.records.events
             )
-            in made.records.events
-        )
 
 
 async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:

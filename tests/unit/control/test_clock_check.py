@@ -1,16 +1,17 @@
 """Tests of control's records about the machine's clock: one for each event, without blocking."""
 
-import time
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from appliance.base import shipped
+from appliance.base.clock import using
 from appliance.channel.answers.status import ClockState
 from appliance.cli.status_verb import doubted_clock
 from appliance.control.clock_check import ClockCheck
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.virtual_clock import VirtualClock
 
 
 class Trail:
@@ -71,14 +72,12 @@ def test_each_step_forward_is_recorded(trail: Trail) -> None:
 @pytest.mark.parametrize(
     ("days", "said"), [(0.5, None), (2000.0, "wrong: 2000 days before this program was built")]
 )
-def test_a_clock_before_the_build_date_is_reported(
-    trail: Trail, monkeypatch: pytest.MonkeyPatch, days: float, said: str | None
-) -> None:
+def test_a_clock_before_the_build_date_is_reported(trail: Trail, days: float, said: str | None) -> None:
     """The machine does not know the time yet, and no earlier record reveals the error."""
     made = Path(shipped.__file__).stat().st_mtime
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     clock.synchronisation_reported(True)
-    monkeypatch.setattr(time, "time", lambda: made - days * 86_400)
-    told = doubted_clock(clock.state())
+    with using(VirtualClock(wall=made - days * 86_400)):
+        told = doubted_clock(clock.state())
     assert (told or "").startswith(said or "")
     assert (told is None) is (said is None)

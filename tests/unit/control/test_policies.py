@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.channel.admin import (
     PolicyConfirm,
     PolicyLoad,
@@ -26,6 +27,7 @@ from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
+from tests.support.virtual_clock import ShiftedClock, VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
@@ -89,9 +91,7 @@ async def until(policies: Policies, revision: int) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Path) -> None:
     """Engineers who locked themselves out may restart the appliance: the timeout still applies."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
@@ -99,8 +99,7 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(
         await policies.reload(PolicyReload(confirm_within=60.0), "operator")
         deadline = policies.confirm_by
     later = (deadline or 0) - 0.5
-    monkeypatch.setattr(time, "time", lambda: later)
-    with appliance.started() as policies:
+    with using(VirtualClock(wall=later)), appliance.started() as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
         assert policies.confirm_by == deadline
         await until(policies, 3)
@@ -126,17 +125,13 @@ async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.Mon
         assert recorded == ["operator", "alice", "disk"]
 
 
-async def test_a_clock_set_back_does_not_extend_the_timeout(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> None:
     """After a power cut the clock may be years back; the rollback comes no later than requested."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
         await policies.reload(PolicyReload(confirm_within=2.0), "operator")
-    now = time.time
-    monkeypatch.setattr(time, "time", lambda: now() - 3e8)
-    with appliance.started() as policies:
+    with using(ShiftedClock(-3e8)), appliance.started() as policies:
         await until(policies, 3)
         assert policies.current.text == OPEN
 

@@ -13,6 +13,7 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
+from appliance.base.clock import using
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import RotatedToken
 from appliance.control import token_orders
@@ -22,6 +23,7 @@ from appliance.store.access_tokens import is_secret, parse_token
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -56,11 +58,6 @@ def lives(tmp_path: Path) -> Iterator[Lives]:
     assert lives.store is not None
     lives.store.close()
     lives.log.close()
-
-
-def set_clock(monkeypatch: pytest.MonkeyPatch, reading: float, clock: str = "time") -> None:
-    """Let a clock show this time."""
-    monkeypatch.setattr(time, clock, lambda: reading)
 
 
 def opens(tokens: TokenOrders, text: str | None) -> bool:
@@ -147,9 +144,7 @@ async def test_a_rotated_token_keeps_its_name_and_role(lives: Lives) -> None:
     assert not opens(lives.next(), old.token), "the end survives a restart"
 
 
-async def test_earlier_tokens_are_valid_for_the_grace_time(
-    lives: Lives, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_earlier_tokens_are_valid_for_the_grace_time(lives: Lives) -> None:
     """Both tokens are valid until then, over a restart; a second rotation brings no end later."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
@@ -158,10 +153,9 @@ async def test_earlier_tokens_are_valid_for_the_grace_time(
     assert newest.expires - newest.created == pytest.approx(7200), "as long as the last one"
     now = time.time()
     for seconds, valid in ((500, [old, new, newest]), (700, [new, newest]), (6500, [newest])):
-        set_clock(monkeypatch, now + seconds)
-        later = lives.next()
-        assert [one.id for one in later.usable()] == [one.id for one in valid]
-        monkeypatch.undo()
+        with using(VirtualClock(wall=now + seconds)):
+            later = lives.next()
+            assert [one.id for one in later.usable()] == [one.id for one in valid]
 
 
 async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None:
@@ -175,15 +169,15 @@ async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None
     assert [one["who"] for one in lives.records("token revoked")] == ["bob", "bob"]
 
 
-async def test_only_a_valid_token_can_be_rotated(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_only_a_valid_token_can_be_rotated(lives: Lives) -> None:
     """An unknown, a revoked and an expired name are rejected; the message lists the valid ones."""
     tokens = lives.next()
     for name, seconds in (("alice", 3600), ("bob", 3600), ("carol", 1)):
         await tokens.add(TokenAdd(name, "viewer", seconds))
     await tokens.revoke(TokenRevoke("bob"))
-    set_clock(monkeypatch, time.time() + 60)
     for name in ("bob", "carol", "dave", "x" * 500):
-        with pytest.raises(TokenRefusedError, match=r"that is valid; there are: alice$"):
+        refused = pytest.raises(TokenRefusedError, match=r"that is valid; there are: alice$")
+        with using(VirtualClock(wall=time.time() + 60)), refused:
             await tokens.rotate(TokenRotate(name))
     assert len((await tokens.listed(TokenList())).tokens) == 3
 
@@ -327,12 +321,13 @@ async def test_uses_are_stored_at_most_once_in_half_a_minute(
     assert lives.store is not None
     stored: list[float] = []
     monkeypatch.setattr(lives.store, "save_token_use", lambda _token, used: stored.append(used))
-    wall, steady = time.time(), time.monotonic()
-    for ahead, passed in ((0, 0.0), (10, 10.0), (-3600, 31.0), (-3590, 41.0), (-3530, 62.0)):
-        set_clock(monkeypatch, wall + ahead)
-        set_clock(monkeypatch, steady + passed, "monotonic")
-        tokens.used(alice.id)
-        assert await uses(tokens) == {"alice": wall + ahead}
+    wall, machine = float(int(time.time())), VirtualClock()
+    with using(machine):
+        for ahead, passed in ((0, 0.0), (10, 10.0), (-3600, 21.0), (-3590, 10.0), (-3530, 21.0)):
+            machine.advance(passed)
+            machine.set_wall(wall + ahead)
+            tokens.used(alice.id)
+            assert await uses(tokens) == {"alice": wall + ahead}
     assert stored == [wall, wall - 3600, wall - 3530]
 
 

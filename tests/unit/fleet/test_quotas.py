@@ -1,10 +1,14 @@
 """Tests of `rosrv_fleet.quotas`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rosrv_fleet.config import Limits
 from rosrv_fleet.quotas import OverQuotaError, RobotQuotas
+
+from appliance.base.clock import using
+from tests.support.virtual_clock import VirtualClock
 
 _DAY = 86_400.0
 
@@ -59,18 +63,24 @@ def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
         found.check("arm1")
 
 
+@pytest.fixture
+def machine() -> Iterator[VirtualClock]:
+    """The clock that pauses are measured with."""
+    machine = VirtualClock()
+    with using(machine):
+        yield machine
+
+
 def test_the_pause_grows_with_refusals_and_processor_time(
-    clock: _Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clock: _Clock, tmp_path: Path, machine: VirtualClock
 ) -> None:
     """After refused uploads a robot pauses longer each time, at most ten minutes; a stored one shortens the next."""
-    now = [0.0]
-    monkeypatch.setattr("rosrv_fleet.quotas.time.monotonic", lambda: now[0])
     found = quotas(tmp_path, clock)
 
     def pause() -> float:
         with pytest.raises(OverQuotaError, match="has to pause") as error:
             found.check("arm1")
-        now[0] += error.value.seconds
+        machine.advance(error.value.seconds + 1e-6)  # rounded
         found.check("arm1")
         return error.value.seconds
 

@@ -7,7 +7,6 @@ import ssl
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -24,11 +23,13 @@ from typer.testing import CliRunner
 
 from appliance.audit.signatures import write_public_key
 from appliance.base.atomic_files import write_whole
+from appliance.base.clock import using
 from appliance.signing.own_certificate import make_own_certificate
 from tests.support.certificates import make_certificates
 from tests.support.enrolled_robots import enrolled_robots
 from tests.support.sources import ROOT
 from tests.support.unreadable_folders import make_unreadable
+from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
 
 
@@ -283,23 +284,24 @@ def test_a_change_while_the_folder_is_read_is_noticed(
 ) -> None:
     """A second change within the clock's step is noticed, also if the reading takes long."""
     enrolled_robots(tmp_path, "arm1", "arm2")
-    folder, now = tmp_path / "robots", time.time_ns()
+    folder, machine = tmp_path / "robots", VirtualClock()
+    now = machine.wall_ns()
     second = (folder / "arm2.json").rename(tmp_path / "arm2.json")
     os.utime(folder, ns=(now, now))
-    iterdir, clock = Path.iterdir, [now]
+    iterdir = Path.iterdir
 
     def slow(listed: Path) -> Iterator[Path]:
         yield from list(iterdir(listed))
-        clock[0] += 5_000_000_000
+        machine.advance(5)
         if second.exists():
             second.rename(folder / "arm2.json")
             os.utime(folder, ns=(now, now))
 
     monkeypatch.setattr(Path, "iterdir", slow)
-    monkeypatch.setattr(time, "time_ns", lambda: clock[0])
-    robots = Robots(folder)
-    assert robots.known().keys() == {"arm1"}
-    assert robots.known().keys() == {"arm1", "arm2"}
+    with using(machine):
+        robots = Robots(folder)
+        assert robots.known().keys() == {"arm1"}
+        assert robots.known().keys() == {"arm1", "arm2"}
 
 
 @pytest.mark.parametrize(

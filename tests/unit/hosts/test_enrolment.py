@@ -4,7 +4,6 @@ import asyncio
 import ipaddress
 import itertools
 import socket
-import time
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
+from appliance.base.clock import using
 from appliance.channel.admin import (
     AuthorityWanted,
     HostAdd,
@@ -69,6 +69,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
 from tests.support.near_authority import NearAuthority
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -520,16 +521,17 @@ def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
     run(tmp_path, second)
 
 
-async def test_a_short_life_needs_a_short_wait(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_short_life_needs_a_short_wait(bench: Bench) -> None:
     """A certificate with a short life stays on the list of revoked certificates for as short a time."""
     keys = [make_key(), make_key(), make_key()]
     await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
-    for former, key in itertools.pairwise(keys):
-        request = signing_request(key, "a").decode()
-        await bench.renew_itself("a", request, former)
-        await bench.renewed("a")
-        now = time.time()
-        monkeypatch.setattr(time, "time", lambda now=now: now + 6)
+    machine = VirtualClock()
+    with using(machine):
+        for former, key in itertools.pairwise(keys):
+            request = signing_request(key, "a").decode()
+            await bench.renew_itself("a", request, former)
+            await bench.renewed("a")
+            machine.advance(6)
 
 
 async def test_a_host_renews_only_its_own_certificate(bench: Bench) -> None:

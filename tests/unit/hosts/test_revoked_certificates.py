@@ -11,9 +11,11 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
+from appliance.base.clock import using
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.nightly
 
@@ -55,15 +57,12 @@ def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) ->
     assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
 
 
-def test_a_clock_that_was_ahead_unrevokes_no_certificate(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None:
     """After a wrong year was set and corrected, revoked certificates are still listed, also after a restart."""
     now = time.time()
     store = StateStore(tmp_path, failed=pytest.fail)
     RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
-    with monkeypatch.context() as patched:
-        patched.setattr(time, "time", lambda: now + 366 * DAY)
+    with using(VirtualClock(wall=now + 366 * DAY)):
         revoked = RevokedCertificates(store.hosts)
         revoked.forget_ended()
         assert revoked.listed({"a"}) == []

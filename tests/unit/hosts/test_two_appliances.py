@@ -1,13 +1,13 @@
 """Tests of hosts' certificates on one of two appliances: the authority's key may be on the other one."""
 
 import asyncio
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from cryptography import x509
 
+from appliance.base.clock import using
 from appliance.hosts import appliance_table
 from appliance.hosts.appliance_table import ApplianceTable
 from appliance.hosts.certificate_requests import AuthorityError
@@ -17,6 +17,7 @@ from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from tests.support.near_authority import NearAuthority
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -126,8 +127,8 @@ async def test_a_certificate_is_renewed_long_before_its_end(
     monkeypatch.setattr(appliance_table, "CERTIFICATE_DAYS", 90.0)
     await first.introduce(given, authority)
     assert first.certificate(given.key) not in (b"", before)
-    monkeypatch.setattr(time, "time", lambda: 4e9)
-    assert first.certificate(given.key) == b""
+    with using(VirtualClock(wall=4e9)):
+        assert first.certificate(given.key) == b""
 
 
 async def test_a_replaced_appliance_is_revoked(

@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
+from appliance.base.clock import using
 from appliance.ipsec.certificate_authority import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -22,6 +23,7 @@ from appliance.ipsec.certificate_authority import (
 )
 from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.proof_of_possession import RequestRefusedError
+from tests.support.virtual_clock import VirtualClock
 
 
 def request_of(
@@ -136,18 +138,15 @@ def number_of(revocations: bytes) -> int:
     return extension.value.crl_number
 
 
-def test_the_number_of_the_list_grows_whatever_the_clock_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_the_list_grows_whatever_the_clock_does(tmp_path: Path) -> None:
     """charon ignores a list with a lower number, and would accept certificates that were revoked since."""
     numbers = [number_of(CertificateAuthority(tmp_path).revocations([]))]
-    an_hour_ago = time.time_ns() - 3_600_000_000_000
-    monkeypatch.setattr(time, "time_ns", lambda: an_hour_ago)
-    authority = CertificateAuthority(tmp_path)  # the signer was started again
-    numbers += [number_of(authority.revocations([])) for _ in range(2)]
-    (tmp_path / LIST_FILE).unlink()
-    (tmp_path / LIST_FILE).mkdir()  # nothing can be written any more
-    numbers.append(number_of(authority.revocations([])))
+    with using(VirtualClock(wall=time.time() - 3600)):
+        authority = CertificateAuthority(tmp_path)  # the signer was started again
+        numbers += [number_of(authority.revocations([])) for _ in range(2)]
+        (tmp_path / LIST_FILE).unlink()
+        (tmp_path / LIST_FILE).mkdir()  # nothing can be written any more
+        numbers.append(number_of(authority.revocations([])))
     assert numbers == sorted(set(numbers))
     (tmp_path / LIST_FILE).rmdir()
     (tmp_path / LIST_FILE).write_bytes(b"")

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.channel.messages import RingGiven
 from appliance.recorder.excluded_topics import known_sums
 from appliance.recorder.ring import SMALLEST
 from appliance.recorder.ring_reader import RingReader
 from appliance.relay.recorder_ring import RecorderRing
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
 
 EVER = 0, 1 << 63
@@ -87,16 +89,16 @@ def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
     assert kept(memory) == [("/orders", b"go")]
 
 
-def test_a_judged_message_has_the_time_of_its_judgement(memory: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_judged_message_has_the_time_of_its_judgement(memory: int) -> None:
     """An unjudged message has the time of its recording; both follow a change of the clock."""
-    second, wall = 10**9, 5000 * 10**9
-    monkeypatch.setattr(time, "time_ns", lambda: wall)
-    stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
-    assert stream is not None
-    stream.write(batch(b"1").view, 1, 1, 4999 * second)
-    stream.write(batch(b"2").view, 1, 2)
-    wall += 60 * second
-    stream.write(batch(b"3").view, 1, 3, 5000 * second)
+    second, machine = 10**9, VirtualClock(wall=5000)
+    with using(machine):
+        stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
+        assert stream is not None
+        stream.write(batch(b"1").view, 1, 1, 4999 * second)
+        stream.write(batch(b"2").view, 1, 2)
+        machine.advance(60)
+        stream.write(batch(b"3").view, 1, 3, 5000 * second)
     reader = RingReader(memoryview(mmap.mmap(memory, 0, prot=mmap.PROT_READ)))
     [found] = reader.read(*EVER)
     assert [one.time for one in found.batches] == [4999 * second, 5000 * second + 7, 5060 * second - 7]

@@ -1,6 +1,7 @@
 """The right to answer alone: the lease, control's replication and the witness, with messages in all orders."""
 
 import asyncio
+import contextlib
 import socket
 from collections import deque
 from pathlib import Path
@@ -11,16 +12,17 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from appliance.base import clock
 from appliance.channel import messages
-from appliance.control import lease_client, replication
+from appliance.control import replication
 from appliance.control.lease_client import LeaseClient
 from appliance.control.replication import Replication
-from appliance.standby import process
 from appliance.standby.membership import Membership
 from appliance.standby.process import LeaseProcess
 from appliance.standby.replication_frames import Stored
 from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from tests.support.examples import examples
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.nightly
 
@@ -65,14 +67,12 @@ class Store:
 class Pair:
     """The active appliance `a`, its standby `b`, and the witness, with every message in a queue of the test."""
 
-    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
-        self.now = 1000.0
-        for module in (process, lease_client, replication):
-            patch.setattr(module, "boot_time", lambda: self.now)
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch, machine: VirtualClock) -> None:
+        self.machine = machine
         patch.setattr(replication, "replication_context", lambda *_, **__: None)
         record = LeaseRecord(1, "", ("a", "b"), "boot")
         self.witness = Witness(
-            record=record, save=lambda _: None, admit=lambda _: None, boot="boot", clock=lambda: self.now
+            record=record, save=lambda _: None, admit=lambda _: None, boot="boot", clock=clock.since_boot
         )
         peers = {name: AppliancePeer(ADDRESSES[name], KEYS[name]) for name in ADDRESSES}
         self.gate = WitnessGate(self.witness, peers, "nonce")
@@ -128,7 +128,7 @@ class Pair:
             case "acknowledge" if self.acknowledgements:
                 sender.take(Stored(2, self.database.history, self.acknowledgements.popleft()))
             case "time":
-                self.now += 0.31
+                self.machine.advance(0.31)
                 self.lease.tick()
             case "witness" if self.requests:
                 answer = self.gate.answer(self.requests.popleft(), ADDRESSES["a"])
@@ -191,7 +191,7 @@ class Pair:
 
 async def run(pair: Pair, steps: list[str]) -> None:
     """Become active, then take these steps."""
-    pair.now += EXPIRY
+    pair.machine.advance(EXPIRY)
     pair.start_control(taken_over=True)
     for step in ["settle"] * 8 + steps:
         pair.step(step)
@@ -219,8 +219,9 @@ def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
     tmp_path_factory: pytest.TempPathFactory, steps: list[str]
 ) -> None:
     """In whatever order messages, acknowledgements, losses and restarts of control come."""
-    with pytest.MonkeyPatch.context() as patch:
-        pair = Pair(tmp_path_factory.mktemp("pair"), patch)
+    machine = VirtualClock()
+    with pytest.MonkeyPatch.context() as patch, clock.using(machine):
+        pair = Pair(tmp_path_factory.mktemp("pair"), patch, machine)
         try:
             asyncio.run(run(pair, steps))
         finally:
@@ -229,7 +230,7 @@ def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
 
 def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The steps above reach both: the removal of an absent standby, and its return."""
-    pair = Pair(tmp_path, monkeypatch)
+    machine = VirtualClock()
 
     async def story() -> None:
         await run(pair, ["change", *["settle"] * 8])
@@ -247,7 +248,5 @@ def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.Mo
         await pair.turn()
         assert pair.answered == 2
 
-    try:
+    with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
         asyncio.run(story())
-    finally:
-        pair.close()

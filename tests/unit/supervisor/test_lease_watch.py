@@ -3,11 +3,10 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-import pytest
-
-from appliance.standby.process import boot_time
+from appliance.base import clock
 from appliance.supervisor.lease_watch import LeaseWatch
 from tests.support.processes import LIMIT
+from tests.support.virtual_clock import VirtualClock
 
 
 class Role:
@@ -25,7 +24,7 @@ class Role:
     async def until_passive(self) -> float:
         """Return the time when it became passive."""
         await asyncio.wait_for(self.passive.wait(), LIMIT)
-        return boot_time()
+        return clock.since_boot()
 
 
 def run(work: Callable[[Role], Awaitable[None]], *, member: bool = True) -> None:
@@ -42,7 +41,7 @@ def test_it_is_passive_until_the_lease_is_held() -> None:
 
     async def work(role: Role) -> None:
         assert role.orders == []
-        role.watch.held(boot_time() + 60, 5)
+        role.watch.held(clock.since_boot() + 60, 5)
         assert role.orders == [5]
         assert role.watch.active
 
@@ -53,7 +52,7 @@ def test_it_is_passive_when_no_further_report_arrives() -> None:
     """Not before the reported time, and without any message."""
 
     async def work(role: Role) -> None:
-        until = boot_time() + 0.2
+        until = clock.since_boot() + 0.2
         role.watch.held(until, 5)
         assert await role.until_passive() >= until
         assert role.orders == [5, "passive"]
@@ -66,8 +65,8 @@ def test_a_later_report_extends_the_time() -> None:
     """An earlier one that is still under way does not shorten it only for a moment: the last report counts."""
 
     async def work(role: Role) -> None:
-        role.watch.held(boot_time() + 0.05, 5)
-        until = boot_time() + 0.3
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        until = clock.since_boot() + 0.3
         role.watch.held(until, 5)
         assert await role.until_passive() >= until
         assert role.orders == [5, "passive"]
@@ -79,7 +78,7 @@ def test_a_report_that_arrives_too_late_does_not_activate() -> None:
     """The supervisor was stopped for a while, and another appliance may be active by now."""
 
     async def work(role: Role) -> None:
-        role.watch.held(boot_time() - 0.001, 5)
+        role.watch.held(clock.since_boot() - 0.001, 5)
         assert role.orders == [] and not role.watch.active
 
     run(work)
@@ -89,8 +88,8 @@ def test_a_late_report_of_an_active_appliance_ends_its_role_at_once() -> None:
     """Without waiting for a timer."""
 
     async def work(role: Role) -> None:
-        role.watch.held(boot_time() + 60, 5)
-        role.watch.held(boot_time() - 0.001, 5)
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.held(clock.since_boot() - 0.001, 5)
         assert role.orders == [5, "passive"]
 
     run(work)
@@ -100,8 +99,8 @@ def test_a_new_epoch_ends_the_state_of_the_old_one() -> None:
     """Another appliance may have been active in between, so no process may keep its memory."""
 
     async def work(role: Role) -> None:
-        role.watch.held(boot_time() + 60, 5)
-        role.watch.held(boot_time() + 60, 7)
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.held(clock.since_boot() + 60, 7)
         assert role.orders == [5, "passive", 7]
 
     run(work)
@@ -111,7 +110,7 @@ def test_the_end_of_the_lease_is_reported_once() -> None:
     """A second end changes nothing."""
 
     async def work(role: Role) -> None:
-        role.watch.held(boot_time() + 60, 5)
+        role.watch.held(clock.since_boot() + 60, 5)
         role.watch.ended()
         role.watch.ended()
         assert role.orders == [5, "passive"]
@@ -119,15 +118,15 @@ def test_the_end_of_the_lease_is_reported_once() -> None:
     run(work)
 
 
-def test_the_time_counts_while_the_machine_sleeps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_counts_while_the_machine_sleeps() -> None:
     """The timer of the loop stops with the machine, so it is set again by the clock that does not."""
 
     async def work(role: Role) -> None:
-        clock = boot_time()
-        monkeypatch.setattr("appliance.supervisor.lease_watch.time.clock_gettime", lambda _clock: clock)
-        role.watch.held(clock + 0.05, 5)
-        clock += 3600.0
-        await role.until_passive()
+        machine = VirtualClock()
+        with clock.using(machine):
+            role.watch.held(clock.since_boot() + 0.05, 5)
+            machine.sleep(3600.0)
+            await role.until_passive()
 
     run(work)
 

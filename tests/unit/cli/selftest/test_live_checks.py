@@ -6,9 +6,11 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 from appliance.cli.selftest import live_checks as selftest_running
+from tests.support.virtual_clock import VirtualClock
 
 OURS = SimpleNamespace(
     sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest_00c0ffee", id="0192-ours", host="10.0.0.1")
@@ -22,6 +24,7 @@ class Log:
     def __init__(self) -> None:
         self.answers: list[Any] = []
         self.searches = 0
+        self.machine = VirtualClock()
 
     def audit(self) -> "Log":
         """Return the log as an appliance has it."""
@@ -35,6 +38,7 @@ class Log:
         """Return the next answer; the last one is repeated."""
         assert newest_first
         self.searches += 1
+        self.machine.advance(0.001)  # a search takes time
         answer = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
         if isinstance(answer, Exception):
             raise answer
@@ -44,20 +48,12 @@ class Log:
 @pytest.fixture
 def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
     """Return a log; waiting takes no time."""
-    now = [100.0]
-
-    def sleep(seconds: float) -> None:
-        assert seconds > 0
-        now[0] += seconds
-
-    def monotonic() -> float:
-        now[0] += 0.001  # a search takes time
-        return now[0]
-
-    monkeypatch.setattr(selftest_running, "time", SimpleNamespace(monotonic=monotonic, sleep=sleep))
+    log = Log()
+    monkeypatch.setattr(selftest_running, "time", SimpleNamespace(sleep=log.machine.advance))
     monkeypatch.setattr(selftest_running, "secrets", SimpleNamespace(token_hex=lambda _bytes: "00c0ffee"))
     monkeypatch.setattr(selftest_running, "call", lambda *_arguments: None)
-    yield Log()
+    with using(log.machine):
+        yield log
 
 
 def outcome(log: Log) -> tuple[str, str]:

@@ -2,33 +2,33 @@
 
 import asyncio
 import ipaddress
-import time
 from typing import Any, cast
 
 import pytest
 
+from appliance.base.clock import using
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.rpc.xmlrpc_client import RefusedError
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
+from tests.support.virtual_clock import ShiftedClock
 
 pytestmark = pytest.mark.anyio
 
 
-async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
     """A node that was just lost returns with all registrations, whatever date the clock has."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
     world.clients.silent = {"/n"}
     await world.look(node)
-    real = time.time
-    monkeypatch.setattr(time, "time", lambda: real() + 365 * 86_400)
-    await world.look(node)
-    world.clients.silent = set()
-    await world.look(node)
+    with using(ShiftedClock(365 * 86_400)):
+        await world.look(node)
+        world.clients.silent = set()
+        await world.look(node)
     assert (node.life, world.hidden.has(Kind.PUBLICATION, "/a")) == (Life.LIVE, ["/n"])
 
 

@@ -1,0 +1,94 @@
+"""The clocks of the machine: one that only advances, the system time, and the time since the boot.
+
+Every reading asks the source of the present context. It is the operating system's, unless `using` replaces it: a test
+sets the time, and a simulation of several machines gives each its own. A task, a `call_later` and `asyncio.to_thread`
+keep the source of their creator; a `threading.Thread` begins with the operating system's.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import UTC, datetime
+from typing import Protocol
+
+_SECOND = 1e9
+
+
+class ClockSource(Protocol):
+    """Where readings come from; all are in nanoseconds."""
+
+    def now_ns(self) -> int:
+        """Return the monotonic time, which only advances and begins anywhere."""
+
+    def wall_ns(self) -> int:
+        """Return the system time since the epoch, which people and time services set."""
+
+    def since_boot_ns(self) -> int:
+        """Return the time since the boot, which also counts while the machine is suspended."""
+
+
+class SystemClock:
+    """The clocks of the operating system."""
+
+    now_ns = staticmethod(time.monotonic_ns)
+    wall_ns = staticmethod(time.time_ns)
+
+    @staticmethod
+    def since_boot_ns() -> int:
+        """Return the time since the boot."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+_SYSTEM = SystemClock()
+_source: ContextVar[ClockSource] = ContextVar("clock", default=_SYSTEM)
+
+
+@contextmanager
+def using(source: ClockSource) -> Iterator[None]:
+    """Take all readings of the block, and of the tasks that it creates, from this source."""
+    before = _source.set(source)
+    try:
+        yield
+    finally:
+        _source.reset(before)
+
+
+def source() -> ClockSource:
+    """Return the present source."""
+    return _source.get()
+
+
+def now() -> float:
+    """Return the monotonic time in seconds: for durations, timeouts and the order of events."""
+    return _source.get().now_ns() / _SECOND
+
+
+def now_ns() -> int:
+    """Return the monotonic time in nanoseconds."""
+    return _source.get().now_ns()
+
+
+def wall() -> float:
+    """Return the system time in seconds since the epoch: for people, and for dates that others have set."""
+    return _source.get().wall_ns() / _SECOND
+
+
+def wall_ns() -> int:
+    """Return the system time in nanoseconds since the epoch."""
+    return _source.get().wall_ns()
+
+
+def utc_now() -> datetime:
+    """Return the system time as a date in UTC."""
+    return datetime.fromtimestamp(wall(), UTC)
+
+
+def since_boot() -> float:
+    """Return the seconds since the boot."""
+    return _source.get().since_boot_ns() / _SECOND
+
+
+def since_boot_ns() -> int:
+    """Return the nanoseconds since the boot."""
+    return _source.get().since_boot_ns()

@@ -1,0 +1,56 @@
+"""A clock for `appliance.base.clock.using` that moves only when a test moves it."""
+
+from appliance.base import clock
+
+_SECOND = 1_000_000_000
+
+
+class VirtualClock:
+    """All readings in nanoseconds; `wall` is the system time, and begins at the present one if it is not given.
+
+    `advance` moves all three clocks together, as time does; `set_wall` sets the system time alone, as people do.
+    """
+
+    def __init__(self, *, wall: float | None = None, now: float = 1000.0) -> None:
+        self._now = round(now * _SECOND)
+        self._wall = clock.wall_ns() if wall is None else round(wall * _SECOND)
+        self._asleep = 0
+
+    def now_ns(self) -> int:
+        """Return the monotonic time."""
+        return self._now
+
+    def wall_ns(self) -> int:
+        """Return the system time."""
+        return self._wall
+
+    def since_boot_ns(self) -> int:
+        """Return the monotonic time and the time that the machine slept."""
+        return self._now + self._asleep
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass."""
+        self.advance_ns(round(seconds * _SECOND))
+
+    def advance_ns(self, nanoseconds: int) -> None:
+        """Let time pass."""
+        self._now += nanoseconds
+        self._wall += nanoseconds
+
+    def sleep(self, seconds: float) -> None:
+        """Suspend the machine."""
+        self._asleep += round(seconds * _SECOND)
+        self._wall += round(seconds * _SECOND)
+
+    def set_wall(self, seconds: float) -> None:
+        """Set the system time, in seconds since the epoch."""
+        self._wall = round(seconds * _SECOND)
+
+
+class ShiftedClock:
+    """The present clocks, with a system time that is ahead by some seconds, or behind."""
+
+    def __init__(self, ahead: float) -> None:
+        present = clock.source()
+        self.now_ns, self.since_boot_ns = present.now_ns, present.since_boot_ns
+        self.wall_ns = lambda: present.wall_ns() + round(ahead * _SECOND)
