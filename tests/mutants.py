@@ -1,0 +1,246 @@
+"""Change the kernel in small wrong ways, and list the changes that no test of the gate finds: `make mutants N=200`.
+
+Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a number.
+A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this process,
+which runs only those tests, until one fails. With `--all`, tests that are not of the gate count, too.
+"""
+
+import argparse
+import ast
+import builtins
+import importlib.abc
+import importlib.machinery
+import json
+import os
+import random
+import re
+import signal
+import sys
+import tempfile
+import types
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+_PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text(encoding="utf-8")
+_KERNEL = re.findall(r"`([\w/]+)\.py` \d+", _PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0])
+MODULES = {f"appliance.{path.replace('/', '.')}": ROOT / "appliance" / f"{path}.py" for path in _KERNEL}
+FOLDERS = ("tests/unit", "tests/world")
+_SECONDS = 300  # a mutant whose tests take longer is found: it hangs
+_OPPOSITES: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+_REACHED = "__reached_mutant__"
+
+
+class _Switches(ast.NodeTransformer):
+    """Puts a switch beside each place that can be changed: `wrong if __reached_mutant__(7) else right`."""
+
+    def __init__(self, module: str, first: int) -> None:
+        self._module, self._number, self._functions = module, first, 0
+        self.described: list[str] = []
+
+    def _reached(self, node: ast.AST, what: str) -> ast.expr:
+        number = self._number + len(self.described)
+        self.described.append(f"{self._module}:{getattr(node, 'lineno', 0)}: {what}")
+        return ast.Call(ast.Name(_REACHED, ast.Load()), [ast.Constant(number)], [])
+
+    def _or(self, node: ast.expr, wrong: ast.expr, what: str) -> ast.expr:
+        return ast.copy_location(ast.IfExp(self._reached(node, what), wrong, node), node)
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        self._functions += 1
+        node.body = [self.visit(statement) for statement in node.body]
+        self._functions -= 1
+        return node
+
+    visit_AsyncFunctionDef = visit_FunctionDef  # type: ignore[assignment]  # noqa: N815
+
+    def visit_match_case(self, node: ast.match_case) -> ast.match_case:
+        node.body = [self.visit(statement) for statement in node.body]  # a pattern takes no expression
+        return node
+
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        self.generic_visit(node)
+        opposite = _OPPOSITES.get(type(node.ops[0]))
+        if not self._functions or opposite is None or len(node.ops) > 1:
+            return node
+        wrong = ast.Compare(node.left, [opposite()], node.comparators)
+        return self._or(node, wrong, f"{ast.unparse(node)} -> {ast.unparse(wrong)}")
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> ast.AST:
+        text = ast.unparse(node)
+        self.generic_visit(node)
+        if not self._functions:
+            return node
+        wrong = ast.BoolOp(ast.And() if isinstance(node.op, ast.Or) else ast.Or(), node.values)
+        return self._or(node, wrong, f"and/or exchanged: {text}")
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.AST:
+        text = ast.unparse(node)
+        self.generic_visit(node)
+        if not self._functions or not isinstance(node.op, ast.Not):
+            return node
+        return self._or(node, node.operand, f"{text} -> without not")
+
+    def visit_Constant(self, node: ast.Constant) -> ast.AST:
+        if not self._functions or not isinstance(node.value, bool | int):
+            return node
+        wrong = ast.Constant(not node.value if isinstance(node.value, bool) else node.value + 1)
+        return self._or(node, wrong, f"{node.value!r} -> {wrong.value!r}")
+
+    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
+        return node  # texts are no decisions
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+        text = ast.unparse(node)
+        self.generic_visit(node)
+        is_call = isinstance(node.value, ast.Call) or (
+            isinstance(node.value, ast.Await) and isinstance(node.value.value, ast.Call)
+        )
+        if not self._functions or not is_call:
+            return node
+        left_out = ast.UnaryOp(ast.Not(), self._reached(node, f"left out: {text}"))
+        return ast.copy_location(ast.If(left_out, [node], []), node)
+
+    def visit_Return(self, node: ast.Return) -> ast.AST:
+        text = ast.unparse(node)
+        self.generic_visit(node)
+        if not self._functions or node.value is None or text == "return None":
+            return node
+        node.value = self._or(node.value, ast.Constant(None), f"{text} -> return None")
+        return node
+
+
+class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Loads the kernel's modules with their switches; `described` says what each number changes."""
+
+    def __init__(self) -> None:
+        self.described: list[str] = []
+
+    def find_spec(
+        self, fullname: str, _path: Sequence[str] | None, _target: types.ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Return how to load a module of the kernel."""
+        file = MODULES.get(fullname)
+        return None if file is None else importlib.machinery.ModuleSpec(fullname, self, origin=str(file))
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        """Load a module with its switches."""
+        file = MODULES[module.__name__]
+        module.__file__ = str(file)
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        switches = _Switches(str(file.relative_to(ROOT)), len(self.described))
+        tree = ast.fix_missing_locations(switches.visit(tree))
+        self.described += switches.described
+        exec(compile(tree, file, "exec"), module.__dict__)  # noqa: S102  our own module
+
+
+class Hunt:
+    """A plugin of pytest that runs the collected tests once to learn what they reach, then once for each mutant."""
+
+    def __init__(self, loader: MutantLoader, number: int, seed: int) -> None:
+        self._loader, self._number, self._seed = loader, number, seed
+        self._reaches: dict[int, set[str]] = {}  # by mutant
+        self._active = -1
+        self._test = ""
+        self.survivors: list[int] = []
+        setattr(builtins, _REACHED, self._reached)
+
+    def _reached(self, number: int) -> bool:
+        if self._active < 0 and self._test:
+            self._reaches.setdefault(number, set()).add(self._test)
+        return number == self._active
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """Remember which test runs."""
+        self._test = nodeid
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Run everything in forks, so that no run affects another."""
+        items = session.items
+        learned = self._fork(session, items, _SECONDS * 10)
+        if learned["failed"]:
+            raise pytest.UsageError(f"without a mutant, these tests fail: {learned['failed']}")
+        reaches: dict[str, list[str]] = learned["reaches"]
+        reached = sorted(map(int, reaches))
+        chosen = random.Random(self._seed).sample(reached, min(self._number, len(reached)))  # noqa: S311
+        print(
+            f"{len(self._loader.described)} mutants, {len(reached)} reached by {len(items)} tests; {len(chosen)} chosen"
+        )
+        for count, number in enumerate(chosen, 1):
+            self._active = number
+            wanted = set(reaches[str(number)])
+            outcome = self._fork(session, [item for item in items if item.nodeid in wanted], _SECONDS)
+            found = ", ".join(outcome["failed"]) or "SURVIVED"
+            self.survivors += [] if outcome["failed"] else [number]
+            print(f"{count}/{len(chosen)} {self._loader.described[number]}: {found[:120]}", flush=True)
+        print(f"{len(chosen) - len(self.survivors)} of {len(chosen)} mutants were found; not found:")
+        for number in self.survivors:
+            print(f"  {self._loader.described[number]}")
+        return True
+
+    def _fork(self, session: pytest.Session, items: list[pytest.Item], seconds: int) -> dict[str, Any]:
+        """Run tests in a fork until one fails; return the ids of failed tests, and what was reached."""
+        with tempfile.NamedTemporaryFile("r") as answer:
+            child = os.fork()
+            if not child:
+                signal.alarm(seconds)
+                self._run(session, items, answer.name)
+            _, status = os.waitpid(child, 0)
+            if status:
+                return {"failed": [f"ended with status {status}"], "reaches": {}}
+            outcome: dict[str, Any] = json.load(answer)
+            return outcome
+
+    def _run(self, session: pytest.Session, items: list[pytest.Item], answer: str) -> None:
+        failed: list[str] = []
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(1, 2)
+        try:
+            session.config.pluginmanager.register(_Failures(failed))
+            for item, following in zip(items, [*items[1:], None], strict=True):
+                session.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+                if failed and self._active >= 0:
+                    break
+            reaches = {number: sorted(tests) for number, tests in self._reaches.items()}
+            Path(answer).write_text(json.dumps({"failed": failed, "reaches": reaches}), encoding="utf-8")
+        finally:
+            os._exit(0)
+
+
+class _Failures:
+    def __init__(self, failed: list[str]) -> None:
+        self._failed = failed
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self._failed.append(report.nodeid)
+
+
+def main() -> int:
+    """Hunt, and return 0: survivors are for people to judge."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--number", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--all", action="store_true", help="also run tests that are not of the gate")
+    parser.add_argument(
+        "tests", nargs="*", default=[folder for folder in FOLDERS if (ROOT / folder).exists()]
+    )
+    given = parser.parse_args()
+    loader = MutantLoader()
+    sys.meta_path.insert(0, loader)
+    hunt = Hunt(loader, given.number, given.seed)
+    options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no", "-s"]
+    options += [] if given.all else ["-m", "not nightly and not real"]
+    return int(pytest.main([*options, *given.tests], plugins=[hunt]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
