@@ -82,7 +82,7 @@ def checkout(tmp_path: Path) -> Path:
 
 def set_up(checkout: Path, *options: str) -> subprocess.CompletedProcess[str]:
     """Run `scripts/setup` of this checkout, for a user with umask 077."""
-    command = [checkout / "scripts/setup", *options]
+    command = [str(checkout / "scripts/setup"), *options]
     return subprocess.run(command, capture_output=True, text=True, umask=0o077, timeout=60, check=False)
 
 
