@@ -1,11 +1,9 @@
 """docs/first-hour.md, followed command by command on three machines: the page shows the real output."""
 
 import os
-import re
 import shutil
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -13,34 +11,9 @@ import pytest
 from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV
 from tests.support.own_namespace import own_namespace
+from tests.support.page_steps import steps
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_root
-
-PAGE = Path(__file__).parents[2] / "docs" / "first-hour.md"
-_STEP = re.compile(
-    r"<!-- on: (?P<host>\w+)(?:, (?P<how>\w+))? -->\n```sh\n(?P<script>.*?)```\n(?:```text\n(?P<shown>.*?)```\n)?",
-    re.S,
-)
-
-
-@dataclass(frozen=True)
-class Step:
-    """One block of commands: the machine, whether it fails or keeps running, and its output."""
-
-    host: str
-    how: str | None
-    script: str
-    shown: tuple[str, ...]
-
-
-def steps() -> list[Step]:
-    """Return the blocks of the page, in order."""
-    found = [
-        Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))
-        for one in _STEP.finditer(PAGE.read_text())
-    ]
-    assert PAGE.read_text().count("```sh") == len(found)
-    return found
 
 
 @pytest.fixture
@@ -74,7 +47,7 @@ def test_the_page_is_true(hosts: dict[str, Host], folder: Path) -> None:
         "COLUMNS": "200",
     }
     try:
-        for step in steps():
+        for step in steps("first-hour.md"):
             script = f"exec 2>&1\ncd {folder}\n" + step.script.replace("/var/lib/rosrv", f"{folder}/state")
             command = ["bash", "-euo", "pipefail", "-c", script]
             label = f"{step.host}: {step.script.splitlines()[-1]}"

@@ -8,6 +8,8 @@ import pytest
 
 from appliance.channel.admin import OPERATIONS
 from distribution import command_line_page, settings_page
+from tests.support.command import commands
+from tests.support.page_steps import steps
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
@@ -15,6 +17,8 @@ WITH_LINKS = [
     *PAGES,
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")),
 ]
+_CODE = re.compile(r"```.*?```|`[^`\n]+`|^ {4,}\S.*$", re.DOTALL | re.MULTILINE)
+_CALL = re.compile(r"(?:^|[`(]|\$ |sudo |bin/|appliance |&& )rosrv ([a-z][^\n`|…]*)", re.MULTILINE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -74,3 +78,28 @@ def test_every_operation_of_rest_is_on_its_page() -> None:
     text = (ROOT / "docs" / "reference" / "rest.md").read_text()
     paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
     assert [path for path in paths if not re.search(rf"{path}(?![\w/])", text)] == []
+
+
+@pytest.mark.parametrize("page", WITH_LINKS[:-1], ids=lambda page: page.name)
+def test_commands_of_pages_exist(page: Path) -> None:
+    """Each `rosrv` command of a page, the CHANGELOG excepted, exists with the options that the page gives it."""
+    options = {
+        name: {one for each in verb.params for one in (*each.opts, "--help")} for name, verb in commands()
+    }
+    groups = {name.split()[0] for name in options}
+    calls = [call.strip() for code in _CODE.findall(page.read_text()) for call in _CALL.findall(code)]
+    assert [call for call in calls if call not in groups and not _exists(call, options)] == []
+
+
+def _exists(call: str, options: dict[str, set[str]]) -> bool:
+    name = max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len, default=None)
+    given = re.findall(r"(?<=[ \[])--[a-z-]+", re.sub(" #.*", "", call))
+    return name is not None and options[name].issuperset(given)
+
+
+def test_the_quickstart_is_quick() -> None:
+    """Five steps, one denied call, and at most 250 words; marks for its test do not count."""
+    text = (ROOT / "docs/quickstart.md").read_text()
+    words = re.sub(r"<!--.*?-->|^```.*$", "", text, flags=re.MULTILINE).split()
+    denied = [step for step in steps("quickstart.md") if step.how == "fails"]
+    assert (text.count("\n## "), len(denied), len(words) <= 250) == (5, 1, True), len(words)

@@ -1,0 +1,44 @@
+"""docs/quickstart.md, followed command by command on a clean machine: the page shows the real output."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.package.conftest import SLOW_SECONDS, clean_machine
+from tests.support.page_steps import steps
+
+pytestmark = pytest.mark.timeout(3600)  # a machine boots, perhaps emulated
+_NETWORK = """
+ip netns add visitor
+ip link add eth0 type veth peer name eth0 netns visitor
+ip address add 10.84.0.2/24 dev eth0
+ip link set eth0 up
+ip -n visitor address add 10.84.0.66/24 dev eth0
+ip -n visitor link set lo up
+ip -n visitor link set eth0 up
+"""
+_DRIVES = "until ROS_MASTER_URI=http://localhost:11311 rosnode ping -c 1 /drive; do sleep 1; done"
+
+
+def test_the_page_is_true(package: Path, tmp_path: Path) -> None:
+    """Every block ends and prints as the page says, on a robot and a visitor that is a namespace of its machine."""
+    record = "ID"
+    with clean_machine(
+        tmp_path, package, {package.name: package}, more=("sudo",), name="quickstart"
+    ) as machine:
+        machine.run("bash", "-euc", _NETWORK)
+        for step in steps("quickstart.md"):
+            command = ["bash", "-euo", "pipefail", "-c", step.script.replace(" ID ", f" {record} ")]
+            if step.host == "visitor":
+                command = ["ip", "netns", "exec", "visitor", *command]
+            if step.how == "stays":
+                machine.run("systemd-run", "--unit=drive", *command)
+                machine.run("bash", "-c", _DRIVES)
+                continue
+            done = machine.run(*command, seconds=SLOW_SECONDS, check=False)
+            assert (done.status != 0) == (step.how == "fails"), f"{step.script}{done.output}"
+            missing = [line for line in step.shown if line not in done.output]
+            assert missing == [], f"{step.script}{done.output}"
+            if step.how == "fails":
+                record = re.findall(r"\[(\w+)\]", done.output)[-1]

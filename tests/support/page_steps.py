@@ -1,0 +1,37 @@
+"""Pages whose commands a test runs: each block is marked with its machine, and the block after it has the output.
+
+    <!-- on: robot, stays -->
+
+`fails` marks a block that ends with an error, `stays` one that keeps running.
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+DOCS = Path(__file__).parents[2] / "docs"
+_STEP = re.compile(
+    r"<!-- on: (?P<host>\w+)(?:, (?P<how>\w+))? -->\n```sh\n(?P<script>.*?)```\n(?:```text\n(?P<shown>.*?)```\n)?",
+    re.S,
+)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One block of commands: the machine, whether it fails or keeps running, and its output."""
+
+    host: str
+    how: str | None
+    script: str
+    shown: tuple[str, ...]
+
+
+def steps(page: str) -> list[Step]:
+    """Return the blocks of a page of `docs`, in order; fail if one is not marked."""
+    text = (DOCS / page).read_text()
+    found = [
+        Step(one["host"], one["how"], one["script"], tuple((one["shown"] or "").splitlines()))
+        for one in _STEP.finditer(text)
+    ]
+    assert text.count("```sh") == len(found)
+    return found
