@@ -58,7 +58,7 @@ class _Switches(ast.NodeTransformer):
         self._functions -= 1
         return node
 
-    visit_AsyncFunctionDef = visit_FunctionDef  # type: ignore[assignment]  # noqa: N815
+    visit_AsyncFunctionDef = visit_FunctionDef  # type: ignore[assignment]  # noqa: N815  the name that ast calls
 
     def visit_match_case(self, node: ast.match_case) -> ast.match_case:
         node.body = [self.visit(statement) for statement in node.body]  # a pattern takes no expression
@@ -170,7 +170,7 @@ class Hunt:
             raise pytest.UsageError(f"without a mutant, these tests fail: {learned['failed']}")
         reaches: dict[str, list[str]] = learned["reaches"]
         reached = sorted(map(int, reaches))
-        chosen = random.Random(self._seed).sample(reached, min(self._number, len(reached)))  # noqa: S311
+        chosen = random.Random(self._seed).sample(reached, min(self._number, len(reached)))  # noqa: S311  a sample
         print(
             f"{len(self._loader.described)} mutants, {len(reached)} reached by {len(items)} tests; {len(chosen)} chosen"
         )
@@ -193,11 +193,9 @@ class Hunt:
             if not child:
                 signal.alarm(seconds)
                 self._run(session, items, answer.name)
-            _, status = os.waitpid(child, 0)
-            if status:
-                return {"failed": [f"ended with status {status}"], "reaches": {}}
-            outcome: dict[str, Any] = json.load(answer)
-            return outcome
+            os.waitpid(child, 0)
+            text = answer.read()
+            return json.loads(text) if text else {"failed": ["it did not end"], "reaches": {}}
 
     def _run(self, session: pytest.Session, items: list[pytest.Item], answer: str) -> None:
         failed: list[str] = []
@@ -212,7 +210,7 @@ class Hunt:
             reaches = {number: sorted(tests) for number, tests in self._reaches.items()}
             Path(answer).write_text(json.dumps({"failed": failed, "reaches": reaches}), encoding="utf-8")
         finally:
-            os._exit(0)
+            os.kill(os.getpid(), signal.SIGKILL)  # nothing of this process may run at its end
 
 
 class _Failures:

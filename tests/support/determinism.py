@@ -7,6 +7,8 @@ reads of a clock, only those by our own code count.
 """
 
 import functools
+import inspect
+import itertools
 import sys
 import threading
 import time
@@ -60,7 +62,7 @@ class Watch:
             self._found, self._watched = outer
 
     def _event(self, event: str, _arguments: tuple[Any, ...]) -> None:
-        if self._watched and event in _FORBIDDEN and not _of_a_loop(event):
+        if self._watched and event in _FORBIDDEN and not _is_harmless(event):
             self._refuse(_FORBIDDEN[event])
 
     def _forbidding(self, what: str, act: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,23 +76,17 @@ class Watch:
 
     def _clock(self, name: str, read: Callable[..., Any]) -> Callable[..., Any]:
         def reading(*arguments: Any) -> Any:
-            if self._watched and sys._getframe(1).f_globals.get("__name__", "").startswith(_OURS):
+            if self._watched and next(callers(2), "").startswith(_OURS):
                 pass
             return read(*arguments)
 
         return reading
 
     def _refuse(self, what: str) -> None:
-        frame, place = sys._getframe(2), ""
-        while frame is not None and not place:
-            if (
-                str(frame.f_globals.get("__name__", "")).startswith(_OURS)
-                and __file__ != frame.f_code.co_filename
-            ):
-                place = f" in {frame.f_globals['__name__']}.{frame.f_code.co_name}"
-            frame = frame.f_back  # type: ignore[assignment]
-        self._found.append(f"{what}{place}")
-        raise ChanceError(f"this test {what}{place}; only tests marked `real` or `nightly` may")
+        ours = (name for name in callers(2) if name.startswith(_OURS) and name != __name__)
+        found = f"{what} in {next(ours, 'a library')}"
+        self._found.append(found)
+        raise ChanceError(f"this test {found}; only tests marked `real` or `nightly` may")
 
 
 WATCH = Watch()
@@ -101,7 +97,16 @@ def may_depend_on_chance(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in ("real", "nightly"))
 
 
-def _of_a_loop(event: str) -> bool:
-    """Return whether an event loop makes the pair of sockets by which threads wake it."""
-    names = {sys._getframe(depth).f_globals.get("__name__") for depth in (3, 4, 5)}
-    return event == "socket.__new__" and "asyncio.selector_events" in names
+def callers(depth: int) -> Iterator[str]:
+    """Yield the modules of the functions that are being executed, from the `depth`th caller outwards."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        if depth < 0:
+            yield str(frame.f_globals.get("__name__", ""))
+        depth, frame = depth - 1, frame.f_back
+
+
+def _is_harmless(event: str) -> bool:
+    """Return whether an event loop makes the sockets by which threads wake it, or urllib3 looks for IPv6 when loaded."""
+    makers = {"asyncio.selector_events", "urllib3.util.connection"}
+    return event == "socket.__new__" and not makers.isdisjoint(itertools.islice(callers(2), 5))

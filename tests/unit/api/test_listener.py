@@ -18,7 +18,7 @@ from appliance.api.listener import Listener
 from appliance.configuration.settings import ApiLimits
 from appliance.quotas.pool import QuotaClass
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]

@@ -114,6 +114,7 @@ async def test_large_values_of_a_host_go_one_at_a_time() -> None:
     assert not inside
 
 
+@pytest.mark.nightly
 async def test_the_work_of_a_thread_is_charged_to_its_host() -> None:
     """A host whose large document was read in a thread is next after the others, as if the loop had read it."""
     time, order = ProcessorTime(lambda host: host, lambda: 0.0), list[Any]()

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.http_server import LIMITS, Client, Server, fault, post, serving
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from appliance.rpc.server import HttpRequest, NoAnswerError
 from appliance.rpc.source_queues import first_for
 from tests.support.http_server import WAIT, Client, Server, Shares, post, serving, until
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 async def test_requests_on_one_connection(client: Client) -> None:

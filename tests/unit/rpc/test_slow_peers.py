@@ -22,7 +22,7 @@ from tests.support.http_server import (
     until,
 )
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 @pytest.mark.parametrize(

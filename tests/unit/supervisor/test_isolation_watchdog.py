@@ -114,6 +114,7 @@ async def test_a_master_side_port_that_cannot_be_closed_is_reported(
     assert news[-1] == told[-1]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "broken", [OSError(errno.EMFILE, "too many open files"), ValueError("no JSON"), KeyError("chain")]
 )
@@ -143,6 +144,7 @@ def test_tunnels_that_cannot_be_opened_are_answered(surroundings: Surroundings) 
     assert "no process can be made" in str(answer.reason)
 
 
+@pytest.mark.nightly
 async def test_probes_are_repeated(surroundings: Surroundings) -> None:
     """While the appliance runs, the enclosure is probed repeatedly, also after a finding."""
     told: list[Message] = []
@@ -172,6 +174,7 @@ def test_without_isolation_there_is_no_address_for_hosts(surroundings: Surroundi
     )
 
 
+@pytest.mark.nightly
 async def test_a_crowd_of_new_hosts_costs_a_few_threads(
     surroundings: Surroundings, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -57,6 +57,7 @@ def test_coverage_lists_what_never_happened(drive: str) -> None:
     assert {(row["kind"], row["what"]): row["count"] > 0 for row in rows}["event", "shot"]
 
 
+@pytest.mark.nightly
 def test_a_type_with_several_definitions_is_rejected(tmp_path: Path) -> None:
     """Messages read by another definition would give wrong conditions."""
     bags = [tmp_path / "a.bag", tmp_path / "b.bag"]

@@ -54,6 +54,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
     yield Place(tmp_path)
 
 
+@pytest.mark.nightly
 def test_a_valid_setup_passes(place: Place) -> None:
     """The exit status is 0 and every check has a result; as root the kernel test ran and left nothing changed."""
     need_root()
@@ -90,6 +91,7 @@ def test_a_certificate_that_has_ended_fails(place: Place) -> None:
     assert found["certificate"]["advice"]
 
 
+@pytest.mark.nightly
 def test_a_certificate_near_its_end_is_a_warning(place: Place) -> None:
     """The warning has the remaining days; the exit status is 0."""
     certificate(place.state, days=5)

@@ -403,6 +403,7 @@ async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
     assert site.arrived.count("getParam /arm") == 7
 
 
+@pytest.mark.nightly
 async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
