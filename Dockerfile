@@ -150,6 +150,8 @@ COPY monitors/msg /opt/landshark/msg
 COPY examples/landshark/nodes /opt/landshark/nodes
 COPY examples/landshark/robot /opt/landshark/
 COPY --from=radar /build/radar /opt/landshark/nodes/radar
+# As above: a checkout under umask 077 is its owner's alone, and the nodes run as another user.
+RUN chmod -R go+rX /opt/landshark
 ENV LANDSHARK_MESSAGES=/opt/landshark/msg PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
     ROS_HOME=/tmp/ros
 WORKDIR /opt/landshark/nodes

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -61,6 +62,8 @@ GRANTED = (
     ("/ocu", "/landshark_control/base_velocity"),
     ("/ocu", "/landshark_control/trigger"),
 )
+# Bytes: the reserve of the audit log, 64 MiB, with some room above it, and the state of two appliances, 40 MiB each.
+_SPACE = 160 << 20
 # Packages that the demonstration's nodes and its ROS master import.
 _NODE_PACKAGES = (
     "rosmaster", "rospy", "genpy", "rosnode", "rosservice", "rostopic",
@@ -250,6 +253,12 @@ def require_everything() -> None:
         raise DemoError(
             "the demonstration creates four hosts as network namespaces, which needs root: "
             "run it with sudo, or in a container with --cap-add SYS_ADMIN --cap-add NET_ADMIN"
+        )
+    folder = tempfile.gettempdir()
+    if (free := shutil.disk_usage(folder).free) < _SPACE:
+        raise DemoError(
+            f"the demonstration needs {_SPACE >> 20} MiB in {folder}, where {free >> 20} MiB are free: free disk space "
+            "there, or set TMPDIR to another folder, such as TMPDIR=/var/tmp"
         )
     imports = f"import {', '.join(_NODE_PACKAGES)}"
     if subprocess.run([NODE_PYTHON, "-c", imports], capture_output=True, check=False).returncode:

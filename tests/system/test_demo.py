@@ -97,6 +97,19 @@ def test_demo_interrupted(number: signal.Signals, before: set[str]) -> None:
     assert present() <= before
 
 
+def test_demo_without_space(tmp_path: Path, before: set[str]) -> None:
+    """With little space for temporary files, an error names the folder before anything starts."""
+    small = f"mount -t tmpfs -o size=100m tmpfs {tmp_path} && exec {ROSRV} demo"
+    command = ["unshare", "--mount", "sh", "-c", small]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
+    )
+    assert done.returncode == 1
+    assert f"needs 160 MiB in {tmp_path}, where 100 MiB are free" in done.stderr
+    assert present() <= before
+
+
 def test_demo_without_root() -> None:
     """Without root, an error says so before anything starts."""
     command = ["/usr/bin/setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", ROSRV, "demo"]

@@ -58,10 +58,13 @@ def up(directory: Path, *more: str) -> Iterator[Process]:
         process.stop(with_signal=signal.SIGTERM)
 
 
-def refusal(directory: Path, *more: str) -> str:
-    """Return the standard error of a failing start, which must print nothing on standard output."""
+def refusal(directory: Path, *more: str, before: tuple[str, ...] = ()) -> str:
+    """Return the standard error of a failing start, which must print nothing on standard output.
+
+    `before` is a program, with its arguments, that runs the start.
+    """
     done = subprocess.run(
-        command(directory, *more),
+        [*before, *command(directory, *more)],
         env=ENVIRONMENT,
         capture_output=True,
         text=True,
@@ -135,10 +138,10 @@ def test_invalid_configuration_is_reported_before_the_start(directory: Path) -> 
 
 
 def test_an_unreachable_state_directory_is_reported(directory: Path) -> None:
-    """As root: if the children's users cannot reach their part, the message names the closed directory."""
+    """Without SYS_ADMIN: if the children's users cannot reach their part, the message names the closed directory."""
     need_root()
     directory.chmod(0o700)
-    said = refusal(directory)
+    said = refusal(directory, before=("setpriv", "--bounding-set=-sys_admin"))
     assert "cannot be used by user" in said
     assert str(directory / "state") in said
 
