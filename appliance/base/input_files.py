@@ -11,6 +11,8 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from appliance.base.owner_access import open_named
+
 LONGEST = 64 << 20
 """The default limit in bytes."""
 
@@ -26,7 +28,7 @@ _KINDS = {
 
 def open_given(path: Path) -> io.BufferedReader:
     """Open a regular file, or the pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
-    descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    descriptor = open_named(path)
     try:
         about = os.fstat(descriptor)
         kind = stat.S_IFMT(about.st_mode)
@@ -62,14 +64,33 @@ def files_below(folder: Path) -> list[Path]:
     `Path.glob` and `rglob` take a folder that may not be read for an empty one.
     """
     found: list[Path] = []
-    for place, folders, files in os.walk(folder, onerror=_raise):
-        found += [path for path in map(Path(place).joinpath, folders) if path.is_symlink()]
-        found += map(Path(place).joinpath, files)
+    for path, is_folder in entries_of(folder):
+        found += files_below(path) if is_folder else [path]
     return sorted(found)
 
 
-def _raise(error: OSError) -> None:
-    raise error
+def entries_of(folder: Path) -> list[tuple[Path, bool]]:
+    """Return the entries of a folder, sorted, and whether each is a folder; a link is not. Raises `OSError`."""
+    descriptor = open_named(folder)
+    try:
+        with os.scandir(descriptor) as entries:
+            return sorted((folder / entry.name, entry.is_dir(follow_symlinks=False)) for entry in entries)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+    finally:
+        os.close(descriptor)
+
+
+def stat_given(path: Path) -> os.stat_result:
+    """Return the status of a file or folder; a link is followed. Raises `OSError`."""
+    try:
+        return path.stat()
+    except (PermissionError, FileNotFoundError):  # as in `open_named`
+        descriptor = open_named(path)
+    try:
+        return os.fstat(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def lines_given(path: Path, longest: int) -> Iterator[bytes]:

@@ -7,6 +7,7 @@ sockets are also read; they also show whether a socket listens outside loopback.
 
 import ipaddress
 import json
+import os
 import sys
 from dataclasses import dataclass
 from enum import StrEnum
@@ -100,7 +101,9 @@ def probe_port(namespace: Namespace, port: int, uid: int = PROBE_UID) -> ProbeRe
 
 
 def _run_child(namespace: Namespace, port: int, uid: int) -> str:
-    arguments = [sys.executable, "-I", "-S", "-c", _CHILD, str(port), str(_CONNECT_SECONDS)]
+    # Other users may not reach a virtual environment; with -I and -S the interpreter itself is enough.
+    python = os.path.realpath(sys.executable)
+    arguments = [python, "-I", "-S", "-c", _CHILD, str(port), str(_CONNECT_SECONDS)]
     child = partial(namespace.popen, arguments, user=uid, group=uid, extra_groups=[], cwd="/", env={})
     try:
         status, output, errors = run_program(child, "", f"the probe of port {port}")
@@ -108,7 +111,7 @@ def _run_child(namespace: Namespace, port: int, uid: int) -> str:
         raise NetworkError(str(error)) from None
     except OSError as error:
         raise NetworkError(
-            f"the probe cannot be run as uid {uid}: {error.strerror} ({sys.executable} must be executable by "
+            f"the probe cannot be run as uid {uid}: {error.strerror} ({python} must be executable by "
             "all users, and CAP_SETUID and CAP_SETGID are needed)"
         ) from error
     if status != 0:

@@ -1,13 +1,14 @@
 """Files of specifications: the folder, their signatures, and their compiled contents."""
 
-from collections.abc import Mapping, Sequence
+import stat
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from appliance.base.input_files import files_below, read_given_text
+from appliance.base.input_files import entries_of, files_below, read_given_text, stat_given
 from appliance.channel import messages
 from appliance.signing.site_keys import UnsignedError, read_signature, signer
 from roswire.definitions import Definitions
@@ -157,15 +158,14 @@ def read_folder(folder: Path) -> Sources:
 
 
 def _read_folder(folder: Path) -> Sources:
-    if not folder.is_dir():
+    if not _is(stat.S_ISDIR, folder):
         raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
-    # `glob` would take a folder that may not be read for an empty one.
-    paths = {path.name: path for path in sorted(folder.iterdir()) if path.match("*.rv")}
+    paths = {path.name: path for path, _is_folder in entries_of(folder) if path.match("*.rv")}
     files = {name: _read(path) for name, path in paths.items()}
     definitions: dict[str, str] = {}
     own = folder / "msg"
-    for path in files_below(own) if own.is_dir() else ():
-        if path.suffix in {".msg", ".srv"} and path.is_file():
+    for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
+        if path.suffix in {".msg", ".srv"} and _is(stat.S_ISREG, path):
             package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
             if package in {folder, own}:
                 place = f"{folder}/msg/package/{path.name}"
@@ -175,6 +175,14 @@ def _read_folder(folder: Path) -> Sources:
             name = f"{package.name}/{path.name}"
             definitions[name], paths[name] = _read(path), path
     return Sources(files, definitions, signatures_of(paths))
+
+
+def _is(kind: Callable[[int], bool], path: Path) -> bool:
+    """Whether a path exists and is of this kind. Raises `OSError` if that is unknown."""
+    try:
+        return kind(stat_given(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
 
 
 def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
@@ -226,12 +234,14 @@ class SpecificationFolder:
 def _stamps(folder: Path) -> list[_Stamp] | None:
     """Return stamps that change when a file changes; None if the folder cannot be read."""
     try:
-        paths = [folder, *folder.glob("*.rv*"), *(folder / "msg").rglob("*")]
-        return sorted(_stamp(path) for path in paths)
+        own = folder / "msg"
+        found = [path for path, _is_folder in entries_of(folder) if path.match("*.rv*")]
+        found += files_below(own) if _is(stat.S_ISDIR, own) else []
+        return sorted(_stamp(path) for path in [folder, *found])
     except OSError:
         return None
 
 
 def _stamp(path: Path) -> _Stamp:
-    about = path.stat()
+    about = stat_given(path)
     return str(path), about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns

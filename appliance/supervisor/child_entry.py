@@ -18,10 +18,13 @@ import msgspec
 import setproctitle
 
 import appliance
+from appliance.base.owner_access import FileLender
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Failed, Lifeline, Walled
 from appliance.supervisor import privileges
-from appliance.supervisor.sandbox import landlock, seccomp
+from appliance.supervisor.input_lender import Borrower
+from appliance.supervisor.sandbox import landlock, private_view, seccomp
+from appliance.supervisor.sandbox.private_view import PrivateView
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
 from appliance.supervisor.users import Account
 
@@ -38,6 +41,8 @@ class LaunchPlan(msgspec.Struct, frozen=True):
     network: bool
     files: int
     sandbox: SandboxPlan
+    lender: int | None = None
+    view: PrivateView | None = None
     entry: str | None = None
     index: int | None = None
     path: str | None = None
@@ -72,7 +77,7 @@ def main() -> None:
             _call(role, plan, secret)
     except ImportError as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}; {_INCOMPLETE}")
-    except (OSError, UnreachableError, seccomp.SeccompError) as error:
+    except (OSError, UnreachableError, private_view.ViewError, seccomp.SeccompError) as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
 
@@ -82,6 +87,8 @@ def _prepare(plan: LaunchPlan) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
     privileges.raise_oom_score(plan.ended_early)
+    if plan.view is not None:
+        private_view.enter(plan.view, plan.account)
     if not plan.network:
         _leave_network_if_allowed()
     privileges.drop_privileges(plan.account, parent=plan.parent, capabilities=plan.capabilities)
@@ -141,6 +148,9 @@ def _call(role: str, plan: LaunchPlan, secret: int | None) -> None:
     configure_logs(role)
     entry = pkgutil.resolve_name(plan.entry)  # a child imports only the modules of its role
     gc.freeze()  # imported modules live as long as the process, so the collector can skip them
+    if plan.lender is not None:
+        os.set_inheritable(plan.lender, False)
+        FileLender.install(Borrower(socket.socket(fileno=plan.lender)).open)
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)

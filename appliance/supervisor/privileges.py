@@ -69,7 +69,7 @@ def raise_oom_score(score: int) -> None:
 
 def leave_network() -> None:
     """Move this process into an empty network namespace. Raises `OSError`."""
-    _call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
+    libc_call("unshare(CLONE_NEWNET)", _CLONE_NEWNET)
 
 
 # The supervisor needs each capability for the use in its comment, and drops all others before it starts any process.
@@ -98,10 +98,10 @@ def drop_unused_capabilities() -> None:
     _empty_bounding_set(but=kept)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; again for capabilities from 32
-    _call("capget", header, sets)
+    libc_call("capget", header, sets)
     for index, word in ((0, kept), (1, kept), (2, 0), (3, kept >> 32), (4, kept >> 32), (5, 0)):
         sets[index] &= word & 0xFFFFFFFF
-    _call("capset", header, sets)
+    libc_call("capset", header, sets)
 
 
 def drop_privileges(account: Account, *, parent: int, capabilities: Sequence[str] = ()) -> None:
@@ -139,7 +139,7 @@ def _reduce_capabilities(kept: int) -> None:
     prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     low, high = kept & 0xFFFFFFFF, kept >> 32
-    _call("capset", header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high))
+    libc_call("capset", header, (ctypes.c_uint32 * 6)(low, low, low, high, high, high))
     for capability in SUPERVISOR_CAPABILITIES.values():
         if kept >> capability & 1:
             prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_RAISE, capability)
@@ -147,10 +147,11 @@ def _reduce_capabilities(kept: int) -> None:
 
 def prctl(option: int, first: int, second: int = 0) -> None:
     """Call `prctl(2)`. Raises `OSError`."""
-    _call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
+    libc_call(f"prctl({option})", ctypes.c_int(option), *map(ctypes.c_ulong, (first, second, 0, 0)))
 
 
-def _call(what: str, *arguments: Any) -> None:
+def libc_call(what: str, *arguments: Any) -> None:
+    """Call the function of the C library with which `what` begins. Raises `OSError`."""
     function = ctypes.CDLL(None, use_errno=True)[what.partition("(")[0]]
     if function(*arguments) != 0:
         number = ctypes.get_errno()

@@ -77,7 +77,7 @@ class ProcessHandle:
         self._process = subprocess.Popen(
             # -s: load no code from the process's home, which is its part of the state directory
             [
-                sys.executable,
+                str(Path(sys.executable).parent.resolve() / Path(sys.executable).name),
                 "-P",
                 "-s",
                 "-m",
@@ -88,7 +88,7 @@ class ProcessHandle:
             stdin=subprocess.DEVNULL,
             cwd="/",
             env=_environment(plan.home),
-            pass_fds=(plan.lifeline,),
+            pass_fds=(plan.lifeline, *([plan.lender] if plan.lender is not None else [])),
             start_new_session=True,
         )
         self.pid = self._process.pid
@@ -212,7 +212,7 @@ def _environment(home: str) -> dict[str, str]:
         "HOME": home,
         "TMPDIR": home,  # SQLite needs it, because no other folder is writable
         "PATH": _PROGRAM_PATH,
-        "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
+        "PYTHONPATH": str(Path(appliance.__file__).resolve().parent.parent),
         "PYDANTIC_DISABLE_PLUGINS": "__all__",  # pydantic would search all installed packages for plugins
     }
 

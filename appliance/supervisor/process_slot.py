@@ -76,13 +76,15 @@ class ProcessSlot:
             return min(2.0 ** (self.short_runs - FAILING_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_runs - 1, 0), len(_BACKOFF) - 1)]
 
-    def plan(self, facts: Facts, lifeline: int) -> LaunchPlan:
-        """Return the plan of the next start; `lifeline` is the child's end."""
+    def plan(self, facts: Facts, lifeline: int, lender: int | None) -> LaunchPlan:
+        """Return the plan of the next start; `lifeline` and `lender` are the child's ends."""
         role = self.role
         home = str(facts.part(role.part))
         plan = LaunchPlan(
             parent=os.getpid(),
             lifeline=lifeline,
+            lender=lender,
+            view=facts.view,
             account=account_of(role.user, group=role.group),
             home=home,
             network=role.network,

@@ -15,6 +15,7 @@ from appliance.standby.membership import LEASE_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
 from appliance.supervisor.sandbox.folders import executables_of, folders_of
+from appliance.supervisor.sandbox.private_view import PrivateView
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, SandboxPlan
 
 ROSMASTER = Path("/usr/bin/rosmaster")
@@ -39,6 +40,7 @@ class Facts:
     syslog_port: int | None = None  # the TCP port of the audit log's receiver
     fleet_reads: tuple[Path, ...] = ()
     collector_port: int | None = None
+    view: PrivateView | None = None
 
     def part(self, name: str) -> Path:
         """Return the part of the state directory with this name."""
@@ -73,11 +75,12 @@ class Role:
     Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to. `files` is the
     limit on open files. `readable_by` is the user whose group may enter `part` and read its group-readable files.
     `group` is the user whose group replaces the role's own, so the role can read files that are `readable_by` that
-    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that the
-    role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry` is its
-    descriptor or None. `sandbox` has the permitted system calls, and the files and ports besides the role's part and
-    the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel kills a higher one earlier if memory
-    is short.
+    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that
+    the role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry`
+    is its descriptor or None. `inputs` are files and folders of the operator, which the supervisor opens for the
+    role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
+    besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
+    kills a higher one earlier if memory is short.
     """
 
     name: str
@@ -102,6 +105,7 @@ class Role:
     capabilities: tuple[str, ...] = ()
     group: str | None = None
     secret: Callable[[Facts], Path | None] | None = None
+    inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
     ended_early: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
 
@@ -164,7 +168,7 @@ ROLES = (
         links=(
             "relay", "signer", "compiler", "api", "charon", "syslog", "fleet", "recorder", "lease", "bundles",
         ),
-        readable_by="rosrv-api",
+        readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, families=ROUTES, reads=(*folders_of(*facts.control_reads), str(DPKG)), binds=None,
             connects=None,

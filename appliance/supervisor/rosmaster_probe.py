@@ -4,12 +4,10 @@ Any answer counts. The firewall accepts only sockets of control's user, so the s
 """
 
 import asyncio
-import ctypes
-import os
 import socket
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 
+from appliance.base.owner_access import acting_as
 from appliance.supervisor.users import Account
 
 _BODY = (
@@ -28,7 +26,8 @@ async def answers(port: int, account: Account, inside: AbstractContextManager[No
     `inside` enters rosmaster's network namespace while the socket is made.
     """
     loop = asyncio.get_running_loop()
-    with inside, _as_user(account):
+    # The firewall matches a socket's owner by fsuid.
+    with inside, acting_as(account.uid):
         sock = socket.socket()
     with sock, suppress(OSError, TimeoutError):
         sock.setblocking(False)
@@ -37,18 +36,3 @@ async def answers(port: int, account: Account, inside: AbstractContextManager[No
             await loop.sock_sendall(sock, _REQUEST)
             return await loop.sock_recv(sock, 1) != b""
     return False
-
-
-@contextmanager
-def _as_user(account: Account) -> Iterator[None]:
-    # The firewall matches a socket's owner by fsuid, which is set for this thread alone. seteuid would also
-    # take root from the threads that change the firewall.
-    if os.geteuid() != 0:
-        yield
-        return
-    setfsuid = ctypes.CDLL(None).setfsuid
-    setfsuid(account.uid)
-    try:
-        yield
-    finally:
-        setfsuid(0)

@@ -16,6 +16,7 @@ from appliance.configuration.settings import Settings, Unasked
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import StandbyAccess
 from appliance.network.firewall.iptables import load_modules
+from appliance.network.namespaces import has_privileges
 from appliance.standby.membership import Membership
 from appliance.supervisor import signals
 from appliance.supervisor.errors import StartError
@@ -26,6 +27,12 @@ from appliance.supervisor.privileges import drop_unused_capabilities, raise_file
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.rings import RecorderRings
 from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.sandbox.private_view import (
+    PrivateView,
+    program_folders,
+    require_view,
+    view_of,
+)
 from appliance.supervisor.service_manager import ServiceManager
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
@@ -106,6 +113,7 @@ def _run(
             own_node=_ports_of_rosout(settings, node_ports),
             standby=_standby_access(standby.membership) if standby is not None else None,
         )
+        view = require_view(view_of(program_folders(), state.path), may_mount=has_privileges())
         isolation = isolation_for(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
         state.write_config(json.dumps(plain(settings)))
@@ -120,6 +128,7 @@ def _run(
                 state,
                 isolation,
                 ready,
+                view=view,
                 manager=manager,
                 rosout_ports=ports.own_node,
                 stands_by=standby.announce if standby is not None else None,
@@ -216,6 +225,7 @@ def _supervise(
     isolation: NoIsolation,
     ready: Callable[[ControlReady, Settings], None],
     *,
+    view: PrivateView | None,
     manager: ServiceManager,
     rosout_ports: range,
     stands_by: Callable[[], None] | None,
@@ -252,6 +262,7 @@ def _supervise(
                 if settings.fleet.collector is not None
                 else None,
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
+                view=view,
             ),
             admin=state.open_admin_socket(),
             ready=say_ready,

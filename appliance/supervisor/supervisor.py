@@ -32,6 +32,7 @@ from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.inherited_listeners import InheritedListeners, ListenerRejectedError
+from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
 from appliance.supervisor.lease_watch import LeaseWatch
@@ -238,9 +239,10 @@ class Supervisor:
         if self.stopping.is_set() or not self._may_start(slot):
             return
         here, there = socket.socketpair()
+        lender = lend_inputs(slot.role.inputs(self._facts))
         try:
             with self._watchdog.isolation.inside():
-                plan = slot.plan(self._facts, there.fileno())
+                plan = slot.plan(self._facts, there.fileno(), lender.fileno() if lender is not None else None)
                 slot.process = ProcessHandle(slot.role.name, slot.index, plan, here, self._reports)
         except OSError as error:
             here.close()
@@ -250,6 +252,8 @@ class Supervisor:
             return
         finally:
             there.close()
+            if lender is not None:
+                lender.close()
         slot.starts += 1
         log.info("process started", role=slot.role.name, pid=slot.process.pid, restarts=slot.starts - 1)
         if slot.role.name == "control":

@@ -13,7 +13,8 @@ def make_unreadable(folder: Path, patch: pytest.MonkeyPatch) -> None:
 
     def refusing(listed: Any) -> Any:
         def list_folder(path: Any = ".") -> Any:
-            if Path(os.fsdecode(path)) == folder:
+            listed_folder = Path(f"/proc/self/fd/{path}").readlink() if isinstance(path, int) else path
+            if Path(os.fsdecode(listed_folder)) == folder:
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
             return listed(path)
 

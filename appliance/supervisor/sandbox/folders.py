@@ -14,7 +14,12 @@ _LOADERS = (("/lib", "ld-linux-*"), ("/lib64", "ld-linux-*"))
 
 def with_system_files(sandbox: SandboxPlan, home: str, run: str) -> SandboxPlan:
     """Permit reading the system, Python, our code and `run` (the resolved configuration), and writing `home`."""
-    code = {sys.prefix, sys.base_prefix, str(Path(appliance.__file__).parent.parent)}
+    # The paths by which `process_handle` starts the process; a private view has no other.
+    code = {
+        str(Path(sys.prefix).resolve()),
+        sys.base_prefix,
+        str(Path(appliance.__file__).resolve().parent.parent),
+    }
     return replace(
         sandbox,
         reads=(*sandbox.reads, *_SYSTEM, str(_RESOLVER.resolve().parent), *code, run),

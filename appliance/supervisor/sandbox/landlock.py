@@ -5,7 +5,6 @@ from version 6 (6.12). Limits that the kernel lacks are reported.
 """
 
 import contextlib
-import ctypes
 import os
 import stat
 import struct
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from appliance.supervisor.privileges import prctl
 from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
+from appliance.supervisor.sandbox.system_calls import system_call
 
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls; the same on all architectures
 _ASK_VERSION = 1
@@ -35,7 +35,7 @@ class LandlockError(Exception):
 
 def version() -> int:
     """Return the ABI of the kernel's Landlock; 0 without it, or if it is disabled."""
-    return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION)[0], 0)
+    return max(system_call(_CREATE_RULESET, None, 0, _ASK_VERSION)[0], 0)
 
 
 def lacking(abi: int) -> list[str]:
@@ -65,9 +65,11 @@ def restrict(sandbox: SandboxPlan) -> int:
         _grant_files(ruleset, sandbox, every)
         for right, granted in ((_BIND, sandbox.binds), (_CONNECT, sandbox.connects)):
             for port in granted or () if ports & right else ():
-                _require(_call(_ADD_RULE, ruleset, _PORT, struct.pack("=QQ", right, port), 0), f"port {port}")
+                _require(
+                    system_call(_ADD_RULE, ruleset, _PORT, struct.pack("=QQ", right, port), 0), f"port {port}"
+                )
         prctl(_PR_SET_NO_NEW_PRIVS, 1)
-        _require(_call(_RESTRICT_SELF, ruleset, 0), "this process")
+        _require(system_call(_RESTRICT_SELF, ruleset, 0), "this process")
     finally:
         os.close(ruleset)
     return abi
@@ -83,7 +85,7 @@ def _rights_of_files(abi: int) -> int:
 def _ruleset(abi: int, files: int, ports: int) -> int:
     attributes = struct.pack("=QQQ", files, ports, _SCOPES)
     size = 24 if abi >= SIGNALS else 16 if abi >= PORTS else 8
-    return _require(_call(_CREATE_RULESET, attributes[:size], size, 0), "a ruleset")
+    return _require(system_call(_CREATE_RULESET, attributes[:size], size, 0), "a ruleset")
 
 
 def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
@@ -98,7 +100,7 @@ def _grant_files(ruleset: int, sandbox: SandboxPlan, every: int) -> None:
             granted = rights if folder else rights & _OF_FILES
             # struct landlock_path_beneath_attr is packed
             rule = struct.pack("=Qi", granted, descriptor)
-            _require(_call(_ADD_RULE, ruleset, _BENEATH, rule, 0), path)
+            _require(system_call(_ADD_RULE, ruleset, _BENEATH, rule, 0), path)
 
 
 def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
@@ -109,13 +111,6 @@ def _opened(paths: Iterable[str]) -> Iterator[tuple[str, int]]:
                 yield path, descriptor
             finally:
                 os.close(descriptor)
-
-
-def _call(number: int, *arguments: int | bytes | None) -> tuple[int, int]:
-    libc = ctypes.CDLL(None, use_errno=True)
-    given = [ctypes.c_long(argument) if isinstance(argument, int) else argument for argument in arguments]
-    result: int = libc.syscall(ctypes.c_long(number), *given)
-    return result, ctypes.get_errno()
 
 
 def _require(outcome: tuple[int, int], what: str) -> int:

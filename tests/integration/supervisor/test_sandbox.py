@@ -139,7 +139,7 @@ class Place:
             syslog_port=self.ports[0],
             collector_port=self.ports[0],
         )
-        plan = ProcessSlot(role, 0).plan(facts, there.fileno())
+        plan = ProcessSlot(role, 0).plan(facts, there.fileno(), None)
         sandbox = replace(plan.sandbox, reads=(*plan.sandbox.reads, str(ROOT)))
         plan = msgspec.structs.replace(plan, sandbox=sandbox, argv=(), entry=entry, secret=None)
         with here, there:

@@ -62,7 +62,7 @@ def test_a_process_that_ran_long_is_restarted_at_once(slot: ProcessSlot) -> None
 def test_a_plan_has_the_number_of_an_indexed_role_only(slot: ProcessSlot) -> None:
     """Only a process of an indexed role receives its index."""
     facts = Facts(state=Path("/state"), config=Path("/state/run/config.json"), rosmaster_port=1)
-    assert slot.plan(facts, 3).index == 1
+    assert slot.plan(facts, 3, None).index == 1
     alone = ProcessSlot(Role(name="signer", user="rosrv-signer", part="signer", entry="m:f"), 0)
-    assert alone.plan(facts, 3).index is None
-    assert alone.plan(facts, 3).home == "/state/signer"
+    assert alone.plan(facts, 3, None).index is None
+    assert alone.plan(facts, 3, None).home == "/state/signer"

@@ -1,0 +1,115 @@
+"""Open a file that an operator names where only its owner may reach it: in a home of mode 0700, or under umask 077.
+
+1. A process first uses its own rights.
+2. Root then acts as the owner of the folder, and after that as the owner of the file. In a container, root lacks
+   CAP_DAC_OVERRIDE, so permissions also stop root. The rights of the folder's owner also decide about symbolic links:
+   users cannot have root open another user's file by a link in their own folder. As the owner of the file, root follows
+   no link.
+3. A role of the appliance asks the supervisor, which opens only the files of the role's row in the table
+   (`supervisor/input_lender.py`).
+"""
+
+import contextlib
+import ctypes
+import os
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import ClassVar
+
+OPENING = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+"""The flags with which a named file is opened: a pipe or a device does not block the caller."""
+
+_PASSING = os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC
+
+
+class FileLender:
+    """The supervisor, as a role sees it: `open` returns an open file, or None if the role may not ask for it."""
+
+    # A setting of the process, as its user is: each reader of a named file would otherwise have to pass it on.
+    open: ClassVar[Callable[[Path], int | None]] = lambda _path: None
+
+    @classmethod
+    def install(cls, opened: Callable[[Path], int | None]) -> None:
+        """Open files by this function from now on if the process has no right to."""
+        cls.open = opened
+
+
+def open_named(path: Path) -> int:
+    """Return a descriptor of a file or folder that an operator names. Raises `OSError`."""
+    try:
+        return os.open(path, OPENING)
+    except PermissionError:
+        lent = open_as_owner(path) if os.geteuid() == 0 else FileLender.open(path)
+        if lent is None:
+            raise
+    except FileNotFoundError:  # perhaps only in a role's private view
+        if (lent := FileLender.open(path)) is None:
+            raise
+    return lent
+
+
+def open_as_owner(path: Path) -> int:
+    """Open a file or folder with the rights of its folder's owner, or of its own. Raises `OSError`."""
+    return _open_in(_folder(path.absolute().parent), path.name, path)
+
+
+def open_below(folder: Path, path: Path) -> int:
+    """Open a path below a folder as `open_as_owner` does; no folder in between may be a link. Raises `OSError`."""
+    place = _folder(folder)
+    for name in path.relative_to(folder).parent.parts:
+        place = _next(place, name, os.O_NOFOLLOW)
+    return _open_in(place, path.name, path)
+
+
+@contextlib.contextmanager
+def acting_as(uid: int) -> Iterator[None]:
+    """Let this thread, and no other, use files and make sockets as another user; without root, change nothing."""
+    # seteuid would also take root from the other threads.
+    if os.geteuid() != 0 or uid == 0:
+        yield
+        return
+    setfsuid = ctypes.CDLL(None).setfsuid
+    setfsuid(uid)
+    try:
+        if setfsuid(-1) != uid:  # setfsuid reports no error; -1 only queries
+            raise PermissionError(f"cannot act as user id {uid}: CAP_SETUID is missing")
+        yield
+    finally:
+        setfsuid(0)
+
+
+def _folder(path: Path) -> int:
+    """Return a descriptor to pass through a folder, with the rights of the owners of the folders above it."""
+    try:
+        return os.open(path, _PASSING)
+    except PermissionError:
+        if path.parent == path:
+            raise
+    return _next(_folder(path.parent), path.name)
+
+
+def _next(place: int, name: str, flags: int = 0) -> int:
+    try:
+        with acting_as(os.fstat(place).st_uid):
+            return os.open(name, _PASSING | flags, dir_fd=place)
+    finally:
+        os.close(place)
+
+
+def _open_in(place: int, name: str, path: Path) -> int:
+    try:
+        with acting_as(os.fstat(place).st_uid):
+            try:
+                return os.open(name, OPENING, dir_fd=place)
+            except PermissionError:
+                about = os.stat(name, dir_fd=place, follow_symlinks=False)
+                if stat.S_ISLNK(about.st_mode):
+                    raise
+        with acting_as(about.st_uid):
+            return os.open(name, OPENING | os.O_NOFOLLOW, dir_fd=place)
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    finally:
+        os.close(place)

@@ -1,0 +1,81 @@
+"""Open the operator's files for a role whose user may not reach them.
+
+The policy may be in a home of mode 0700, and an operator expects `rosrv up` to read it there as `rosrv policy check`
+does. The role gets open files, so no file is copied, and a reload reads the present text.
+
+1. Only a path that the role's row lists is opened: a file of it with its signature and test cases, or a folder with
+   everything below it. A role that was taken over gets nothing else.
+2. A thread answers, because a file system may block; it ends with the role.
+"""
+
+import contextlib
+import errno
+import os
+import socket
+import threading
+from collections.abc import Collection
+from pathlib import Path
+
+from appliance.base.owner_access import open_as_owner, open_below
+
+_LONGEST_PATH = 4096
+_ERROR_BYTES = 4  # an answer: an error number, or 0 and a descriptor
+_NOT_AN_INPUT = (1 << 32) - 1
+_BESIDE = ("", ".sig", ".tests.yaml")
+
+
+class Borrower:
+    """A role's end of the link."""
+
+    def __init__(self, link: socket.socket) -> None:
+        self._link = link
+        self._asking = threading.Lock()
+
+    def open(self, path: Path) -> int | None:
+        """Return a descriptor of a file or folder; None if it is not an input of the role. Raises `OSError`."""
+        with self._asking:
+            self._link.send(os.fsencode(path))
+            answer, descriptors, _flags, _address = socket.recv_fds(self._link, _ERROR_BYTES, 1)
+        for descriptor in descriptors:
+            os.set_inheritable(descriptor, False)
+            return descriptor
+        number = int.from_bytes(answer)
+        if number == _NOT_AN_INPUT:
+            return None
+        raise OSError(number, os.strerror(number), str(path))
+
+
+def lend_inputs(inputs: Collection[Path]) -> socket.socket | None:
+    """Return the role's end of a link over which it gets these files; None if it has the supervisor's rights anyway."""
+    if not inputs or os.geteuid() != 0:
+        return None
+    here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    threading.Thread(target=_serve, args=(here, tuple(inputs)), name="input lender", daemon=True).start()
+    return there
+
+
+def _serve(link: socket.socket, inputs: tuple[Path, ...]) -> None:
+    with link, contextlib.suppress(OSError):  # the role has ended
+        while wanted := link.recv(_LONGEST_PATH):
+            try:
+                descriptor = open_input(Path(os.fsdecode(wanted)), inputs)
+            except OSError as error:
+                link.send((error.errno or errno.EACCES).to_bytes(_ERROR_BYTES))
+                continue
+            if descriptor is None:
+                link.send(_NOT_AN_INPUT.to_bytes(_ERROR_BYTES))
+                continue
+            try:
+                socket.send_fds(link, [bytes(_ERROR_BYTES)], [descriptor])
+            finally:
+                os.close(descriptor)
+
+
+def open_input(path: Path, inputs: Collection[Path]) -> int | None:
+    """Open one of the inputs, a file beside it, or a file below it; return None for others. Raises `OSError`."""
+    for given in inputs:
+        if any(path == given.with_name(given.name + suffix) for suffix in _BESIDE):
+            return open_as_owner(path)
+        if path.is_relative_to(given) and ".." not in path.parts[len(given.parts) :]:
+            return open_below(given, path)
+    return None

@@ -1,0 +1,97 @@
+"""Tests of `appliance.supervisor.input_lender` and `base.owner_access`: files that only their owner may reach."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from appliance.supervisor.input_lender import Borrower, lend_inputs
+from tests.support.requirements import need_root
+
+USER: Final = 61099
+_READ = """
+import sys
+from pathlib import Path
+from appliance.base.input_files import read_given_text
+from appliance.specifications.specification_files import read_folder
+print(read_given_text(Path(sys.argv[1])), read_folder(Path(sys.argv[2])).named())
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """Return the home of a user, of mode 0700, with a policy, a folder of specifications, and another file."""
+    need_root()
+    (tmp_path / "monitors/msg/p").mkdir(parents=True)
+    for name in ("robot.ini", "robot.ini.sig", "monitors/m.rv", "monitors/msg/p/T.msg", ".ssh_key"):
+        (tmp_path / name).write_text(name)
+    for path in (tmp_path, *tmp_path.rglob("*")):
+        os.chown(path, USER, USER)
+        path.chmod(0o700 if path.is_dir() else 0o600)
+    return tmp_path
+
+
+@pytest.fixture
+def borrower(home: Path) -> Iterator[Borrower]:
+    """Return a role's end of the link, for the policy and the specifications."""
+    link = lend_inputs((home / "robot.ini", home / "monitors"))
+    assert link is not None
+    with link:
+        yield Borrower(link)
+
+
+def text(descriptor: int | None) -> str:
+    """Return the text of an open file, and close it."""
+    assert descriptor is not None
+    with os.fdopen(descriptor, encoding="utf-8") as file:
+        return file.read()
+
+
+def test_a_role_gets_its_inputs(home: Path, borrower: Borrower) -> None:
+    """A role gets its files, those beside a file, and those below a folder, as they are at the time of the request."""
+    for name in ("robot.ini", "robot.ini.sig", "monitors/m.rv", "monitors/msg/p/T.msg"):
+        assert text(borrower.open(home / name)) == name
+    replaced = home / "new"
+    replaced.write_text("edited")
+    replaced.rename(home / "robot.ini")
+    assert text(borrower.open(home / "robot.ini")) == "edited"
+    with pytest.raises(FileNotFoundError):
+        borrower.open(home / "robot.ini.tests.yaml")
+
+
+def test_a_role_gets_nothing_else(home: Path, borrower: Borrower) -> None:
+    """Other files of the home are not lent, by whatever path; nor is the content of a folder that is only passed."""
+    for path in (home / ".ssh_key", home / "monitors/../.ssh_key", home, Path("/etc/shadow")):
+        assert borrower.open(path) is None
+
+
+def test_a_link_cannot_lend_the_files_of_another_user(
+    home: Path, borrower: Borrower, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """The owner of the folder decides what its links reach: root does not follow them with its own rights."""
+    secret = tmp_path_factory.mktemp("other") / "secret"
+    secret.write_text("secret")
+    secret.chmod(0o600)
+    secret.parent.chmod(0o700)
+    (home / "monitors/x.rv").symlink_to(secret)
+    (home / "monitors/msg/q").symlink_to(secret.parent)
+    with pytest.raises(PermissionError):
+        borrower.open(home / "monitors/x.rv")
+    with pytest.raises(NotADirectoryError):
+        borrower.open(home / "monitors/msg/q/secret")
+
+
+def test_root_of_a_container_reads_the_files_of_an_owner(home: Path) -> None:
+    """Without CAP_DAC_OVERRIDE, as in compose.yaml, root reads a checkout that umask 077 closed."""
+    rights = "--bounding-set=-dac_override,-dac_read_search"
+    files = [str(home / "robot.ini"), str(home / "monitors")]
+    home.parent.chmod(0o711)
+    plain = subprocess.run(["setpriv", rights, "cat", files[0]], capture_output=True, text=True, check=False)
+    assert "Permission denied" in plain.stderr
+    command = ["setpriv", rights, sys.executable, "-c", _READ, *files]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == "robot.ini {'m.rv': 'monitors/m.rv', 'msg/p/T.msg': 'monitors/msg/p/T.msg'}\n"
