@@ -1,13 +1,9 @@
 """Rules for imports between modules."""
 
-import ast
 from graphlib import TopologicalSorter
-from pathlib import Path
 
 import grimp
 import pytest
-
-import rosmop
 
 _MOST_IMPORTS = 25
 
@@ -52,20 +48,6 @@ def test_the_appliance_imports_only_public_modules_of_the_language(imports: dict
     assert all(
         module.startswith("appliance.cli.") for module, imported in found if imported.startswith("tool")
     )
-
-
-def test_the_tests_of_the_language_import_only_the_language() -> None:
-    """The tests run without the appliance: they import rosmop, roswire and libraries."""
-    folder = Path(rosmop.__file__).parent / "tests"
-    files = list(folder.rglob("*.py"))
-    assert files
-    wrong = [
-        f"{file.relative_to(folder)}: {node.module}"
-        for file in files
-        for node in ast.walk(ast.parse(file.read_text()))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in {"appliance", "tests"}
-    ]
-    assert not wrong
 
 
 def test_no_module_imports_too_many(imports: dict[str, set[str]]) -> None:

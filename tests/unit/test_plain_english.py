@@ -1,22 +1,24 @@
 """Pages, docstrings and comments are written in plain English: one word for one thing, and none of the habits below.
 
-`ROOTS` lists the files that are checked: pages as a whole, Python files by their docstrings, comments and names of
+Pages are checked as a whole; `test_source_rules.py` checks Python files by their docstrings, comments and names of
 tests. Code, quoted output and generated pages are left out.
 """
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ROOTS = (
-    "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "appliance", "rosmop", "roswire", "examples",
-    "benchmarks", "distribution", "fleet", "tests",
+PAGES = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
+FOLDERS = (
+    "appliance/", "rosmop/", "rosmop/tests/", "roswire/", "examples/", "benchmarks/", "distribution/", "fleet/",
+    "tests/",
 )  # fmt: skip
+"""The folders whose Python files and pages are checked."""
 GENERATED = ("metrics.md", "audit-events.md")
 STRING_OR_COMMENT = re.compile(
     r'''"""(?:\\.|[^\\])*?"""|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[#][^\n]*''',
@@ -84,41 +86,29 @@ HABITS = (
     Habit(r"\bhe\b|\bhis\b|\bhim\b", "they, the host, the process", "An operator signs his order."),
 )
 
-
-def files() -> Iterator[Path]:
-    """Yield every checked file."""
-    for name in ROOTS:
-        path = ROOT / name
-        found = sorted([*path.rglob("*.md"), *path.rglob("*.py")]) if path.is_dir() else [path]
-        yield from (file for file in found if file.name not in GENERATED)
+CODE = re.compile(r"```.*?```|<!--.*?-->|`[^`\n]*`|\]\([^)]*\)", re.DOTALL)
+_ANY = re.compile("|".join(f"(?:{habit.pattern})" for habit in HABITS), re.MULTILINE)
 
 
-def prose(path: Path) -> str:
-    """Return the text of a file with everything else replaced by blanks; lines keep their numbers."""
-    text = path.read_text()
-    if path.suffix == ".py":
-        return _without_code(_said_in(text))
-    return _without_code(re.sub(r"^ {4,}\S.*$", "", text, flags=re.MULTILINE))
+def bad_habits(prose: str) -> Iterator[tuple[int, str]]:
+    """Yield the line of each bad habit, with the words to write instead."""
+    prose = CODE.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), prose)
+    if _ANY.search(prose):
+        for habit in HABITS:
+            for hit in re.finditer(habit.pattern, prose, re.MULTILINE):
+                yield prose.count("\n", 0, hit.start()) + 1, f"{hit[0].strip()!r}: write {habit.instead!r}"
 
 
-def _without_code(text: str) -> str:
-    code = r"```.*?```|<!--.*?-->|`[^`\n]*`|\]\([^)]*\)"
-    return re.sub(code, lambda found: re.sub(r"[^\n]", " ", found[0]), text, flags=re.DOTALL)
-
-
-def _said_in(source: str) -> str:
+def said_in(source: str, nodes: Sequence[ast.AST]) -> str:
     """Return the docstrings, comments and names of tests of a Python file, each on its line."""
     lines = [""] * (source.count("\n") + 2)
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and node.name.startswith("test_"):
-            lines[node.lineno] += f"{node.name.removeprefix('test_').replace('_', ' ').capitalize()}."
-        if (
-            isinstance(node, ast.Expr)
-            and isinstance(node.value, ast.Constant)
-            and isinstance(node.value.value, str)
-        ):
-            for offset, line in enumerate(node.value.value.split("\n")):
-                lines[node.lineno + offset] += line.strip()
+    for node in nodes:
+        match node:
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) if name.startswith("test_"):
+                lines[node.lineno] += f"{name.removeprefix('test_').replace('_', ' ').capitalize()}."
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                for offset, line in enumerate(text.split("\n")):
+                    lines[node.lineno + offset] += line.strip()
     number = position = 0
     for token in STRING_OR_COMMENT.finditer(source):
         if token[0][0] == "#":
@@ -128,19 +118,19 @@ def _said_in(source: str) -> str:
     return "\n".join(lines[1:])
 
 
-@pytest.mark.parametrize("page", list(files()), ids=lambda page: str(page.relative_to(ROOT)))
-def test_no_file_has_a_bad_habit(page: Path) -> None:
+def test_no_page_has_a_bad_habit() -> None:
     """Each finding has its line and the words to write instead."""
-    text = prose(page)
+    folders = [path for name in ("docs/", *FOLDERS) for path in sorted((ROOT / name).rglob("*.md"))]
     found = [
-        f"{page.name}:{text.count(chr(10), 0, hit.start()) + 1}: {hit[0].strip()!r}: write {habit.instead!r}"
-        for habit in HABITS
-        for hit in re.finditer(habit.pattern, text, re.MULTILINE)
+        f"{page.relative_to(ROOT)}:{line}: {what}"
+        for page in {ROOT / name for name in PAGES}.union(folders)
+        if page.name not in GENERATED
+        for line, what in bad_habits(re.sub(r"^ {4,}\S.*$", "", page.read_text(), flags=re.MULTILINE))
     ]
-    assert found == []
+    assert not found, "\n".join(found)
 
 
 @pytest.mark.parametrize("habit", HABITS, ids=lambda habit: habit.instead)
 def test_each_pattern_finds_its_example(habit: Habit) -> None:
     """A pattern that finds nothing would never fail."""
-    assert re.search(habit.pattern, habit.example, re.MULTILINE)
+    assert any(habit.instead in what for _line, what in bad_habits(habit.example))

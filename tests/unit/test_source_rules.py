@@ -1,0 +1,483 @@
+"""Rules on the source, in one pass over all files: each is parsed once, and every rule sees its nodes.
+
+A row of `RULES` has the folders that it applies to, the function that yields what it sees in a file, the function that
+judges this over all files, and sources that the rule must find and must not find.
+"""
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import pytest
+
+from tests.support.sources import ROOT
+from tests.unit.test_plain_english import FOLDERS, bad_habits, said_in
+
+PRODUCT = ("appliance/", "rosmop/", "roswire/")
+WITH_FLEET = (*PRODUCT, "fleet/")
+LANGUAGE_TESTS = "rosmop/tests/"
+
+
+class Source(NamedTuple):
+    """A parsed file."""
+
+    path: str
+    text: str
+    nodes: Sequence[ast.AST]
+
+
+class Seen(NamedTuple):
+    """Something that a rule saw at a place."""
+
+    path: str
+    line: int
+    what: str
+
+
+Judge = Callable[[Sequence[Seen]], Iterable[str]]
+
+
+class Rule(NamedTuple):
+    """A rule on the source."""
+
+    folders: tuple[str, ...]
+    see: Callable[[Source], Iterator[tuple[int, str]]]
+    judge: Judge
+    wrong: Sequence[str] = ()
+    right: Sequence[str] = ()
+
+
+def forbid(instead: str) -> Judge:
+    """Return a judge to whom everything that is seen is wrong."""
+    return lambda seen: [f"{one.path}:{one.line}: {one.what}: {instead}" for one in seen]
+
+
+def exactly(listed: Iterable[str], instead: str) -> Judge:
+    """Return a judge that compares what is seen with a list, in both directions."""
+    allowed = set(listed)
+
+    def judge(seen: Sequence[Seen]) -> Iterator[str]:
+        found = {one.what for one in seen}
+        yield from (
+            f"{one.path}:{one.line}: {one.what}: {instead}" for one in seen if one.what not in allowed
+        )
+        yield from (
+            f"test_source_rules.py: {one} is listed but no longer found: remove it" for one in allowed - found
+        )
+
+    return judge
+
+
+# --- text from outside, malformed data, descriptors ---
+
+
+def code_from_text(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each call that makes code of text."""
+    for node in source.nodes:
+        match node:
+            case ast.Call(func=ast.Name(id="eval" | "exec" | "compile" | "__import__" as name)):
+                yield node.lineno, f"{name}()"
+
+
+def narrow_handlers(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each error of `msgspec` that is named other than to raise it."""
+    if "MsgspecError" not in source.text and "DecodeError" not in source.text:
+        return
+    raised = {id(part) for one in source.nodes if isinstance(one, ast.Raise) for part in ast.walk(one)}
+    for node in source.nodes:
+        match node:
+            case ast.Attribute(attr="MsgspecError" | "DecodeError" as name) if id(node) not in raised:
+                yield node.lineno, name
+
+
+def closed_descriptors(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each attribute that a function closes as a descriptor but does not reset."""
+    if "os.close" not in source.text:
+        return
+    for function in source.nodes:
+        if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        inside = list(ast.walk(function))
+        reset = {
+            ast.unparse(target)
+            for node in inside
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.UnaryOp | ast.Constant)
+            for target in node.targets
+        }
+        for node in inside:
+            match node:
+                case ast.Call(
+                    func=ast.Attribute(value=ast.Name(id="os"), attr="close"), args=[ast.Attribute() as kept]
+                ) if ast.unparse(kept) not in reset:
+                    yield node.lineno, ast.unparse(kept)
+
+
+# --- names ---
+
+
+def public_classes(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each class whose name has no underscore before it."""
+    for node in source.nodes:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield node.lineno, node.name
+
+
+def once(seen: Sequence[Seen]) -> Iterator[str]:
+    """A public class name identifies one class of the appliance, the language and the collector."""
+    places = defaultdict(list)
+    for path, line, name in seen:
+        places[name].append(f"{path}:{line}")
+    for name, found in places.items():
+        if len(found) > 1:
+            yield f"{', '.join(found)}: {name} is defined {len(found)} times: rename all but one"
+
+
+BY_NAME = {"getattr", "setattr", "hasattr", "delattr", "vars", "globals", "locals"}
+FINDERS = {"import_module", "resolve_name", "attrgetter", "methodcaller"}
+NAMES = {
+    "__annotations__", "__dataclass_fields__", "__dict__", "__getattribute__", "__name__", "__qualname__", "__slots__",
+    "__struct_fields__", "__subclasses__",
+}  # fmt: skip
+_FIELDS = "the same for all fields of a node or struct"
+_IMPORTED = "imported only where it runs; a test resolves every row"
+_LIBRARY = "how the library or Python itself offers it"
+_TEXT = "a word in a text for people"
+LOOKUPS = {
+    "appliance/api/moments.py _units": "msgspec names the schemas of structs by their classes",
+    "appliance/api/operation_routes.py _add": _LIBRARY,
+    "appliance/api/routing.py add_api_route": _LIBRARY,
+    "appliance/api/routing.py components": "the schemas in the contract have the names of their structs",
+    "appliance/api/routing.py tagged": "monitors have a tag, other answers with an ETag a revision",
+    "appliance/audit/query.py conditions": "the fields of a filter have the names of the log's columns",
+    "appliance/audit/record_format.py as_object": _FIELDS,
+    "appliance/audit/search.py _neighbours": "the fields of a record have the names of the log's columns",
+    "appliance/backup/create.py _is_full": _LIBRARY,
+    "appliance/cli/connection/target.py speaking": _LIBRARY,
+    "appliance/cli/demo.py demo": "the demonstration is beside the package, and imports it",
+    "appliance/cli/lazy.py loaded": _IMPORTED,
+    "appliance/cli/selftest/probe_nodes.py call": _LIBRARY,
+    "appliance/configuration/config_sources.py _with_absolute_paths": _FIELDS,
+    "appliance/control/spare_memory.py return_spare_memory": _LIBRARY,
+    "appliance/evidence/bundle_verifier.py ": _LIBRARY,
+    "appliance/evidence/bundle_verifier.py regular": _LIBRARY,
+    "appliance/forwarding/log_forwarder.py step": _TEXT,
+    "appliance/forwarding/segment_pusher.py _failed": _TEXT,
+    "appliance/master/calls/call.py _type_name": _TEXT,
+    "appliance/relay/grant_table.py _fact": "a statement and its withdrawal have the same key",
+    "appliance/supervisor/child_entry.py _call": _IMPORTED,
+    "rosmop/batch/ray_cluster.py _reason": _TEXT,
+    "rosmop/check/reachable_types.py _plain": _FIELDS,
+    "rosmop/fast/serialization.py _made": _TEXT,
+    "rosmop/fast/serialization.py _plain": _TEXT,
+    "rosmop/fast/wasm_instance.py load": _LIBRARY,
+    "rosmop/prove/terms.py choice": _FIELDS,
+    "rosmop/run/outcomes.py __repr__": _TEXT,
+    "rosmop/text/tree.py fields_of": _FIELDS,
+    "rosmop/recordings/recording.py _text_of": _TEXT,
+}
+"""The functions that may look up names, with the reason: a misspelt name would fail late, or never."""
+
+
+def lookups(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield the innermost function of each lookup of an attribute, class or parameter by its name."""
+    if any(map(_is_lookup, source.nodes)):
+        yield from ((line, f"{source.path} {name}") for line, name in _lookups_in(source.nodes[0], ""))
+
+
+def _lookups_in(node: ast.AST, function: str) -> Iterator[tuple[int, str]]:
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        function = node.name
+    if isinstance(node, ast.expr) and _is_lookup(node):
+        yield node.lineno, function
+    for child in ast.iter_child_nodes(node):
+        # The name of a class in a message is not a lookup.
+        named = isinstance(child, ast.Attribute) and child.attr in ("__name__", "__qualname__")
+        if not (named and isinstance(node, ast.FormattedValue | ast.keyword)):
+            yield from _lookups_in(child, function)
+
+
+def _is_lookup(node: ast.AST) -> bool:
+    match node:
+        case ast.Call(func=ast.Name(id=name)):
+            return name in BY_NAME or name in FINDERS
+        case ast.Attribute(attr=name):
+            return name in NAMES or name in FINDERS
+    return False
+
+
+# --- functions that an object gets after it was made ---
+
+
+def slots(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield the attributes that begin as an empty function, and the attributes of other objects that are set."""
+    for node in source.nodes:
+        match node:
+            case ast.AnnAssign(target=target, annotation=kind, value=ast.expr() as value):
+                if _does_nothing(value) and "Callable" in ast.unparse(kind):
+                    yield from ((node.lineno, f"empty {name}") for name in _own(target))
+            case ast.Assign(targets=[ast.Attribute() as target], value=ast.Lambda() as value):
+                if _does_nothing(value):
+                    yield from ((node.lineno, f"empty {name}") for name in _own(target))
+        match node:
+            case ast.Assign(targets=targets):
+                ends = [
+                    each for one in targets for each in (one.elts if isinstance(one, ast.Tuple) else [one])
+                ]
+            case ast.AnnAssign(target=target):
+                ends = [target]
+            case _:
+                continue
+        for end in ends:
+            if isinstance(end, ast.Attribute) and not _own(end):
+                yield node.lineno, f"set {end.attr}"
+
+
+def _own(target: ast.expr) -> list[str]:
+    match target:
+        case ast.Attribute(value=ast.Name(id="self" | "cls"), attr=name) | ast.Name(id=name):
+            return [name]
+    return []
+
+
+def _does_nothing(value: ast.expr) -> bool:
+    match value:
+        case ast.Constant(value=None) | ast.Name(id="dict" | "list" | "set" | "str" | "int" | "bool"):
+            return True
+        case ast.Lambda(body=ast.Constant() | ast.Name()):
+            return True
+    return False
+
+
+def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
+    """If an empty slot that another file fills is forgotten, it silently does nothing."""
+    fillers = defaultdict(set)
+    for path, _line, what in seen:
+        if what.startswith("set "):
+            fillers[what.removeprefix("set ")].add(path)
+    for path, line, what in seen:
+        kind, name = what.split()
+        if kind == "empty" and (others := fillers[name] - {path}):
+            yield f"{path}:{line}: {name} is filled in {sorted(others)}: make it an argument of the constructor"
+
+
+# --- clocks ---
+
+WALL_CLOCK = {
+    "a moment that people are shown, or that stands in a file": [
+        "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
+        "bundles/poller.py", "control/bundle_gate.py",
+        "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
+        "control/policies.py", "control/queries.py", "control/replication.py",
+        "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
+        "forwarding/segment_pusher.py",
+        "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
+        "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
+        "relay/recorder_ring.py",
+        "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
+        "supervisor/rings.py", "supervisor/supervisor.py",
+    ],
+    "an end that is a date: of a certificate, a token, a revocation": [
+        "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "bundles/verified_bundles.py",
+        "control/passive_rest.py", "control/token_orders.py", "hosts/appliance_table.py",
+        "hosts/certification.py", "hosts/enrolment_tokens.py",
+        "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
+        "signing/own_certificate.py",
+    ],
+    "a span that goes on over restarts of the machine, which has no other clock": [
+        "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
+    ],
+    "whether the wall clock can be believed, and where it is read": [
+        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/clock_check.py",
+    ],
+    "a moment that people ask for (`--since 1h`), or a page that is shown once": [
+        "api/alarms.py", "api/moments.py", "audit/filter_options.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
+        "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
+        "cli/status_verb.py", "cli/topic_verbs.py",
+    ],
+}  # fmt: skip
+"""The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""
+DIRECT = {
+    "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
+    "appliance/standby/witness.py": "is copied to a machine without the appliance",
+    "appliance/audit/log.py": "has a thread, which `clock.using` does not reach",
+}
+"""The files that read a clock other than by `base/clock.py`."""
+_CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {
+    f"{clock}{unit}" for clock in ("monotonic", "perf_counter", "clock_gettime") for unit in ("", "_ns")
+}
+
+
+def wall_clocks(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each read of the wall clock, which may be set while a robot runs."""
+    for node in source.nodes:
+        match node:
+            case ast.ImportFrom(module="appliance.base.clock", names=names):
+                wall = any(one.name in ("wall", "wall_ns", "utc_now") for one in names)
+            case ast.Attribute(value=ast.Name(id="clock"), attr="wall" | "wall_ns" | "utc_now"):
+                wall = True
+            case ast.Attribute(value=ast.Name(id="time"), attr="time" | "time_ns"):
+                wall = True
+            case _:
+                wall = False
+        if wall:
+            yield node.lineno, source.path  # type: ignore[attr-defined]  # an import or an expression
+
+
+def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each read of a clock other than by `base/clock.py`, where a test sets all clocks."""
+    for node in source.nodes:
+        match node:
+            case ast.ImportFrom(module="time"):  # a bare `time()` does not reveal which clock is used
+                yield node.lineno, source.path
+            case ast.Attribute(value=ast.Name(id="time"), attr=name) if name in _CLOCKS:
+                yield node.lineno, source.path
+            case ast.Attribute(
+                value=ast.Name(id=of) | ast.Attribute(attr=of), attr="now" | "utcnow" | "today"
+            ) if of in ("datetime", "date"):
+                yield node.lineno, source.path
+
+
+# --- pages and prose ---
+
+
+def printed(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield all strings; an f-string has a gap for each value."""
+    for node in source.nodes:
+        match node:
+            case ast.Constant(value=str(text)):
+                yield node.lineno, text
+            case ast.JoinedStr(values=values):
+                yield (
+                    node.lineno,
+                    "\0".join(str(one.value) for one in values if isinstance(one, ast.Constant)),
+                )
+
+
+def quoted(seen: Sequence[Seen]) -> Iterator[str]:
+    """docs/troubleshooting.md quotes only messages that the program can print."""
+    page = (ROOT / "docs/troubleshooting.md").read_text()
+    cells = re.findall(r"^\| ([^|]*`[^|]*) \|", page, re.MULTILINE)
+    messages = [piece for cell in cells for piece in re.findall(r"`([^`(]+)`", cell) if " " in piece]
+    assert len(messages) > 25
+    program = "\n".join(one.what for one in seen)
+    for one in messages:
+        if one not in program:
+            yield f"docs/troubleshooting.md: {one!r} is in no string of the appliance: quote what it prints"
+
+
+def habits(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield the bad habits in docstrings, comments and names of tests."""
+    yield from bad_habits(said_in(source.text, source.nodes))
+
+
+def foreign_imports(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each import by a test of the language that needs the appliance or its tests."""
+    for node in source.nodes:
+        match node:
+            case ast.ImportFrom(module=str(module)) if module.split(".")[0] in ("appliance", "tests"):
+                yield node.lineno, module
+
+
+RULES = {
+    "code": Rule(
+        PRODUCT, code_from_text, forbid("text never becomes code; parse it"),
+        ["exec(compile('y = 2', '', 'exec'))", "__import__(name)"], ["re.compile(text)"],
+    ),
+    "decoding": Rule(
+        WITH_FLEET, narrow_handlers, forbid("catch ValueError, which includes UnicodeDecodeError"),
+        ["try: pass\nexcept (OSError, msgspec.DecodeError): pass"], ["raise msgspec.DecodeError"],
+    ),
+    "descriptors": Rule(
+        PRODUCT, closed_descriptors, forbid("set it to -1 or None: the next open file gets its number"),
+        ["def close(self):\n    os.close(self._lock)"],
+        ["def close(self):\n    os.close(self._lock)\n    self._lock = -1"],
+    ),
+    "class names": Rule(WITH_FLEET, public_classes, once, ["class A: ...\nclass A: ..."], ["class A: ..."]),
+    "lookups": Rule(
+        PRODUCT, lookups, exactly(LOOKUPS, "name it in the source, or list it in LOOKUPS with the reason"),
+        [
+            f"def f():\n    {text}" for text in (
+                "getattr(a, name)", "importlib.import_module(name)", "operator.attrgetter('x')",
+                "table[kind.__name__]", "a.__dict__[name] = 1", "[x for x in node.__struct_fields__]", "vars(a)",
+                "f(type(a).__name__)",
+            )
+        ],
+        ["f'{type(error).__name__}: {error}'", "log(message=type(a).__name__)", "print(__name__)"],
+    ),
+    "slots": Rule(PRODUCT, slots, unfilled),
+    "wall clock": Rule(
+        PRODUCT, wall_clocks,
+        exactly(
+            [f"appliance/{file}" for files in WALL_CLOCK.values() for file in files],
+            "use a monotonic clock, or list the file in WALL_CLOCK under its purpose",
+        ),
+        ["clock.wall()", "time.time()", "from appliance.base.clock import utc_now"],
+    ),
+    "clocks": Rule(
+        ("appliance/", "fleet/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
+        ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
+    ),
+    "messages": Rule(("appliance/",), printed, quoted),
+    "English": Rule(FOLDERS, habits, forbid("plain English")),
+    "language": Rule(
+        (LANGUAGE_TESTS,), foreign_imports, forbid("tests of the language run without the appliance"),
+        ["from appliance.base import clock", "from tests.support.site import Site"], ["from rosmop.run import engine"],
+    ),
+}  # fmt: skip
+
+
+def test_the_source_keeps_its_rules() -> None:
+    """Each finding has its place and what to do."""
+    seen: dict[str, list[Seen]] = {name: [] for name in RULES}
+    for file in sorted({path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}):
+        source = parsed(str(file.relative_to(ROOT)), file.read_text())
+        for name, rule in RULES.items():
+            if applies(rule, source.path):
+                seen[name] += (Seen(source.path, line, what) for line, what in rule.see(source))
+    assert len(seen["class names"]) > 1000
+    found = [finding for name, rule in RULES.items() for finding in rule.judge(seen[name])]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("rule", RULES.values(), ids=RULES)
+def test_a_rule_finds_what_it_forbids(rule: Rule) -> None:
+    """A rule that finds nothing would never fail."""
+    for text in rule.wrong:
+        assert findings(rule, text), text
+    for text in rule.right:
+        assert not findings(rule, text), text
+
+
+@pytest.mark.parametrize(
+    "value", ["lambda: None", "lambda topic: 0", "None", "dict", "lambda *_: ''", "lambda: False"]
+)
+@pytest.mark.parametrize("begin", ["self.changed: Callable[[], int] | None", "changed: 'Callable[[], None]'"])
+def test_a_slot_that_another_file_fills_is_found(begin: str, value: str) -> None:
+    """A constructor that fills its own attribute is fine, and an attribute that is not a function."""
+    fillers = ("parts.hosts.changed = f", "x.changed, x.lost = f, g", "x.changed: Callable[[], None] = f")
+    for filler in fillers:
+        assert findings(RULES["slots"], f"{begin} = {value}", filler), filler
+    assert not findings(RULES["slots"], f"{begin} = {value}", "self.changed = f")
+    for other in ("self.changed = changed", "self.changed: int = 0", "self.changed: Task | None = None"):
+        assert not findings(RULES["slots"], other, fillers[0]), other
+
+
+def parsed(path: str, text: str) -> Source:
+    """Return a parsed source."""
+    return Source(path, text, list(ast.walk(ast.parse(text))))
+
+
+def applies(rule: Rule, path: str) -> bool:
+    """Whether a rule is about this file: rules on the product are not about the tests of the language."""
+    tested = path.startswith(LANGUAGE_TESTS) and LANGUAGE_TESTS not in rule.folders
+    return path.startswith(rule.folders) and not tested
+
+
+def findings(rule: Rule, *texts: str) -> list[str]:
+    """Return what a rule finds in examples."""
+    sources = [parsed(f"example{number}.py", text) for number, text in enumerate(texts)]
+    seen = [Seen(one.path, line, what) for one in sources for line, what in rule.see(one)]
+    return [finding for finding in rule.judge(seen) if "example" in finding]
