@@ -107,6 +107,6 @@ def callers(depth: int) -> Iterator[str]:
 
 
 def _is_harmless(event: str) -> bool:
-    """Return whether an event loop makes the sockets by which threads wake it, or urllib3 looks for IPv6 when loaded."""
+    """Return whether a loop makes the sockets by which threads wake it, or urllib3 looks for IPv6 when loaded."""
     makers = {"asyncio.selector_events", "urllib3.util.connection"}
     return event == "socket.__new__" and not makers.isdisjoint(itertools.islice(callers(2), 5))
