@@ -87,12 +87,6 @@ GIVES_UP = {
 SAID = {category: verb for verb, category in VERBS.items()}
 
 
-@pytest.fixture
-def anyio_backend() -> str:
-    """Return the loop that control runs on."""
-    return "asyncio"
-
-
 def text_of(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> str:
     """Return a policy that grants this host the rights in these sections; `missing` sections are left out."""
     lines: dict[str, list[str]] = {}

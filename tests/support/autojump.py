@@ -1,0 +1,154 @@
+"""An event loop with virtual time, so that a test waits for nothing and runs the same way each time.
+
+1. The loop and `appliance.base.clock` have one `VirtualClock`. When nothing is ready, it jumps to the next timer.
+2. `run_in_executor` and `asyncio.to_thread` run the function in the loop, in the order of the calls, without a thread.
+3. If nothing is ready and there is no timer, the test would wait for ever: `DeadlockError` names what each task
+   waits for.
+4. The loop has no selector. Sockets, signals, programs and calls of other threads raise `RealLoopError`.
+"""
+
+import asyncio
+import contextlib
+import math
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextvars import Context
+from types import CoroutineType
+from typing import TYPE_CHECKING, Any, Never, TypeVar, TypeVarTuple
+
+from appliance.base import clock
+from tests.support.virtual_clock import VirtualClock
+
+_Result = TypeVar("_Result")
+_Arguments = TypeVarTuple("_Arguments")
+_MOST_JUMPS = 200_000
+
+
+class DeadlockError(Exception):
+    """The tasks of a test wait for something that cannot happen."""
+
+
+class RealLoopError(Exception):
+    """A test used something that only a loop of the operating system has."""
+
+
+class AutojumpLoop(asyncio.BaseEventLoop):
+    """An event loop that takes its time from `machine`. Use it inside `clock.using(machine)`, as `autojump` does."""
+
+    _thread_id: int | None  # of the thread that runs the loop
+
+    def __init__(self, machine: VirtualClock) -> None:
+        super().__init__()
+        self.machine = machine
+        self._selector = self  # `BaseEventLoop` selects when it has run what was ready
+        self._jumps = 0
+
+    def time(self) -> float:
+        """Return the virtual time in seconds."""
+        return self.machine.now_ns() / 1e9
+
+    def select(self, timeout: float | None) -> list[Never]:
+        """Jump to the next timer, which is due in `timeout` seconds (None: there is no timer)."""
+        if timeout is None:
+            raise DeadlockError(f"deadlock: {self._waiting()}")
+        if timeout > 0:
+            self._jumps += 1
+            if self._jumps > _MOST_JUMPS:
+                raise DeadlockError(f"{_MOST_JUMPS} timers have passed in vain: {self._waiting()}")
+            self.machine.advance_ns(math.ceil(timeout * 1e9))
+        # A timer is due if it is later by less than this: after a year, a float has steps of more than a nanosecond.
+        self._clock_resolution = max(1e-9, 2 * math.ulp(self.time()))
+        return []
+
+    def _process_events(self, _events: list[Never]) -> None:
+        """Do nothing: the loop has no selector."""
+
+    def _write_to_self(self) -> None:
+        """Do nothing: only another thread would have to wake the loop."""
+
+    def _waiting(self) -> str:
+        tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
+        places = [f"\n  {task.get_name()} at {_place(task.get_coro())}" for task in tasks]
+        return f"{len(places)} tasks wait for ever{''.join(places)}"
+
+    def call_soon_threadsafe(
+        self, callback: Callable[[*_Arguments], object], *args: *_Arguments, context: Context | None = None
+    ) -> asyncio.Handle:
+        """Call the function soon, if this is the loop's own thread."""
+        if self._thread_id not in (None, threading.get_ident()):
+            self._refuse()
+        return self.call_soon(callback, *args, context=context)
+
+    def run_in_executor(
+        self, _executor: object, func: Callable[[*_Arguments], _Result], *args: *_Arguments
+    ) -> asyncio.Future[_Result]:
+        """Run the function in the next turn of the loop; it finds no running loop, as in a thread."""
+        future: asyncio.Future[_Result] = self.create_future()
+        self.call_soon(self._run_inline, future, func, args)
+        return future
+
+    def _run_inline(
+        self, future: asyncio.Future[_Result], func: Callable[..., _Result], args: tuple[Any, ...]
+    ) -> None:
+        if future.cancelled():
+            return
+        asyncio._set_running_loop(None)
+        try:
+            result = func(*args)
+        except Exception as error:  # noqa: BLE001  the caller gets it, as from a thread
+            future.set_exception(error)
+        else:
+            future.set_result(result)
+        finally:
+            asyncio._set_running_loop(self)
+
+    def remove_reader(self, _fd: object) -> bool:
+        """Return that there was no reader."""
+        return False
+
+    remove_writer = remove_signal_handler = remove_reader  # type: ignore[assignment]  # parameters' names differ
+
+    def _refuse(self, *_args: object, **_options: object) -> Never:
+        """Say what the test has to do."""
+        raise RealLoopError(
+            "this test uses a socket, a signal, a program or a thread, which a loop with virtual time does not have:"
+            " replace it, or mark the test `real` or `nightly`"
+        )
+
+    async def _refuse_to_wait(self, *_args: object, **_options: object) -> Never:
+        self._refuse()
+
+    if not TYPE_CHECKING:  # the signatures are many, and nothing is done with the arguments
+        add_reader = add_writer = add_signal_handler = _refuse
+        sock_accept = sock_connect = sock_recv = sock_recv_into = sock_recvfrom = _refuse_to_wait
+        sock_sendall = sock_sendfile = sock_sendto = _refuse_to_wait
+        create_connection = create_server = create_datagram_endpoint = _refuse_to_wait
+        create_unix_connection = create_unix_server = _refuse_to_wait
+        connect_accepted_socket = connect_read_pipe = connect_write_pipe = _refuse_to_wait
+        subprocess_exec = subprocess_shell = _refuse_to_wait
+
+
+def _place(coroutine: Any) -> str:
+    """Return the file, line and name of the innermost coroutine that waits."""
+    while isinstance(coroutine, CoroutineType) and isinstance(coroutine.cr_await, CoroutineType):
+        coroutine = coroutine.cr_await
+    frame = getattr(coroutine, "cr_frame", None)
+    return (
+        f"{frame.f_code.co_filename}:{frame.f_lineno} {frame.f_code.co_qualname}"
+        if frame
+        else repr(coroutine)
+    )
+
+
+@contextlib.contextmanager
+def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], AutojumpLoop]]:
+    """Yield what makes loops with virtual time; `machine` is the clock of the block."""
+    machine = machine or VirtualClock()
+    with clock.using(machine):
+        yield lambda: AutojumpLoop(machine)
+
+
+def run(main: Coroutine[Any, Any, _Result]) -> _Result:
+    """Run a coroutine in virtual time, as `asyncio.run` does in real time."""
+    with autojump() as new_loop, asyncio.Runner(loop_factory=new_loop) as runner:
+        return runner.run(main)
