@@ -1,4 +1,4 @@
-"""The relay's event loop: epoll and timers, single-threaded, nothing else.
+"""The relay's event loop: epoll and timers, single-threaded; long work runs in a thread `beside` it.
 
 The loop does not use asyncio, which costs a callback, a transport and a future for each read. Raw epoll with one bound
 method per descriptor halves the delay of a relayed message. The pump waits (`transport/pump.pyx`), and serves armed
@@ -25,12 +25,15 @@ Invariants:
 
 import heapq
 import itertools
+import os
 import select
 import socket
+import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 from appliance.base import clock
 from appliance.quotas.table import RELAY_TURN
@@ -62,6 +65,9 @@ _COSTLY = 3 * QUANTUM  # more than a payer uses if its handlers stop when the qu
 _EVENTS_PER_TURN = 64
 _LONGEST_WAIT = 3600.0
 _UNKNOWN = -1
+_SWITCH_SECONDS = 0.0005  # the longest time that the loop waits for a thread beside it
+
+T = TypeVar("T")
 
 Handler = Callable[[int], None]
 
@@ -110,6 +116,42 @@ class _Watched(NamedTuple):
     handler: Handler
     payer: _Payer | None
     epoll: select.epoll
+
+
+class WorkBeside(Protocol):
+    """Work that is done beside the loop."""
+
+    def discard(self) -> None:
+        """Wait for the end of the work, and discard its result."""
+
+
+class _WorkThread:
+    """Work in a thread of its own, and the descriptor with which it wakes the loop."""
+
+    def __init__(self, loop: "EventLoop", work: Callable[[], T], done: Callable[[T], None]) -> None:
+        sys.setswitchinterval(_SWITCH_SECONDS)
+        self._loop = loop
+        self._ended = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        results: list[T] = []
+
+        def run() -> None:
+            results.append(work())
+            os.eventfd_write(self._ended, 1)
+
+        def finish(_events: int) -> None:
+            self.discard()
+            done(results[0])
+
+        loop.watch(self._ended, READ, finish)
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+
+    def discard(self) -> None:
+        """Wait for the thread, and stop watching it."""
+        self._thread.join()
+        self._loop.unwatch(self._ended)
+        os.close(self._ended)
+        self._ended = -1
 
 
 class EventLoop:
@@ -195,6 +237,13 @@ class EventLoop:
         found = self._payer(payer)
         found.later.append(callback)
         self._waiting[payer] = found
+
+    def beside(self, work: Callable[[], T], done: Callable[[T], None]) -> "WorkBeside":
+        """Do work in a thread while the loop continues; then call `done` with its result, in the loop's thread.
+
+        `work` must not raise. `done` is not called before this method returns.
+        """
+        return _WorkThread(self, work, done)
 
     def used(self) -> int:
         """Return the processor time (ns) of the running handler, or since the first call if its start is unknown."""

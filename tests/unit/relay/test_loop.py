@@ -2,6 +2,7 @@
 
 import itertools
 import socket
+import threading
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -288,3 +289,32 @@ def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Cost
     costs.ready("robot", 1)
     costs.turns_until(lambda: len(costs.order) >= 10)
     assert len(called) <= 60
+
+
+@pytest.mark.nightly
+def test_work_beside_the_loop_is_done_in_a_thread_and_ends_in_the_loop(loop: EventLoop) -> None:
+    """The loop turns while the work is done; then `done` gets the result in the loop's thread."""
+    may_end = threading.Event()
+    results: list[tuple[int, int]] = []
+
+    def work() -> int:
+        may_end.wait(30)
+        return threading.get_ident()
+
+    loop.beside(work, lambda worker: results.append((worker, threading.get_ident())))
+    loop.turn(0)
+    assert results == []
+    may_end.set()
+    loop.turn(30)
+    [(worker, caller)] = results
+    assert caller == threading.get_ident() != worker
+
+
+@pytest.mark.nightly
+def test_discarded_work_is_not_reported(loop: EventLoop) -> None:
+    """`discard` waits for the thread, and the loop forgets it."""
+    results: list[None] = []
+    before = threading.active_count()
+    loop.beside(lambda: None, results.append).discard()
+    loop.turn(0)
+    assert (results, threading.active_count()) == ([], before)

@@ -8,7 +8,7 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import (
@@ -23,12 +23,13 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.data_plane import DataPlane
-from appliance.relay.loop import EventLoop
+from appliance.relay.loop import EventLoop, WorkBeside
 from appliance.relay.relay_limits import MIB, RelayLimits
 from appliance.relay.transport.loop_channel import LoopLink
 from roswire.tcpros import HeaderParser, encode_header
 from tests.support.processes import LIMIT
 
+T = TypeVar("T")
 LOOPBACK = "127.0.0.1"
 LIMITS = replace(
     RelayLimits(grant_seconds=30.0, header_seconds=30.0, connect_seconds=30.0, service_seconds=30.0),
@@ -94,11 +95,47 @@ class Peer:
         self.sock.close()
 
 
+class WorldLoop(EventLoop):
+    """A loop that does the work beside it at its next turn, without a thread, and not while the test `holds` it."""
+
+    holds = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._works: list[_HeldWork] = []
+
+    def beside(self, work: Callable[[], T], done: Callable[[T], None]) -> WorkBeside:
+        """Do the work at the next turn."""
+        held = _HeldWork(self._works, lambda: done(work()))
+        self.after(0, self._work)
+        return held
+
+    def release(self) -> None:
+        """Do the work that the test held."""
+        self.holds = False
+        self.after(0, self._work)
+
+    def _work(self) -> None:
+        while self._works and not self.holds:
+            self._works.pop(0).do()
+
+
+class _HeldWork:
+    def __init__(self, works: list["_HeldWork"], do: Callable[[], None]) -> None:
+        self._works = works
+        self.do = do
+        works.append(self)
+
+    def discard(self) -> None:
+        """Forget the work."""
+        self._works.remove(self)
+
+
 class World:
     """An engine with a control, one node `/talker` (key `k`) that publishes /chatter and offers /mode."""
 
     def __init__(self, limits: RelayLimits = LIMITS) -> None:
-        self.loop = EventLoop()
+        self.loop = WorldLoop()
         self.engine = DataPlane(self.loop, limits)
         self.told: list[Any] = []
         self.open: list[socket.socket] = []

@@ -2,9 +2,8 @@
 
 import gc
 import struct
-import threading
 import time
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,9 @@ from appliance.channel.messages import (
     PublicationPlaced,
     PublicationWithdrawn,
     SpecificationsRefused,
-    SpecificationsStated,
     SpecificationsTaken,
     StateGiven,
 )
-from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
@@ -82,23 +79,9 @@ def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Mon
     world.gets(subscriber, string("bad") + string("one"))
 
 
-@pytest.fixture
-def compiled(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """Return an event; while it is not set, specifications stay uncompiled."""
-    compiled, load_now = threading.Event(), Loader.load
-
-    def load_late(message: SpecificationsStated, holder_of: Callable[[int], Hashable]) -> Any:
-        compiled.wait()
-        return load_now(message, holder_of)
-
-    monkeypatch.setattr(Loader, "load", staticmethod(load_late))
-    return compiled
-
-
-def test_the_first_specifications_delay_only_their_topics(
-    world: Monitored, compiled: threading.Event
-) -> None:
+def test_the_first_specifications_delay_only_their_topics(world: Monitored) -> None:
     """However long compiling takes, the loop still answers, and no message bypasses the monitors."""
+    world.loop.holds = True
     late = GUARD.replace("/chatter", "/late")
     world.state(stated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
@@ -108,7 +91,7 @@ def test_the_first_specifications_delay_only_their_topics(
     world.loop.after(0, lambda: turned.append(True))
     world.until(lambda: turned)
     assert ("k", "/late") not in world.engine.topics
-    compiled.set()
+    world.loop.release()
     taken = world.until(lambda: world.taken(SpecificationsTaken, 1))
     assert (taken.began, taken.statement) == (["guard"], 7)
     assert ("k", "/late") in world.engine.topics
@@ -136,16 +119,15 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
 
 @pytest.mark.parametrize("text", [GUARD.replace("/chatter", "/late"), "nonsense"])
 def test_specifications_of_a_new_control_are_in_force_before_its_placements(
-    world: Monitored, compiled: threading.Event, text: str
+    world: Monitored, text: str
 ) -> None:
     """If control crashed during a change, the next control may begin with another revision, or a refused one."""
-    compiled.set()
     world.load(GUARD)
-    compiled.clear()
+    world.loop.holds = True
     world.state(stated(2, [("0.rv", text)], {}, {}, True, ahead=True))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
     assert ("k", "/late") not in world.engine.topics
-    compiled.set()
+    world.loop.release()
     world.until(lambda: world.taken(SpecificationsTaken, 2) or world.taken(SpecificationsRefused, 2))
     assert ("k", "/late") in world.engine.topics
 
