@@ -4,8 +4,6 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from appliance.base import clock
-
 _LOOK_SECONDS = 0.5
 _AGAIN = 1.25  # times the reserve must be free before space is no longer scarce, so that alarms do not flap
 
@@ -23,12 +21,11 @@ class DiskSpace:
         self._looked = float("-inf")
         self.left: int | None = None
 
-    def look(self) -> bool | None:
+    def look(self, now: float) -> bool | None:
         """Check the disk if a check is due; return True if space just became scarce, False if scarcity just ended.
 
         Return None if nothing changed. Raises `OSError`.
         """
-        now = clock.now()
         if now - self._looked < _LOOK_SECONDS:
             return None
         self._looked = now

@@ -18,7 +18,6 @@ from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.signatures import Signatures
 from appliance.audit.waiters import Waiter, answer
-from appliance.base.clock import now
 from appliance.signing.signed_statements import parse_checkpoint
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
@@ -43,7 +42,10 @@ class CheckpointSchedule:
 
 
 class Housekeeping:
-    """The background work of the log at `path`, on the log's thread; `writer` is None while the database is closed."""
+    """The background work of the log at `path`, in its turns; `writer` is None while the database is closed.
+
+    `now` returns the time of the present turn.
+    """
 
     def __init__(
         self,
@@ -53,6 +55,7 @@ class Housekeeping:
         remover: Remover,
         *,
         clock: Callable[[], int],
+        now: Callable[[], float],
         make: MakeRecord,
         hold: Callable[[AuditRecord], None],
     ) -> None:
@@ -61,6 +64,7 @@ class Housekeeping:
         self.remover = remover
         self._checkpoints = checkpoints
         self._clock = clock
+        self._now = now
         self._make = make
         self._hold = hold
         self._paused_until = self._asked_at = 0.0  # monotonic seconds
@@ -84,22 +88,22 @@ class Housekeeping:
 
     def attempt(self, action: Callable[[], None]) -> None:
         """Run a step; after a failed one, skip all steps for a while."""
-        if now() < self._paused_until:
+        if self._now() < self._paused_until:
             return
         try:
             action()
         except WRITE_ERRORS as error:
             self._failing = f"{self._path}: {error}"
-            self._paused_until = now() + _HOUSE_SECONDS
+            self._paused_until = self._now() + _HOUSE_SECONDS
         else:
             self._failing = None
 
     def next_due(self, now: float) -> float | None:
-        """Return the seconds until the next work is due; None during the pause after a failure."""
+        """Return the time of the next work; None during the pause after a failure."""
         if now < self._paused_until:
             return None
-        due = self.remover.due - now
-        return min(due, self._sealed_at + self._checkpoints.seconds - now) if self.unsealed else due
+        due = self.remover.due
+        return min(due, self._sealed_at + self._checkpoints.seconds) if self.unsealed else due
 
     # --- between two batches of records -----------------------------------------------------------------------
 
@@ -115,16 +119,16 @@ class Housekeeping:
         """Index records and remove old ones while no record waits; the last one was written at time `quiet_since`."""
         if self.writer is not None and not busy():
             # Committing the index for a single record is too expensive: wait for more records or for a quiet period.
-            quiet = now() - quiet_since >= _IDLE_SECONDS / 2
+            quiet = self._now() - quiet_since >= _IDLE_SECONDS / 2
             if quiet or self.writer.text_lag >= _TEXT_STEP:
                 self.attempt(lambda: self._index(busy))
-        if self.writer is not None and now() >= self.remover.due:
+        if self.writer is not None and self._now() >= self.remover.due:
             self.attempt(self._retain)
 
     # --- checkpoints ------------------------------------------------------------------------------------------
 
     def _seal_is_due(self) -> bool:
-        waited = now() - self._sealed_at
+        waited = self._now() - self._sealed_at
         return self.unsealed >= self._checkpoints.records or (
             self.unsealed > 0 and (waited >= self._checkpoints.seconds or bool(self._waiting))
         )
@@ -152,7 +156,7 @@ class Housekeeping:
         writer = self.writer
         if writer is None:
             return
-        self._sealed_at = now()
+        self._sealed_at = self._now()
         checkpoint, text = writer.seal(self._clock())
         detail = {"number": checkpoint.number, "sequence": checkpoint.sequence, "hash": checkpoint.hash}
         writer.append([self._make("checkpoint", Severity.DEBUG, "", detail)])
@@ -166,7 +170,7 @@ class Housekeeping:
 
     def ask_signatures(self) -> None:
         """Request all missing signatures."""
-        self._asked_at = now()
+        self._asked_at = self._now()
         if self.writer is not None:
             self._signatures.ask(self.writer)
 

@@ -1,4 +1,4 @@
-"""Write the audit log: `record` puts a record into a queue, and the log's thread writes it.
+"""Write the audit log: `record` puts a record into a queue, and a turn of the log writes it.
 
 1. `record` never blocks and never raises: it only appends to a queue.
 2. Records keep their order.
@@ -10,11 +10,9 @@
 
 import asyncio
 import contextlib
-import contextvars
 import os
 import sqlite3
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -38,6 +36,8 @@ from appliance.audit.repetition import summary
 from appliance.audit.retention import Retention
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
 from appliance.audit.waiters import Waiter, answer
+from appliance.base.clock import now, wall_ns
+from appliance.base.engine_thread import Drive, EngineThread
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_RESERVE
 
@@ -79,10 +79,10 @@ class _LossCounter:
 
 
 class AuditLog:
-    """The log at `path`, open for writing.
+    """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
 
     `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
-    `checkpoint_every` records or `checkpoint_seconds`. The log's thread then calls `signer(number, text)`, and the
+    `checkpoint_every` records or `checkpoint_seconds`. A turn of the log then calls `signer(number, text)`, and the
     owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
     a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that
     lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free.
@@ -103,12 +103,14 @@ class AuditLog:
         reserve: int = AUDIT_RESERVE.bounds.whole,
         queue_limit: int = 100_000,
         held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  the default ignores them
-        clock: Callable[[], int] = time.time_ns,
+        clock: Callable[[], int] = wall_ns,
+        drive: Drive = EngineThread,
     ) -> None:
         self.path = path
         self.ids = IdSource(clock=clock)
         self.strict = durability == "strict"
         self._clock = clock
+        self._now = now()  # the time of the present turn
         self._queue_limit = queue_limit
         self._held_by = held_by
         self.budget = budget or Budget(lambda _host: QuotaClass.NAMED)
@@ -126,9 +128,11 @@ class AuditLog:
                 self._signatures,
                 removals,
                 clock=clock,
+                now=lambda: self._now,
                 report=lambda reason, detail: self._own("records removed", Severity.NOTICE, reason, detail),
             ),
             clock=clock,
+            now=lambda: self._now,
             make=self._own,
             hold=self._held.append,
         )
@@ -136,23 +140,13 @@ class AuditLog:
         self._writer: ChainWriter | None = None
         self._failed: str | None = "the log is being opened"
         self._failed_since = 0
-        self._caught_up = self._written_at = time.monotonic()
+        self._caught_up = self._written_at = self._retry_at = self._now
         self._lost = _LossCounter()
-        self._idle = False
-        self._ended = False
+        self._begun = self._closing = self._ended = False
         self._counts_recovered = False
         self._continued: tuple[str, int] | None = None
         self._unwritten: str | None = None
-        self._wake = threading.Event()
-        self._hurry = threading.Event()
-        self._stopping = threading.Event()
-        self._opened = threading.Event()
-        log_context = contextvars.copy_context()  # the name of this process
-        self._thread = threading.Thread(
-            target=log_context.run, args=(self._run,), name="audit log", daemon=True
-        )
-        self._thread.start()
-        self._opened.wait()
+        self._driver = drive("audit log", self.turn, 0.0 if self.strict else _GATHER_SECONDS)
 
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
@@ -178,8 +172,7 @@ class AuditLog:
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
         self._put(Waiter(loop, future))
-        if not self.strict:
-            self._hurry.set()
+        self._driver.hurry()
         return await future
 
     async def wait_signed(self) -> str | None:
@@ -187,7 +180,7 @@ class AuditLog:
         loop = asyncio.get_running_loop()
         future: asyncio.Future[str | None] = loop.create_future()
         self._put(partial(self.housekeeping.seal_now, Waiter(loop, future)))
-        self._hurry.set()
+        self._driver.hurry()
         return await future
 
     @property
@@ -204,7 +197,7 @@ class AuditLog:
     def lag(self) -> Lag:
         """Return how far writing to the disk is behind."""
         waiting = len(self._queue) + len(self._held)
-        return Lag(waiting, time.monotonic() - self._caught_up if waiting else 0.0)
+        return Lag(waiting, now() - self._caught_up if waiting else 0.0)
 
     def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
         """Store the signer's signature if it is valid and made with the pinned key; otherwise record it as refused."""
@@ -231,38 +224,40 @@ class AuditLog:
 
     def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
         """Write waiting records, make a last checkpoint and close; return the reason for a failure or timeout."""
-        self._stopping.set()
-        self._hurry.set()
-        self._wake.set()
-        self._thread.join(seconds)
-        if self._thread.is_alive():
+        self._closing = True
+        if not self._driver.end(seconds):
             return f"{self.path}: still being written after {seconds:g} s"
         return self._unwritten
 
     def _put(self, item: AuditRecord | Waiter | Callable[[], None]) -> None:
         self._queue.append(item)
-        # The thread sets `_idle` before it checks the queue once more: it sees the item, or this call sees `_idle`.
-        if self._idle:
-            self._idle = False
-            self._wake.set()
+        self._driver.wake()
         if self._ended:
             self._refuse_queued()
 
-    # --- the log's thread -----------------------------------------------------------------------------------
+    # --- the turns ------------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def turn(self, now: float) -> float | None:
+        """Write a batch of the queue and do what is due at `now`; return the time of the next turn, None at the end."""
+        if self._ended:
+            return None
+        self._now = now
+        if now < self._retry_at and not self._closing:
+            return self._retry_at
+        due = None
         try:
-            self._serve()
+            due = self._turn(now)
         except BaseException as error:
             # A defect: the owner must see that records are no longer written, and deny requests.
             self._unwritten = self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
             raise
         finally:
-            self._failed = self._failed or f"{self.path}: the log is closed"
-            self._ended = True
-            self._opened.set()
-            self._answer_waiting()
-            self._refuse_queued()
+            if due is None:
+                self._failed = self._failed or f"{self.path}: the log is closed"
+                self._ended = True
+                self._answer_waiting()
+                self._refuse_queued()
+        return due
 
     def _refuse_queued(self) -> None:
         with contextlib.suppress(IndexError):
@@ -271,13 +266,37 @@ class AuditLog:
                 if isinstance(item, Waiter):
                     answer([item], self._failed)
 
-    def _serve(self) -> None:
-        self._attempt(self._open)
-        self._opened.set()
-        while not self._stopping.is_set():
-            self._wait()
-            self._turn()
-        self._turn()
+    def _turn(self, now: float) -> float | None:
+        if not self._begun:
+            self._begun = True
+            return now if self._attempt(self._open) else self._pause(now)
+        closing = self._closing  # the queue has everything that was recorded before
+        more = self._drain(now)
+        for due in self._folder.expire(now):
+            self._held.append(due)
+            self.budget.summarised(due)
+        self._look_for_room(now)
+        written = self._attempt(self._write)
+        self._answer_waiting()
+        self.housekeeping.after_batch(written=written)
+        if more and written:
+            return now
+        self.housekeeping.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
+        if closing:
+            self._finish()
+            return None
+        if self._failed is not None:
+            return self._pause(now)
+        if not self._queue:
+            self._caught_up = now
+        dues = (now + _IDLE_SECONDS, self._folder.next_due(), self.housekeeping.next_due(now))
+        return max(now + 0.001, min(due for due in dues if due is not None))
+
+    def _pause(self, now: float) -> float:
+        self._retry_at = now + _RETRY_SECONDS
+        return self._retry_at
+
+    def _finish(self) -> None:
         self._held.extend(self._folder.finish())
         self.housekeeping.unsealed += len(self._held)
         if self._attempt(self._write) and self.housekeeping.unsealed:
@@ -287,49 +306,8 @@ class AuditLog:
         if self._writer is not None:
             self._writer.close()
 
-    def _turn(self) -> None:
-        while True:
-            more = self._drain()
-            now = time.monotonic()
-            for due in self._folder.expire(now):
-                self._held.append(due)
-                self.budget.summarised(due)
-            self._look_for_room()
-            written = self._attempt(self._write)
-            self._answer_waiting()
-            self.housekeeping.after_batch(written=written)
-            if not more or not written:
-                break
-        self.housekeeping.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
-
-    def _wait(self) -> None:
-        if self._failed is not None:
-            self._stopping.wait(_RETRY_SECONDS)
-            return
-        self._wake.clear()
-        self._idle = True
-        if not self._queue:
-            self._caught_up = time.monotonic()
-            self._wake.wait(self._until_due())
-        self._idle = False
-        if self._queue and not self.strict:
-            self._hurry.wait(_GATHER_SECONDS)
-        self._hurry.clear()
-        if self._stopping.is_set():
-            self._hurry.set()
-
-    def _until_due(self) -> float:
-        now = time.monotonic()
-        due = self._folder.next_due()
-        waits = [_IDLE_SECONDS] if due is None else [_IDLE_SECONDS, due - now]
-        house = self.housekeeping.next_due(now)
-        if house is not None:
-            waits.append(house)
-        return max(0.001, min(waits))
-
-    def _drain(self) -> bool:
+    def _drain(self, now: float) -> bool:
         """Process a batch of queued items; return whether more are left."""
-        now = time.monotonic()
         queue, offer = self._queue, self._folder.offer
         for _ in range(_LARGEST_BATCH):
             if not queue:
@@ -346,9 +324,9 @@ class AuditLog:
                 item()
         return bool(queue)
 
-    def _look_for_room(self) -> None:
+    def _look_for_room(self, now: float) -> None:
         with contextlib.suppress(OSError):  # the writer reports a missing folder
-            scarce = self._room.look()
+            scarce = self._room.look(now)
             if scarce is not None:
                 severity, left = (Severity.ALARM if scarce else Severity.NOTICE), self._room.left
                 event = "disk nearly full" if scarce else "disk has room"
@@ -420,7 +398,7 @@ class AuditLog:
             del self._held[: len(batch)]
             self._folder.touched.difference_update(touched)
             self.housekeeping.unsealed += len(batch) + len(report)
-            self._caught_up = self._written_at = time.monotonic()
+            self._caught_up = self._written_at = self._now
             if self._failed_since:
                 _logger.warning("the audit log is written again")
             self._failed, self._failed_since = None, 0

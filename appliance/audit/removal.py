@@ -11,7 +11,6 @@ from appliance.audit.log_writer import ChainWriter, RemovedRange
 from appliance.audit.record import AuditRecord
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.signatures import RemovalSigner, Signatures
-from appliance.base import clock
 from appliance.signing.signed_statements import Removal, limit_of_removal
 
 _AT_ONCE = 512
@@ -30,7 +29,10 @@ class _Wanted(NamedTuple):
 
 
 class Remover:
-    """Applies a log's retention, on the log's thread; `approve` requests a signature, `report` makes the record."""
+    """Applies a log's retention, in its turns; `approve` requests a signature, `report` makes the record.
+
+    `now` returns the time of the present turn.
+    """
 
     def __init__(
         self,
@@ -39,12 +41,14 @@ class Remover:
         approve: RemovalSigner | None,
         *,
         clock: Callable[[], int],
+        now: Callable[[], float],
         report: Callable[[str, dict[str, object]], AuditRecord],
     ) -> None:
         self._retention = retention
         self._signatures = signatures
         self._approve = approve
         self._clock = clock
+        self._now = now
         self._report = report
         self._wanted: _Wanted | None = None
         self._asked = self._aged = self._refused = 0.0
@@ -53,7 +57,7 @@ class Remover:
 
     def step(self, writer: ChainWriter) -> bool:
         """Remove one step of records, or request the signature for it; return whether records were removed."""
-        now = clock.now()
+        now = self._now()
         self.due = now + _LOOK_SECONDS
         if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
             return False
@@ -103,7 +107,7 @@ class Remover:
         wanted = self._wanted
         if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None
-            self._refused = clock.now() + _REFUSED_SECONDS
+            self._refused = self._now() + _REFUSED_SECONDS
             waits = early and not wanted.by_size
             self.unremoved = None if waits else f"old records are not removed: the signer refuses: {reason}"
 

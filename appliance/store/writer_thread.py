@@ -1,4 +1,4 @@
-"""Write one SQLite file in one thread: changes are queued, written in groups, and can be awaited.
+"""Write one SQLite file: changes are queued, written in groups by one thread, and can be awaited.
 
 Waiting changes are committed together (group commit). A killed process loses no change: a separate file holds
 queued changes until the database has them (`ahead`). A power failure loses no change that was awaited
@@ -13,11 +13,12 @@ earlier process may have passed on changes that it then lost in a crash.
 
 import asyncio
 import contextlib
+import math
 import os
-import queue
 import secrets
 import sqlite3
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from typing import Any, NamedTuple
 import msgspec
 import structlog
 
+from appliance.base.engine_thread import Drive, EngineThread
 from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
@@ -32,6 +34,7 @@ from appliance.store.changes import Change, ChangeError, Condition, Delete, Put,
 _GROUP = 2_000
 _GATHER_SECONDS = 0.02  # time to gather changes that are not awaited: they are safe in `ahead`
 
+_RETRY_SECONDS = 0.5
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
 _ROOM = 4 << 20  # bytes; SQLite's write-ahead log grows to this size, and few texts are longer
@@ -75,10 +78,13 @@ class Database:
     """The state file at `path`, created with `schema` when it is new.
 
     Raises `StoreError` if the file is not a database or cannot be opened. `failed` is called once when writing fails (a
-    full disk). Nothing is dropped: the write is tried again until it succeeds or the database is closed.
+    full disk). Nothing is dropped: the write is tried again until it succeeds or the database is closed. `drive` makes
+    the driver that calls the turns, in one thread.
     """
 
-    def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
+    def __init__(
+        self, path: Path, schema: str, *, failed: Callable[[str], None], drive: Drive = EngineThread
+    ) -> None:
         self._path = path
         self._failed = failed
         self._failing = ""
@@ -105,13 +111,13 @@ class Database:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._feeds: tuple[ChangeFeed, ...] = ()
         self._gathered: _Gathered | None = None
-        self._queue: queue.SimpleQueue[_Queued | _Waiter | None] = queue.SimpleQueue()
+        self._queue: deque[_Queued | _Waiter] = deque()
+        self._group: list[_Queued | _Waiter] = []
+        self._retry_at = -math.inf
         self._order = threading.Lock()  # for equal order in the write-ahead file and the queue
-        self._closed = False
-        self._closing = threading.Event()
-        self._hurry = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="store", daemon=True)
-        self._thread.start()
+        self._closed = False  # no further changes
+        self._ended = False  # no further turns
+        self._driver = drive("store", self.turn, _GATHER_SECONDS)
 
     def query(self, sql: str, parameters: Sequence[Value] = ()) -> list[tuple[Any, ...]]:
         """Read rows, including those queued before; after start-up, call this in a thread, because it may wait.
@@ -119,10 +125,10 @@ class Database:
         The result lacks changes that are not written within `_CATCH_UP_SECONDS`. If writing fails (a full disk), the
         call does not wait.
         """
-        if self._thread.is_alive() and not self._failing:
+        if not self._ended and not self._failing:
             written = threading.Event()
-            self._queue.put(_Waiter(written.set, synced=False))
-            self._hurry.set()
+            self._queue.append(_Waiter(written.set, synced=False))
+            self._driver.hurry()
             written.wait(_CATCH_UP_SECONDS)
         try:
             with contextlib.closing(sqlite3.connect(self._path)) as reader:
@@ -181,10 +187,11 @@ class Database:
                 except OSError as error:
                     self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
             for number, (change, _, _) in enumerate(encoded, first):
-                self._queue.put(_Queued(number, change))
+                self._queue.append(_Queued(number, change))
             for feed in self._feeds:
                 bodies = [body or self._encoder.encode(change) for change, _, body in encoded]
                 feed.add([Encoded(number, body) for number, body in enumerate(bodies, first)])
+        self._driver.wake()
 
     def follow(self, changed: Callable[[], None], room: int) -> ChangeFeed:
         """Return a feed of all changes from now on; `changed` is called after each, in its thread."""
@@ -253,8 +260,8 @@ class Database:
 
         with self._order:
             self._require_open()
-            self._queue.put(_Waiter(call_back, synced=True))
-        self._hurry.set()
+            self._queue.append(_Waiter(call_back, synced=True))
+        self._driver.hurry()
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
                 raise StoreError(f"{self._failing}; free space: until then a restart undoes recent changes")
@@ -266,66 +273,73 @@ class Database:
         """
         with self._order:
             self._closed = True
-            self._queue.put(None)
-        self._closing.set()
-        self._hurry.set()
-        self._thread.join(seconds)
-        if self._thread.is_alive():
+        if not self._driver.end(seconds):
             self._failed(f"{self._path}: still being written after {seconds:g} s; {_LEFT}")
             return
         self._connection.close()
         self._ahead.close()
 
-    def _run(self) -> None:
+    def turn(self, now: float) -> float | None:
+        """Write a group of the queue; return the time of the next turn, None at the end."""
+        if self._ended:
+            return None
+        if now < self._retry_at and not self._closed:
+            return self._retry_at
+        due = None
         try:
-            self._write()
+            due = self._turn(now)
         except BaseException as error:
             # A defect: callers that wait get the error, and orders are refused. The next start applies the changes.
             self._failing = f"{self._path}: writing ended: {type(error).__name__}: {error}"
             self._fail(self._failing)
             raise
+        finally:
+            self._ended = due is None
+        return due
 
-    def _write(self) -> None:
-        while True:
-            group = [self._queue.get()]
-            if isinstance(group[0], _Queued) and self._queue.empty():
-                self._hurry.wait(_GATHER_SECONDS)
-            self._hurry.clear()
-            while len(group) < _GROUP and not self._queue.empty():
-                group.append(self._queue.get())
-            self._commit([item for item in group if isinstance(item, _Queued)])
-            waiters = [item for item in group if isinstance(item, _Waiter)]
-            if any(waiter.synced for waiter in waiters):
-                self._sync()
-            for waiter in waiters:
-                waiter.tell()
-            if None in group:
-                return
+    def _turn(self, now: float) -> float | None:
+        closed = self._closed  # the queue has everything that was changed before
+        group = self._group
+        while self._queue and len(group) < _GROUP:
+            group.append(self._queue.popleft())
+        changes = [item for item in group if isinstance(item, _Queued)]
+        if changes and not self._commit(changes):
+            if not closed:
+                self._retry_at = now + _RETRY_SECONDS
+                return self._retry_at
+            self._fail(f"{self._failing}; {_LEFT}")
+            return None
+        waiters = [item for item in group if isinstance(item, _Waiter)]
+        if any(waiter.synced for waiter in waiters):
+            self._sync()
+        for waiter in waiters:
+            waiter.tell()
+        group.clear()
+        if self._queue:
+            return now
+        return None if closed else math.inf
 
-    def _commit(self, queued: list[_Queued]) -> None:
-        while queued:
-            last = queued[-1].number
-            try:
-                self._execute([self.tables.statement(item.change) for item in queued], last)
-            except sqlite3.Error as error:
-                if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
-                self._failing = f"{self._path}: {error}"
-                self._fail(self._failing)
-                if self._closing.wait(0.5):
-                    self._fail(f"{self._failing}; {_LEFT}")
-                    return
-            else:
-                self._failing = ""
-                try:
-                    self._ahead.stored(last)
-                except OSError as error:  # the database has these changes, so the next start skips them
-                    self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
-                    return
-                if self._told:
-                    _log.warning("state is written again", file=str(self._path))
-                    self._told.clear()
-                return
+    def _commit(self, queued: list[_Queued]) -> bool:
+        """Commit changes, and return whether the database has them."""
+        last = queued[-1].number
+        try:
+            self._execute([self.tables.statement(item.change) for item in queued], last)
+        except sqlite3.Error as error:
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            self._failing = f"{self._path}: {error}"
+            self._fail(self._failing)
+            return False
+        self._failing = ""
+        try:
+            self._ahead.stored(last)
+        except OSError as error:  # the database has these changes, so the next start skips them
+            self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
+            return True
+        if self._told:
+            _log.warning("state is written again", file=str(self._path))
+            self._told.clear()
+        return True
 
     def _sync(self) -> None:
         try:

@@ -10,8 +10,7 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
-from appliance.audit.log import AuditLog
-from appliance.base.clock import using
+from appliance.base.clock import now, using
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.control.signer_requests import SignerRequests
@@ -19,6 +18,7 @@ from appliance.control.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import decision
+from tests.support.engines import InlineDatabase, open_log
 from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
 
@@ -56,7 +56,7 @@ class Member:
         """Start control's log, state and recorder."""
         requests = SignerRequests(lambda: self.log)
         self.signed, self._signs = requests.signed, True
-        self.log = AuditLog(
+        self.log = open_log(
             self.path,
             signer=requests.want,
             clock=self.clock,
@@ -68,7 +68,7 @@ class Member:
         self._signer.attach(asyncio.get_running_loop(), self._sign, lambda: None, lambda _reason: None)
         requests.attach(Channel(ours, messages.SignerLink))
         self._requests = requests
-        self.store = StateStore(self.state / "control", failed=lambda _reason: None)
+        self.store = StateStore(self.state / "control", failed=lambda _reason: None, kind=InlineDatabase)
         trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
         self.trail = trail
         self.recorder = TakeoverRecorder(
@@ -108,7 +108,7 @@ class Member:
 
     def timed(self) -> AbstractContextManager[None]:
         """Return a block in which records of the trail have this machine's time."""
-        return using(VirtualClock(wall=self.clock() / SECOND))
+        return using(VirtualClock(wall=self.clock() / SECOND, now=now()))
 
     async def decide(self, count: int, seconds: float) -> None:
         """Record decisions over some seconds."""

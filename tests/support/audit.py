@@ -1,12 +1,14 @@
 """Make records for tests of the audit log, and wait until they are on disk."""
 
 import asyncio
-import time
 from typing import Any
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import AuditRecord, RuleReference
+from appliance.base import clock
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.engines import let_pass
+from tests.support.virtual_clock import VirtualClock
 
 
 class RecordingTrail(AuditTrail):
@@ -26,7 +28,7 @@ def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
     """Return a decision of RVMaster; `changes` replace fields."""
     fields: dict[str, Any] = {
         "id": log.ids.next(),
-        "time": time.time_ns(),
+        "time": clock.wall_ns(),
         "event": "decision",
         "decision": "allow",
         "host": f"10.0.0.{number % 5}",
@@ -42,6 +44,17 @@ def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
     return AuditRecord(**fields | changes)
 
 
-def settle(log: AuditLog) -> str | None:
-    """Wait until all records are on disk; return the reason if they cannot be written."""
-    return asyncio.run(asyncio.wait_for(log.wait_durable(), 60))
+def settle(log: AuditLog, time: VirtualClock | None = None) -> str | None:
+    """Wait until all records are on disk; return the reason if they cannot be written.
+
+    With `time`, half a second passes, after which a log that could not be written tries again.
+    """
+
+    async def settled() -> str | None:
+        waiting = asyncio.ensure_future(log.wait_durable())
+        await asyncio.sleep(0)
+        if time is not None:
+            let_pass(log, time, 0.5)
+        return await asyncio.wait_for(waiting, 4)
+
+    return asyncio.run(settled())

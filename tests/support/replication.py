@@ -23,6 +23,7 @@ from appliance.standby.replication_receiver import ReplicationReceiver
 from appliance.standby.replication_sender import ReplicationSender
 from appliance.standby.replication_transport import ReplicationListener, follow_at
 from appliance.store.writer_thread import Database, StoreError
+from tests.support.engines import InlineDatabase
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER NOT NULL, note TEXT) WITHOUT ROWID;
@@ -103,7 +104,7 @@ class ActiveSide:
         listening: socket.socket | None = None,
     ) -> None:
         self.epoch = epoch
-        self.database = Database(path, schema, failed=print)
+        self.database = InlineDatabase(path, schema, failed=print)
         self.sender = ReplicationSender(self.database, lambda: self.epoch, room=room)
         self._socket = listening or listening_socket()
         self.port: int = self._socket.getsockname()[1]

@@ -11,13 +11,13 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.pyx?)` (\d+)", SECTION)}
-BUDGET = 11_540  # lines of code: lower this number with the kernel, and never raise it
+BUDGET = 11_521  # lines of code: lower this number with the kernel, and never raise it
 
 # The modules outside the kernel that the kernel may import.
 OUTSIDE = frozenset(
     """
     audit.copies audit.disk_space audit.events audit.ids audit.lock_holders base.atomic_files base.clock
-    base.input_files base.validation_messages channel.channel channel.link channel.messages
+    base.engine_thread base.input_files base.validation_messages channel.channel channel.link channel.messages
     channel.messages.relay_link channel.rosout_address configuration.settings master.calls.monitor_calls
     master.calls.request_peek master.endpoints.delivery master.endpoints.node_ports master.endpoints.node_api
     master.endpoints.topic_taps_control master.endpoints.traffic master.parameter_charges

@@ -302,7 +302,6 @@ WALL_CLOCK = {
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
     "appliance/standby/witness.py": "is copied to a machine without the appliance",
-    "appliance/audit/log.py": "has a thread, which `clock.using` does not reach",
 }
 """The files that read a clock other than by `base/clock.py`."""
 _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {

@@ -1,7 +1,6 @@
 """Fixtures of the audit log: a path, a key, a signer in the test's process, and logs."""
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,11 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
+from appliance.base import clock
 from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError
+from tests.support.engines import ByHand
+from tests.support.virtual_clock import VirtualClock
 
 MakeLog = Callable[..., AuditLog]
 
@@ -28,7 +30,7 @@ class Notary:
         self._signed = CheckpointMemory(directory, clock=self._now)
 
     def _now(self) -> int:
-        return time.time_ns() - self.ago
+        return clock.wall_ns() - self.ago
 
     def sign(self, text: bytes) -> None:
         """Remember a checkpoint, unless it is from another history: some tests make such checkpoints."""
@@ -38,6 +40,14 @@ class Notary:
     def approve(self, checkpoint: bytes, newest: bytes) -> bytes:
         """Return the signed text of a removal. Raises `RemovalRefusedError`."""
         return RemovalApprover(self._signed, self.kept, clock=self._now).approve(checkpoint, newest)
+
+
+@pytest.fixture(autouse=True)
+def time() -> Iterator[VirtualClock]:
+    """Return the clock of the test, which moves only when the test moves it."""
+    time = VirtualClock(wall=1_800_000_000)
+    with clock.using(time):
+        yield time
 
 
 @pytest.fixture
@@ -90,7 +100,7 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
         logs.clear()
         if "retention" in settings:
             notary.kept = RetentionLimits(settings["retention"].days, settings["retention"].size)
-        log = AuditLog(path, **settings)
+        log = AuditLog(path, drive=ByHand, **settings)
         logs.append(log)
         made.append(log)
         log.request_signatures()

@@ -2,7 +2,6 @@
 
 import json
 import lzma
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,10 @@ from appliance.audit.search import export
 from appliance.audit.signatures import read_public_key
 from appliance.evidence.export_verification import ExportUnreadableError, ExportVerification, verify_export
 from tests.support.audit import decision, settle
+from tests.support.engines import ByHand
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
-from tests.unit.audit.test_retention import await_removal, make_old
+from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
 pytestmark = pytest.mark.nightly
 
@@ -137,7 +138,7 @@ def test_tampering_is_found(
 
 def test_a_rehashed_record_leads_to_no_checkpoint(log: Path, public: bytes, tmp_path: Path) -> None:
     """A forger who recomputes the hashes of the whole export cannot sign a checkpoint."""
-    forged_log = AuditLog(tmp_path / "forged.db", checkpoint_every=5)
+    forged_log = AuditLog(tmp_path / "forged.db", drive=ByHand, checkpoint_every=5)
     for number in range(20):
         forged_log.record(decision(forged_log, number))
     settle(forged_log)
@@ -166,21 +167,20 @@ def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: 
 
 
 def test_an_export_after_retention_is_proved(
-    make_log: MakeLog, path: Path, public: bytes, notary: Notary, tmp_path: Path
+    make_log: MakeLog, path: Path, public: bytes, notary: Notary, time: VirtualClock
 ) -> None:
     """The records that retention left can be proved, from the first to the last."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
-    await_removal(path, 1900)
+    retain(log, time)
+    assert first_sequence(path) > 1900
     for number in range(200):
         log.record(decision(log, number))
     settle(log)
-    deadline = time.monotonic() + 30
-    while not (result := checked(exported(path, Filter()), tmp_path / "x.ndjson", public)).proven:
-        assert time.monotonic() < deadline
-        log.record(decision(log))
-        settle(log)
+    retain(log, time)
+    result = checked(exported(path, Filter()), path.with_name("x.ndjson"), public)
+    assert result.proven
     log.close()
     assert result.ok, result.findings
 

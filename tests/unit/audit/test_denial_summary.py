@@ -15,6 +15,7 @@ from appliance.audit.record import AuditRecord, RuleReference
 from appliance.audit.record_format import LogEntry, rfc3339
 from appliance.audit.repetition import ALL, ALL_UNKNOWN, HOST, KIND, OTHERS, UNKNOWN
 from appliance.audit.search import export
+from appliance.base import clock
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 
@@ -170,7 +171,7 @@ def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     found = summary_of_log(log.path, Filter(), 10)
     assert [(row.host, row.count) for row in found.hosts] == [("10.0.0.1", 30)]
     assert len([*export(log.path, Filter(decision=("deny",)))]) < 30
-    assert summary_of_log(log.path, Filter(since=time.time_ns() + 60 * _SECOND), 10).hosts == []
+    assert summary_of_log(log.path, Filter(since=clock.wall_ns() + 60 * _SECOND), 10).hosts == []
 
 
 @pytest.mark.nightly

@@ -12,12 +12,10 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.quotas.pool import QuotaClass
 from tests.support.audit import decision, settle
+from tests.support.engines import ByHand, let_pass
 from tests.support.small_disk import small_disk
-from tests.support.waiting import eventually
+from tests.support.virtual_clock import VirtualClock
 
-pytestmark = pytest.mark.nightly
-
-_LIMIT_SECONDS = 30
 _RESERVE = 16 << 20
 
 
@@ -28,23 +26,18 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         yield place
 
 
-def await_degraded(log: AuditLog, *, degraded: bool) -> None:
-    """Wait until the log reports low space, or no longer reports it."""
-    eventually(lambda: (log.degraded is not None) is degraded, lambda: f"degraded: {log.degraded}")
-
-
-def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
+def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path, time: VirtualClock) -> None:
     """Below the reserve an alarm is raised and hosts in debt wait; with free space again all is as before."""
     budget = Budget(lambda _host: QuotaClass.REGISTERED)
     with capture_logs() as said:
-        log = AuditLog(disk / "audit.db", budget=budget, reserve=_RESERVE)
+        log = AuditLog(disk / "audit.db", drive=ByHand, budget=budget, reserve=_RESERVE)
         log.record(decision(log))
         assert settle(log) is None
         assert log.degraded is None
         filler = disk / "filler"
         filler.write_bytes(b"x" * (20 << 20))
-        await_degraded(log, degraded=True)
-        eventually(lambda: [one["event"] for one in said] == ["disk nearly full"], lambda: str(said))
+        let_pass(log, time, 1)
+    assert [one["event"] for one in said] == ["disk nearly full"]
     assert "make room" in said[0]["reason"]
     assert "reserve" in (log.degraded or "")
     assert log.failed is None
@@ -56,7 +49,8 @@ def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
     assert budget.pause("10.0.0.1") == 0
     assert settle(log) is None
     filler.unlink()
-    await_degraded(log, degraded=False)
+    let_pass(log, time, 1)
+    assert log.degraded is None
     assert budget.pause("10.0.0.66") == 0
     assert log.close() is None
     found = search(disk / "audit.db", Filter(event="disk *")).entries[::-1]

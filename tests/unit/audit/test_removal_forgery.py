@@ -2,7 +2,6 @@
 
 import lzma
 import sqlite3
-import time
 from contextlib import closing
 from pathlib import Path
 
@@ -18,10 +17,13 @@ from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.retention import Retention
 from appliance.audit.search import export, search
 from appliance.audit.verification import verify
+from appliance.base import clock
 from appliance.signing.signed_statements import Removal
 from tests.support.audit import decision, settle
+from tests.support.engines import ByHand
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
-from tests.unit.audit.test_retention import await_removal, make_old
+from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
 pytestmark = pytest.mark.nightly
 
@@ -40,7 +42,7 @@ def forge(path: Path, proof: dict[str, object] | None = None) -> RemovedRange:
     assert gone is not None
     detail = gone._asdict() | {"count": gone.last_sequence - gone.first_sequence + 1} | (proof or {})
     report = AuditRecord(
-        id=f"{time.time_ns():016x}0000", time=time.time_ns(), event="records removed", severity=Severity.NOTICE,
+        id=f"{clock.wall_ns():016x}0000", time=clock.wall_ns(), event="records removed", severity=Severity.NOTICE,
         reason="older than 30.0 days", detail=detail,
     )  # fmt: skip
     writer.remove(gone, report)
@@ -101,12 +103,15 @@ def test_another_signature_does_not_help(fresh: Path, whose: str) -> None:
     assert kinds(verify(fresh)) == {FindingKind.REMOVAL_UNFOUNDED}
 
 
-def test_a_signed_removal_covers_no_other(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_a_signed_removal_covers_no_other(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """After a real removal of old records, its signature does not cover a removal of new ones."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log, decision="deny", host="10.0.0.66"))
-    await_removal(path, 1900)
+    retain(log, time)
+    assert first_sequence(path) > 1900
     for number in range(300):
         log.record(decision(log, number))
         if number % 100 == 99:
@@ -120,7 +125,7 @@ def test_a_signed_removal_covers_no_other(make_log: MakeLog, path: Path, notary:
 
 
 def test_the_signer_refuses_removals_beyond_its_settings(
-    make_log: MakeLog, path: Path, notary: Notary
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
 ) -> None:
     """A control that asks for more than the signer's settings allow gets no signature, and all records stay."""
     make_old(make_log, notary)
@@ -128,12 +133,8 @@ def test_the_signer_refuses_removals_beyond_its_settings(
     notary.kept = type(notary.kept)()  # forever
     log.record(decision(log))
     settle(log)
-    deadline = time.monotonic() + 30
-    while log.degraded is None:
-        assert time.monotonic() < deadline
-        log.record(decision(log))
-        settle(log)
-    assert "the signer refuses" in log.degraded
+    retain(log, time)
+    assert "the signer refuses" in (log.degraded or "")
     log.close()
     assert next(export(path, Filter())).sequence == 1
     assert verify(path).ok
@@ -162,7 +163,7 @@ def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
 
 def test_an_old_log_is_continued(old: Path) -> None:
     """This version continues the log; after its first checkpoint, every further removal must be signed."""
-    log = AuditLog(old, checkpoint_every=10)
+    log = AuditLog(old, drive=ByHand, checkpoint_every=10)
     for number in range(50):
         log.record(decision(log, number))
         settle(log)

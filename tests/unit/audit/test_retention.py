@@ -2,8 +2,6 @@
 
 import itertools
 import sqlite3
-import threading
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -11,47 +9,57 @@ from typing import Any
 import pytest
 
 from appliance.audit.chain_findings import FindingKind
+from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
 from appliance.audit.verification import verify
+from appliance.base import clock
 from tests.support.audit import decision, settle
-from tests.support.waiting import eventually
+from tests.support.engines import let_pass
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 
 pytestmark = pytest.mark.nightly
 
 _DAY = 86_400_000_000_000
-_LIMIT_SECONDS = 30
 
 
-def await_removal(path: Path, through: int = 1) -> None:
-    """Wait until retention removed the records up to a sequence."""
-    eventually(lambda: next(export(path, Filter(), page=1)).sequence > through, "they are removed")
+def first_sequence(path: Path) -> int:
+    """Return the sequence of the oldest record."""
+    return next(export(path, Filter(), page=1)).sequence
+
+
+def retain(log: AuditLog, time: VirtualClock) -> None:
+    """Let a minute pass, in which the log removes what it may."""
+    let_pass(log, time, 60)
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:
     """Make a log of 2000 records that were made and signed a week ago."""
     notary.ago = 7 * _DAY
-    clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
-    log = make_log(checkpoint_every=100, clock=lambda: next(clock))
+    old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
+    log = make_log(checkpoint_every=100, clock=lambda: next(old))
     for number in range(2000):
-        log.record(decision(log, number, time=next(clock), reason=f"old {number}"))
+        log.record(decision(log, number, time=next(old), reason=f"old {number}"))
         if number % 100 == 99:
             settle(log)
-    log.record(decision(log, time=next(clock)))
+    log.record(decision(log, time=next(old)))
     log.close()
     notary.ago = 0
 
 
-def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_old_records_are_removed_and_that_is_recorded(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """Records past the limit are removed, the log names them, and verification proves the rest."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
     log.record(fresh)
-    await_removal(path, 1900)
+    retain(log, time)
+    assert first_sequence(path) > 1900
     settle(log)
     log.close()
     reports = [entry.record for entry in export(path, Filter(event="records removed"))]
@@ -68,31 +76,38 @@ def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: P
     assert result.removed == removed
 
 
-def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_removal_by_age_waits_for_receipts(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """With `fleet.retention_waits`, old records stay until the collector has them; then they are removed."""
     make_old(make_log, notary)
     received = [700]
     log = make_log(checkpoint_every=100, retention=Retention(days=1, collected=lambda: received[0]))
     log.record(decision(log))
     settle(log)
-    eventually(lambda: next(export(path, Filter(), page=1)).sequence > 400, "the collected ones are removed")
+    retain(log, time)
     log.housekeeping.remover.sealed()
-    assert next(export(path, Filter(), page=1)).sequence <= 701
+    retain(log, time)
+    assert 400 < first_sequence(path) <= 701
     received[0] = 2100
     log.housekeeping.remover.sealed()
-    await_removal(path, 1900)
+    retain(log, time)
+    assert first_sequence(path) > 1900
     log.close()
     assert verify(path).ok
 
 
-def test_removal_by_size_does_not_wait_for_receipts(make_log: MakeLog, path: Path) -> None:
+def test_removal_by_size_does_not_wait_for_receipts(
+    make_log: MakeLog, path: Path, time: VirtualClock
+) -> None:
     """The log's size limit wins: uncollected records are removed."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20, collected=lambda: 0))
     for number in range(6000):
         log.record(decision(log, number, reason="x" * 400))
         if number % 200 == 199:
             settle(log)
-    await_removal(path)
+    retain(log, time)
+    assert first_sequence(path) > 1
 
 
 def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
@@ -106,9 +121,11 @@ def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
     assert search(path, Filter()).entries[-1].sequence
 
 
-def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_records_with_future_times_delay_no_removal(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """After a year of a fast clock, its records delay no removal and are not removed early."""
-    now = itertools.count(time.time_ns() - 7 * _DAY, 1000)
+    now = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
     notary.ago, ahead = 7 * _DAY, 0
     log = make_log(checkpoint_every=10, clock=lambda: next(now) + ahead)
     for ahead in (0, 365 * _DAY, 0):
@@ -120,12 +137,15 @@ def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Pat
     notary.ago = 0
     log = make_log(checkpoint_every=10, retention=Retention(days=1))
     log.record(decision(log))
-    await_removal(path, 250)
+    retain(log, time)
+    assert first_sequence(path) > 250
     log.close()
     assert verify(path).ok
 
 
-def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_waiting_for_the_signers_clock_is_not_an_alarm(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """The machine's clock is a year ahead: the signer waits, nothing is removed, and no delay is reported."""
     log = make_log(checkpoint_every=10, retention=Retention(days=30))
     for number in range(100):
@@ -136,17 +156,18 @@ def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: 
     told: list[bool] = []
     notary.refused = told.append
     log = make_log(
-        checkpoint_every=10, retention=Retention(days=30), clock=lambda: time.time_ns() + 365 * _DAY
+        checkpoint_every=10, retention=Retention(days=30), clock=lambda: clock.wall_ns() + 365 * _DAY
     )
     log.record(decision(log))
     settle(log)
-    eventually(lambda: told, "it was refused")
-    settle(log)
+    retain(log, time)
     assert (told[0], log.degraded) == (True, None)
-    assert next(export(path, Filter(), page=1)).sequence == 1
+    assert first_sequence(path) == 1
 
 
-def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: Path) -> None:
+def test_a_log_past_its_size_loses_its_oldest_records(
+    make_log: MakeLog, path: Path, time: VirtualClock
+) -> None:
     """The log stays near its limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     for number in range(12_000):
@@ -154,31 +175,27 @@ def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: P
         if number % 200 == 0:
             settle(log)
     settle(log)
-    await_removal(path)
-    end, tick = time.monotonic() + _LIMIT_SECONDS, threading.Event()
-    while next(export(path, Filter(), page=1)).sequence < 3000:
-        assert time.monotonic() < end
-        log.record(decision(log))
-        tick.wait(0.05)
+    retain(log, time)
+    assert first_sequence(path) > 3000
     log.close()
     result = verify(path)
     assert result.ok, result.findings
     assert "larger than" in search(path, Filter(event="records removed")).entries[0].record.reason
 
 
-def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> None:
+def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
     """A flood of allows removes no denial: each denial is copied with its id, time and original position."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
     log.record(early)
-    end = time.monotonic() + 3 * _LIMIT_SECONDS
     number = 0
-    while not (first := next(export(path, Filter(), page=1), None)) or first.sequence < 3000:
-        assert time.monotonic() < end
+    while first_sequence(path) < 3000:
+        assert number < 20_000
         for _ in range(200):
             number += 1
             log.record(decision(log, number))
         settle(log)
+        let_pass(log, time, 5)
     settle(log)
     log.close()
     (kept,) = search(path, Filter(decision=("deny",))).entries
@@ -197,7 +214,7 @@ def denial(number: int, host: str, **fields: Any) -> AuditRecord:
     )
 
 
-def test_a_flood_of_denials_leaves_those_of_other_hosts() -> None:
+def test_a_flood_of_denials_leaves_those_of_other_hosts(time: VirtualClock) -> None:
     """At most half of the removed records are copied: alarms first, then hosts in turn.
 
     Unknown hosts count as one host.
@@ -217,10 +234,10 @@ def test_a_flood_of_denials_leaves_those_of_other_hosts() -> None:
 
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     """Records that the signer has not signed yet stay, however old."""
-    clock = itertools.count(time.time_ns() - 7 * _DAY, 1000)
-    log = make_log(checkpoint_every=100, clock=lambda: next(clock), signer=lambda number, text: None)
+    old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
+    log = make_log(checkpoint_every=100, clock=lambda: next(old), signer=lambda number, text: None)
     for number in range(1000):
-        log.record(decision(log, number, time=next(clock)))
+        log.record(decision(log, number, time=next(old)))
     settle(log)
     log.close()
     log = make_log(retention=Retention(days=1), signer=lambda number, text: None)
@@ -230,12 +247,15 @@ def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     assert next(export(path, Filter())).sequence == 1
 
 
-def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary: Notary) -> None:
+def test_removal_beyond_retention_is_found(
+    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+) -> None:
     """Removing more records than the retention record names is found."""
     make_old(make_log, notary)
     log = make_log(retention=Retention(days=1))
     log.record(decision(log))
-    await_removal(path)
+    retain(log, time)
+    assert first_sequence(path) > 1
     log.close()
     first = next(export(path, Filter())).sequence
     with closing(sqlite3.connect(path)) as attacker:

@@ -24,9 +24,9 @@ from appliance.audit.segments import (
     write_segment,
 )
 from tests.support.audit import decision, settle
-from tests.support.waiting import eventually
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
-from tests.unit.audit.test_retention import await_removal, make_old
+from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
 pytestmark = pytest.mark.nightly
 
@@ -44,7 +44,7 @@ def segments(make_log: MakeLog, path: Path) -> list[bytes]:
     """Return the first three segments of a real log; its last checkpoint, that of its end, is not signed."""
     log = make_log(checkpoint_every=5)
     fill(log, 21)
-    eventually(lambda: len(signed_checkpoints(path)) == 4, "four checkpoints are signed")
+    assert len(signed_checkpoints(path)) == 4
     assert log.close() is None
     return [written(path, number) for number in (1, 2, 3)]
 
@@ -185,13 +185,14 @@ def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: 
 
 
 def test_retention_leaves_a_segment_after_the_removed_records(
-    make_log: MakeLog, path: Path, notary: Notary, public: bytes
+    make_log: MakeLog, path: Path, notary: Notary, public: bytes, time: VirtualClock
 ) -> None:
     """After a removal, the first remaining checkpoint has a segment, which begins after the removed records."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
-    await_removal(path, 1900)
+    retain(log, time)
+    assert first_sequence(path) > 1900
     settle(log)
     number = next_segment(path, 0)
     assert number is not None

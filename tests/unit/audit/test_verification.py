@@ -24,7 +24,7 @@ from appliance.audit.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.verification import verify
 from appliance.signing.signed_statements import parse_checkpoint
 from tests.support.audit import decision, settle
-from tests.support.waiting import eventually
+from tests.support.engines import ByHand
 from tests.unit.audit.conftest import MakeLog
 from tests.unit.transcripts import transcripts
 
@@ -75,17 +75,18 @@ def test_a_first_signature_during_the_verification_has_its_key(
 ) -> None:
     """The key is read after the log, because it is pinned before its first signature is stored."""
     asked: list[tuple[int, bytes]] = []
-    log = AuditLog(path, checkpoint_every=5, signer=lambda *one: asked.append(one))
+    log = AuditLog(path, drive=ByHand, checkpoint_every=5, signer=lambda *one: asked.append(one))
     for number in range(10):
         log.record(decision(log, number))
     assert settle(log) is None
-    eventually(lambda: asked, "the log asks for a signature")
+    assert asked
     usual = getattr(verification, moment)
 
     def sign(*arguments: Any, **options: Any) -> Any:
         for number, text in asked:
             log.signed(number, key.sign(text), key.public_key().public_bytes_raw())
-        eventually(lambda: signed_checkpoints(path), "it is stored")
+        settle(log)
+        assert signed_checkpoints(path)
         return usual(*arguments, **options)
 
     monkeypatch.setattr(verification, moment, sign)

@@ -24,6 +24,7 @@ from appliance.backup.create import back_up, copy_database
 from appliance.backup.restore import restore
 from appliance.ipsec.signed_checkpoints import CheckpointMemory
 from tests.support.audit import decision, settle
+from tests.support.engines import open_log
 from tests.support.requirements import need_root
 from tests.support.small_disk import small_disk
 
@@ -44,7 +45,7 @@ def state(tmp_path: Path) -> Path:
         logs[0].signed(number, key.sign(text), key.public_key().public_bytes_raw())
 
     logs: list[AuditLog] = []
-    logs.append(AuditLog(state / "control" / "audit.db", checkpoint_every=5, signer=sign))
+    logs.append(open_log(state / "control" / "audit.db", checkpoint_every=5, signer=sign))
     for number in range(30):
         logs[0].record(decision(logs[0], number))
         assert settle(logs[0]) is None

@@ -19,6 +19,7 @@ from tests.support.answers import example
 from tests.support.appliance_pair import four_takeovers, play
 from tests.support.audit import decision, settle
 from tests.support.bags import make_bag, number
+from tests.support.engines import open_log
 from tests.support.fake_appliance import FakeAppliance
 from tests.support.transcript import Section, Transcript, sections
 
@@ -43,7 +44,7 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
     file, key = Path("state/control/audit.db"), Ed25519PrivateKey.generate()
     file.parent.mkdir(exist_ok=True)
     public, logs = key.public_key().public_bytes_raw(), list[AuditLog]()
-    log = AuditLog(
+    log = open_log(
         file,
         checkpoint_every=10 if signed else 1000,
         signer=lambda number, text: (

@@ -26,6 +26,7 @@ from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.control_parts import OPEN, ControlParts
+from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -73,7 +74,7 @@ class Control(ControlParts):
         super().__init__()
         state.mkdir(exist_ok=True)
         (state / "policy.ini").write_text(text)
-        self.state = StateStore(state, failed=print)
+        self.state = StateStore(state, failed=print, kind=InlineDatabase)
         self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
         self.policies = Policies(

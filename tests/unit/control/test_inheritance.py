@@ -10,6 +10,7 @@ from appliance.control.lease_client import LeaseClient
 from appliance.control.replication import Pair
 from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
 from tests.support.standby_site import memberships
 
 pytestmark = pytest.mark.nightly
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.nightly
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
     """Yield a state file, which both appliances share here, as the replication makes both equal."""
-    made = StateStore(tmp_path, failed=pytest.fail)
+    made = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield made
     made.close()
 

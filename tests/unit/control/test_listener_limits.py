@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import export
 from appliance.configuration.settings import Settings
@@ -20,6 +19,7 @@ from appliance.rpc.connection_table import ConnectionTable, Stage
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
+from tests.support.engines import open_log
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -33,7 +33,7 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
     given = Settings()
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
-    log = AuditLog(tmp_path / "audit.db")
+    log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
 
@@ -77,7 +77,7 @@ def test_hosts_of_a_wildcard_share_processor_time() -> None:
 def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
     """Return limits under a policy that names `ROBOT` and admits all others by `*`; one of the others is registered."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
-    log = AuditLog(tmp_path / "audit.db")
+    log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     yield ListenerLimits(
         Settings(),
@@ -103,7 +103,7 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
 def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
     """Two hundred hosts of `*` register a node each and keep connecting: the slots reserved for the robot stay free."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
-    log = AuditLog(tmp_path / "audit.db")
+    log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
     table = limits.connection_table
@@ -163,7 +163,7 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
         f"[Options]\ntell = {tell}\naudit-only = all\n[Nodes]\ndefault = *\n", file="a.ini"
     )
     blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
-    log = AuditLog(tmp_path / "audit.db")
+    log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
     refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))

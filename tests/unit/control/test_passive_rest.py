@@ -22,6 +22,7 @@ from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.state_file import StateStore
 from tests.support.answers import example
+from tests.support.engines import InlineDatabase
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -45,7 +46,7 @@ def made(name: str) -> tuple[TokenRow, str]:
 
 def save(folder: Path, *rows: TokenRow) -> None:
     """Store tokens, as replication does."""
-    store = StateStore(folder, failed=pytest.fail)
+    store = StateStore(folder, failed=pytest.fail, kind=InlineDatabase)
     store.save_tokens(*rows)
     store.close()
 

@@ -26,6 +26,7 @@ from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
+from tests.support.engines import InlineDatabase
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 from tests.support.virtual_clock import ShiftedClock, VirtualClock
 
@@ -62,7 +63,7 @@ class Appliance:
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
         """Run control until the block ends; yield its policies."""
-        store = StateStore(self.state, failed=fail)
+        store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         records = cast(Any, Records())
         policies = Policies(
             self.file,

@@ -16,6 +16,7 @@ from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reconcile.enactor import Enactor, write
 from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
+from tests.support.engines import InlineDatabase
 from tests.support.idle import idle, idle_class
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -37,7 +38,7 @@ class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
 
 async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
     """The policy may have changed while control was stopped: the new one applies once all nodes are restored."""
-    store = StateStore(tmp_path, failed=fail)
+    store = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
     before = Registry()
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/n", host, parse_node_uri(URI), URI, "10.0.0.1", 19001, 19002)
@@ -70,7 +71,7 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
 
 def test_requests_in_progress_are_stored_before_the_end(tmp_path: Path) -> None:
     """A request that changes state during the shutdown is written before the store is closed."""
-    store = StateStore(tmp_path, failed=fail)
+    store = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
 
     async def scenario() -> bool:
         under_way = asyncio.Event()
@@ -90,6 +91,6 @@ def test_requests_in_progress_are_stored_before_the_end(tmp_path: Path) -> None:
 
     assert asyncio.run(scenario())
     store.close()
-    again = StateStore(tmp_path, failed=fail)
+    again = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
     assert again.database.query("SELECT value FROM setting WHERE name = 'ended'") == [("yes",)]
     again.close()

@@ -9,6 +9,7 @@ import pytest
 
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
 
 pytestmark = pytest.mark.nightly
 
@@ -41,7 +42,7 @@ class Scene:
 @pytest.fixture
 def scene(tmp_path: Path) -> Iterator[Scene]:
     """Return a scene where everything is enabled."""
-    store = StateStore(tmp_path, failed=pytest.fail)
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield Scene(store)
     store.close()
 

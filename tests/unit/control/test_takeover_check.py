@@ -18,6 +18,7 @@ from appliance.specifications.specification_revisions import text_of
 from appliance.standby.membership import Membership
 from appliance.store.state_file import IncarnationRow, MonitorRevisionRow, RevisionRow, StateStore
 from tests.support.appliance import OPEN_POLICY
+from tests.support.engines import InlineDatabase
 from tests.support.site_key import LINE, signed
 from tests.support.standby_site import memberships
 from tests.unit.specifications.monitor_desk import TEXTS, here
@@ -36,7 +37,7 @@ class Standby:
         self.monitors.mkdir()
         self.policy = home / "policy.ini"
         self.policy.write_text(OPEN_POLICY)
-        self.store = StateStore(home / "control", failed=pytest.fail)
+        self.store = StateStore(home / "control", failed=pytest.fail, kind=InlineDatabase)
         self.membership = memberships(home)[0]["b"]
         self.compilations = 0
         self.store.save_revision(self.revision(OPEN_POLICY))

@@ -166,7 +166,7 @@ def test_the_state_has_a_takeover_only_once_its_record_is_on_disk(tmp_path: Path
         await a.recorder.took_over(1)
         assert "last takeover" not in a.store.settings()
         a.path.with_name("away").rename(a.path)
-        await asyncio.to_thread(eventually, lambda: a.log.failed is None, "the log is written again")
+        assert await a.log.wait_durable() is None
         await a.recorder.took_over(1)
         assert a.store.settings()["last takeover"] == '{"epoch":1,"appliance":"a"}'
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.base.clock import using
@@ -23,6 +22,7 @@ from appliance.store.access_tokens import is_secret, parse_token
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.engines import InlineDatabase, open_log
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -33,7 +33,7 @@ class Lives:
 
     def __init__(self, home: Path) -> None:
         self.home = home
-        self.log = AuditLog(home / "audit.db")
+        self.log = open_log(home / "audit.db")
         self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
         self.store: StateStore | None = None
 
@@ -46,7 +46,7 @@ class Lives:
         """Start control after the previous one died."""
         if self.store is not None:
             self.store.close()
-        self.store = StateStore(self.home, failed=pytest.fail)
+        self.store = StateStore(self.home, failed=pytest.fail, kind=InlineDatabase)
         return TokenOrders(self.store, self.trail, lambda: None)
 
 
@@ -267,7 +267,7 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
         for path, data in state.items():
             path.write_bytes(data)
         ahead.write_bytes(whole[:length])
-        store = StateStore(lives.home, failed=pytest.fail)
+        store = StateStore(lives.home, failed=pytest.fail, kind=InlineDatabase)
         usable = [row.id for row in store.tokens() if row.usable(time.time())]
         store.close()
         assert len(usable) == 1
@@ -278,7 +278,7 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
 
 async def _rotate_and_die(lives: Lives) -> None:
     """Rotate in a new control that is killed before its writer writes."""
-    store = StateStore(lives.home, failed=pytest.fail)
+    store = StateStore(lives.home, failed=pytest.fail, kind=InlineDatabase)
     # The writer never gets to it.
     pytest.MonkeyPatch().setattr(store.database, "_commit", lambda _statements: None)
 

@@ -24,10 +24,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.copies import signed_checkpoints
-from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.retention import Retention
 from appliance.audit.search import search
+from appliance.base import clock
 from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import bundle_verifier
@@ -35,9 +35,11 @@ from appliance.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
+from tests.support.engines import open_log
 from tests.support.examples import examples
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
-from tests.unit.audit.test_retention import await_removal, make_old
+from tests.unit.audit.test_retention import make_old, retain
 from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
 
 pytestmark = pytest.mark.nightly
@@ -604,10 +606,12 @@ def test_records_removed_by_retention_are_listed(
 ) -> None:
     """The result names the removed loads and says that the state before them is unknown."""
     make_old(make_log, notary)
-    log = make_log(checkpoint_every=100, retention=Retention(days=1))
-    log.record(decision(log))
-    await_removal(path, 1900)
-    log.close()
+    passing = VirtualClock()
+    with clock.using(passing):
+        log = make_log(checkpoint_every=100, retention=Retention(days=1))
+        log.record(decision(log))
+        retain(log, passing)
+        log.close()
     running = Control(make_log())
     running.begun = 0
     running.work()
@@ -647,7 +651,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without an answer the export ends after a timeout and names the signer."""
     monkeypatch.setattr("appliance.control.evidence_orders.SEAL_SECONDS", 0.2)
-    log = AuditLog(path, signer=lambda _number, _text: None)
+    log = open_log(path, signer=lambda _number, _text: None)
     running = Control(log)
     running.work()
     with pytest.raises(BundleError, match=r"cannot be sealed.*the signer has not answered within 0\.2 s"):

@@ -14,7 +14,6 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from appliance.audit.log import AuditLog
 from appliance.base.clock import using
 from appliance.channel.admin import (
     AuthorityWanted,
@@ -68,6 +67,7 @@ from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
+from tests.support.engines import InlineDatabase, open_log
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
 
@@ -89,8 +89,8 @@ class Bench:
         self.answer = TunnelsEnclosed("kernel")
         self.asked: list[Message] = []
         self.order: list[str] = []
-        self.store = StateStore(directory, failed=pytest.fail)
-        self.log = AuditLog(directory / "audit.db")
+        self.store = StateStore(directory, failed=pytest.fail, kind=InlineDatabase)
+        self.log = open_log(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
         self.authority = NearAuthority(directory)
         self.trail = RecordingTrail(self.log)

@@ -15,6 +15,7 @@ from appliance.base.clock import using
 from appliance.hosts.revoked_certificates import RevokedCertificates
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
 from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.nightly
@@ -32,7 +33,7 @@ def serials(count: int) -> list[str]:
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
     """A state."""
-    one = StateStore(tmp_path, failed=pytest.fail)
+    one = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield one
     one.close()
 
@@ -60,7 +61,7 @@ def test_a_certificate_is_on_the_list_until_it_has_expired(store: StateStore) ->
 def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None:
     """After a wrong year was set and corrected, revoked certificates are still listed, also after a restart."""
     now = time.time()
-    store = StateStore(tmp_path, failed=pytest.fail)
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
     with using(VirtualClock(wall=now + 366 * DAY)):
         revoked = RevokedCertificates(store.hosts)
@@ -68,7 +69,7 @@ def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None
         assert revoked.listed({"a"}) == []
         assert revoked.missing({"a"}) == revoked.wait_for_room({"a"}) == 0
     store.close()
-    again = StateStore(tmp_path, failed=pytest.fail)
+    again = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     assert [row.serial for row in RevokedCertificates(again.hosts).listed({"a"})] == ["a1"]
     again.close()
 
@@ -76,7 +77,7 @@ def test_a_clock_that_was_ahead_unrevokes_no_certificate(tmp_path: Path) -> None
 def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
     """Long expired ones are dropped; one without a stored expiry is kept as long as it could be valid."""
     now = time.time()
-    first = StateStore(tmp_path, failed=pytest.fail)
+    first = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     revoked = RevokedCertificates(first.hosts)
     revoked.add("a", "a1", now + DAY)
     revoked.add("a", "a2", now - 401 * DAY)
@@ -87,10 +88,10 @@ def test_revoked_certificates_are_kept_over_restarts(tmp_path: Path) -> None:
             ("b2", now - 800 * DAY),
         ):  # as a version before has written
             database.execute("INSERT INTO revoked_certificate VALUES (?, ?)", (serial, moment))
-    second = StateStore(tmp_path, failed=pytest.fail)
+    second = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     assert [row.serial for row in RevokedCertificates(second.hosts).listed({"a"})] == ["a1", "b1"]
     second.close()
-    third = StateStore(tmp_path, failed=pytest.fail)
+    third = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     assert {row.serial for row in third.hosts.revoked()} == {"a1", "b1"}
     third.close()
 

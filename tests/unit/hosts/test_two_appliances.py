@@ -16,6 +16,7 @@ from appliance.hosts.shared_authority import SharedAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
 from tests.support.near_authority import NearAuthority
 from tests.support.virtual_clock import VirtualClock
 
@@ -28,7 +29,7 @@ PIN = "sha256//" + 43 * "A" + "="
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
     """Return the state that both appliances have, one after the other."""
-    opened = StateStore(tmp_path, failed=pytest.fail)
+    opened = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield opened
     opened.close()
 

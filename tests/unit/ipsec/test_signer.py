@@ -21,7 +21,6 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.audit.checkpoints import read_signer_memory
-from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.audit.signatures import read_public_key
@@ -52,6 +51,7 @@ from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.removals import RetentionLimits
 from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle
+from tests.support.engines import open_log
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -204,7 +204,7 @@ def test_log_and_signer_together(signer: SignerProcess, tmp_path: Path) -> None:
     """Checkpoints made while the signer was away are signed when it is back, and the log is verifiable."""
     path = tmp_path / "audit.db"
     link: list[Channel] = []
-    log = AuditLog(
+    log = open_log(
         path,
         checkpoint_every=10,
         signer=lambda number, text: link[0].send(SignatureWanted(number, text)) if link else None,

@@ -20,6 +20,7 @@ from appliance.control.rest import RestLink
 from appliance.control.token_orders import TokenOrders
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
+from tests.support.engines import InlineDatabase
 from tests.support.heard import Heard
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -32,7 +33,7 @@ class World:
     """The parts of control that note orders and records."""
 
     def __init__(self, directory: Path) -> None:
-        self.store = StateStore(directory, failed=lambda _text: None)
+        self.store = StateStore(directory, failed=lambda _text: None, kind=InlineDatabase)
         self.done: list[tuple[AnyRequest, str]] = []
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None

@@ -12,7 +12,6 @@ import msgspec
 import pytest
 from rosbags.rosbag1 import Reader
 
-from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.configuration.settings import RecorderRules
@@ -23,6 +22,7 @@ from appliance.recorder.recording_store import MOST_TEMPORARY, RecordingStore
 from appliance.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
 from appliance.relay.recorder_ring import ExcludedStream
 from tests.support.audit import decision, settle
+from tests.support.engines import open_log
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
 pytestmark = pytest.mark.nightly
@@ -40,7 +40,7 @@ class Scene:
         self.disk = disk
         self.folder = folder / "recordings"
         self.folder.mkdir(exist_ok=True)
-        self.log = AuditLog(folder / "audit.db", clock=self.clock)
+        self.log = open_log(folder / "audit.db", clock=self.clock)
         settle(self.log)
         self.rules = RecorderRules(**{"enabled": True, "before": 10, "after": 5, "longest": 60} | rules)
         self.memory = memoryview(mmap.mmap(-1, SMALLEST))

@@ -25,7 +25,6 @@ import msgspec
 import pytest
 from msgspec.structs import asdict
 
-from appliance.audit.log import AuditLog
 from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
 from appliance.channel.answers.monitor_answers import Replacement
@@ -45,6 +44,7 @@ from appliance.specifications.specification_manager import (
 from appliance.specifications.specification_revisions import Check
 from appliance.store.state_file import StateStore
 from tests.support.audit import RecordingTrail
+from tests.support.engines import InlineDatabase, open_log
 from tests.support.stated import parts_here
 
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
@@ -77,9 +77,9 @@ class Desk:
         self.home, self.folder = home, home / "monitors"
         self.folder.mkdir()
         (self.folder / "a.rv").write_text(A)
-        self.log = AuditLog(home / "audit.db")
+        self.log = open_log(home / "audit.db")
         self.trail = RecordingTrail(self.log)
-        self.store = StateStore(home, failed=pytest.fail)
+        self.store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
         self.began: list[str] = []

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import export
 from appliance.channel.messages import MonitorEvent
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import settle
+from tests.support.engines import open_log
 
 pytestmark = pytest.mark.nightly
 
@@ -20,7 +20,7 @@ NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", 
 @pytest.mark.parametrize("kind", ["verdict", "drop", "change", "fault", "log", "publish"])
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     """A verdict has a category of its own, and a robot may use any names."""
-    log = AuditLog(tmp_path / "audit.db")
+    log = open_log(tmp_path / "audit.db")
     records = MonitorRecords(
         AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {}),
         lambda _topic, _data: None,

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.log import AuditLog
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
@@ -19,6 +18,7 @@ from appliance.specifications.specification_files import (
 )
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import RecordingTrail
+from tests.support.engines import open_log
 from tests.support.stated import parts_here
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
@@ -105,7 +105,7 @@ class World:
     """Two relays with the monitors `a` and `b`, one on each, and their topics carried."""
 
     def __init__(self, home: Path) -> None:
-        self.log = AuditLog(home / "audit.db")
+        self.log = open_log(home / "audit.db")
         self.trail = RecordingTrail(self.log)
         self.fleet = Fleet(self.trail)
         self.rollout = self.fleet.rollout
@@ -313,7 +313,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     files = {"b": spec("b", "/b"), "z": spec("z", "/z")}
     allocation.adopt(allocation.plan(revision(1, **files).checked))
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
-    log = AuditLog(tmp_path / "other.db")
+    log = open_log(tmp_path / "other.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     after = Fleet(trail).rollout
     await after.start(revision(1, **files), restarted=True, kept=kept[-1])

@@ -24,7 +24,8 @@ from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.changes import Change, Delete, Put
 from appliance.store.state_file import SCHEMA as WHOLE_SCHEMA
 from appliance.store.state_file import StateStore
-from appliance.store.writer_thread import Database, StoreError
+from appliance.store.writer_thread import StoreError
+from tests.support.engines import InlineDatabase
 from tests.support.replication import SCHEMA, tables_of
 from tests.support.small_disk import small_disk
 
@@ -232,7 +233,7 @@ def test_an_appliance_that_was_active_needs_a_snapshot(tmp_path: Path) -> None:
     with pytest.raises(ReplicationError, match="another history"):
         again.take(changes(thing("a"), first=9))
     again.close()
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = InlineDatabase(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     database.put("thing", "more", 1, None)
     database.close()
     last = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
@@ -242,7 +243,7 @@ def test_an_appliance_that_was_active_needs_a_snapshot(tmp_path: Path) -> None:
 
 def test_all_tables_of_the_state_can_be_copied(tmp_path: Path) -> None:
     """Every column has a type that is checked; rows of the state as it is written today are accepted."""
-    store = StateStore(tmp_path, failed=pytest.fail)
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
         found = {name for (name,) in reader.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
     assert found == {*store.database.tables, "journal"}
@@ -257,7 +258,7 @@ def test_all_tables_of_the_state_can_be_copied(tmp_path: Path) -> None:
     replica.take(SnapshotRows([Put(table, [row]) for table, row in rows.items()]))
     replica.take(SnapshotEnd(3))
     replica.close()
-    again = StateStore(tmp_path, failed=pytest.fail)
+    again = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     assert (again.settings(), again.tokens()[0].name) == ({"name": "value"}, "name")
     assert again.database.number == 7
     again.close()

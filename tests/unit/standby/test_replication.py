@@ -48,7 +48,7 @@ from appliance.store.state_file import (
     RevisionRow,
     StateStore,
 )
-from appliance.store.writer_thread import Database
+from tests.support.engines import InlineDatabase
 from tests.support.processes import LIMIT
 from tests.support.replication import (
     SCHEMA,
@@ -475,7 +475,7 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
     """Control finds on the standby what it has saved on the active appliance, by snapshot and by changes."""
     for name in ("active", "standby"):
         (tmp_path / name).mkdir()
-    store = StateStore(tmp_path / "active", failed=pytest.fail)
+    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
     node = IncarnationRow("k", "/n", "10.0.0.1", "http://r:1/", "10.0.0.2", 1, 2, True, "live", 1.5, (3, 4))
     token, _text = make_token("alice", "viewer", now=1000.0, seconds=60)
 
@@ -513,7 +513,9 @@ async def test_a_standby_can_take_over_the_whole_state(tmp_path: Path) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
     replica.close()
     await asyncio.to_thread(store.close)
-    expected, found = (StateStore(tmp_path / name, failed=pytest.fail) for name in ("active", "standby"))
+    expected, found = (
+        StateStore(tmp_path / name, failed=pytest.fail, kind=InlineDatabase) for name in ("active", "standby")
+    )
     for table in found.database.tables:
         query = f"SELECT * FROM {table}"  # noqa: S608  a table of the schema
         assert found.database.query(query) == expected.database.query(query), table
@@ -528,7 +530,7 @@ async def test_an_obstacle_to_a_takeover_is_reported_while_the_link_is_open(tmp_
     """The standby learns of each new policy, and the active appliance of an obstacle, its change and its end."""
     (tmp_path / "active").mkdir()
     (tmp_path / "standby").mkdir()
-    store = StateStore(tmp_path / "active", failed=pytest.fail)
+    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
     sender = ReplicationSender(store.database, lambda: 1)
     replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
     revisions: list[int] = []
@@ -676,7 +678,7 @@ async def test_a_standby_introduces_itself_once_an_hour(tmp_path: Path) -> None:
 
 async def test_an_introduction_is_not_an_acknowledgement(tmp_path: Path) -> None:
     """The active appliance passes it on; before the position of the standby it ends the link."""
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = InlineDatabase(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
     sender, heard = ReplicationSender(database, lambda: 1), list[Introduction]()
     sender.on_introduction(heard.append)
     ends, others = await pair_of_streams()

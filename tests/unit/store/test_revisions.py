@@ -10,6 +10,7 @@ from appliance.store import revisions
 from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import StoreError
+from tests.support.engines import InlineDatabase
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -59,7 +60,7 @@ class Keeper(Revisions[MonitorRevisionRow]):
 @pytest.fixture
 def keeper(tmp_path: Path) -> Iterator[Keeper]:
     """Revisions 4, 5 and 7."""
-    store = StateStore(tmp_path, failed=pytest.fail)
+    store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     keeper = Keeper(store)
     for number in (4, 5, 7):
         keeper.change(row(number))

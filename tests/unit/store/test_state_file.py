@@ -17,6 +17,7 @@ from appliance.store.state_file import (
     RevisionRow,
     StateStore,
 )
+from tests.support.engines import InlineDatabase
 
 pytestmark = pytest.mark.nightly
 
@@ -30,7 +31,7 @@ def incarnation(key: str) -> IncarnationRow:
 
 def reopened(directory: Path) -> StateStore:
     """Return the store as the next control finds it."""
-    return StateStore(directory, failed=pytest.fail)
+    return StateStore(directory, failed=pytest.fail, kind=InlineDatabase)
 
 
 def leave_behind(directory: Path, changes: Sequence[Encoded]) -> None:

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import math
 import os
 import signal
 import sqlite3
@@ -19,13 +20,17 @@ from typing import NoReturn
 import msgspec
 import pytest
 
+from appliance.base import clock
 from appliance.store import ahead as ahead_module
 from appliance.store import writer_thread
 from appliance.store.ahead import Encoded, WriteAhead, WriteAheadClosedError
 from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Delete, Put, Tables, joined
 from appliance.store.writer_thread import Database, StoreError
+from tests.support.engines import ByHand, let_pass
 from tests.support.small_disk import small_disk
+from tests.support.virtual_clock import VirtualClock
+from tests.support.waiting import eventually
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -60,7 +65,7 @@ def failures() -> list[str]:
 @pytest.fixture
 def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
     """A new database."""
-    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     yield database
     database.close()
 
@@ -76,33 +81,59 @@ async def test_queued_statements_are_in_the_file_once_settled(database: Database
 
 def test_closing_writes_what_is_left(tmp_path: Path) -> None:
     """Nothing that was queued before `close` is lost."""
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     for number in range(3000):
         database.put("thing", str(number), 1)
     database.close()
-    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert again.query("SELECT count(*) FROM thing") == [(3000,)]
     again.close()
 
 
-async def test_a_write_that_fails_is_tried_again_until_it_succeeds(
-    database: Database, failures: list[str], tmp_path: Path
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have SQLite not wait for locks of other processes."""
+    monkeypatch.setattr(sqlite3, "connect", partial(sqlite3.connect, timeout=0))
+
+
+def test_a_write_that_fails_is_tried_again_until_it_succeeds(
+    impatient: None, tmp_path: Path, failures: list[str]
 ) -> None:
     """While another process locks the file, the failure is reported; afterwards the row is saved."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
-    database.query("SELECT 1")
     blocker.execute("BEGIN EXCLUSIVE")
     database.put("thing", "late", 1)
-    async with asyncio.timeout(60):
-        while not failures:
-            await asyncio.sleep(0.05)
-        blocker.execute("COMMIT")
-        await database.settled()
+    assert database.turn(0) == 0.5
+    database.put("thing", "later", 2)
+    assert database.turn(0.4) == 0.5  # it is not tried again with each change
+    assert database.turn(0.5) == 1.0
+    assert [("locked" in failure) for failure in failures] == [True]
+    blocker.execute("COMMIT")
     blocker.close()
-    assert "locked" in failures[0]
-    assert database.query("SELECT name FROM thing") == [("late",)]
+    assert database.query("SELECT name FROM thing") == []
+    assert database.turn(1.0) == math.inf
+    assert database.query("SELECT name FROM thing") == [("late",), ("later",)]
+    database.close()
 
 
+def test_changes_that_cannot_be_written_at_the_end_are_reported(
+    impatient: None, tmp_path: Path, failures: list[str]
+) -> None:
+    """While another process locks the file, closing reports the unwritten rest, which the next start applies."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
+    blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
+    blocker.execute("BEGIN EXCLUSIVE")
+    database.put("thing", "late", 1)
+    database.close()
+    assert "applied at the next start" in failures[-1]
+    blocker.close()
+    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
+    assert again.query("SELECT name FROM thing") == [("late",)]
+    again.close()
+
+
+@pytest.mark.nightly
 def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[str]) -> None:
     """While another process locks the file, closing ends in time, reports the unwritten rest, and loses nothing."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
@@ -120,14 +151,27 @@ def test_a_failing_write_does_not_delay_the_end(tmp_path: Path, failures: list[s
     again.close()
 
 
+@pytest.mark.nightly
+async def test_a_thread_writes_changes(tmp_path: Path) -> None:
+    """A change is written soon, and when a caller waits at once."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database.put("thing", "a", 1)
+    await database.settled()
+    with sqlite3.connect(tmp_path / "state.db") as other:
+        assert other.execute("SELECT name FROM thing").fetchall() == [("a",)]
+        database.put("thing", "b", 1)
+        eventually(lambda: other.execute("SELECT name FROM thing WHERE name = 'b'").fetchall(), "it is there")
+    database.close()
+
+
 def test_a_waiting_caller_learns_that_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An operator who waits gets an error; once the disk has space again, all queued statements are written."""
-    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
+    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0)
     with small_disk(tmp_path / "disk", "1m") as place:
         failures: list[str] = []
-        database = Database(place / "state.db", SCHEMA, failed=failures.append)
+        database = Database(place / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
         filler = place / "filler"
         with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
             while file.write(bytes(4096)):
@@ -138,10 +182,12 @@ def test_a_waiting_caller_learns_that_the_disk_is_full(
             with pytest.raises(StoreError, match=r"state\.db: .*full; free space"):
                 await database.settled()
             filler.unlink()
-            monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 30)
+            let_pass(database, passing, 1)
             await database.settled()
 
-        asyncio.run(scene())
+        passing = VirtualClock()
+        with clock.using(passing):
+            asyncio.run(scene())
         assert database.query("SELECT name FROM thing") == [("late",)]
         database.close()
 
@@ -150,23 +196,24 @@ async def test_callers_learn_that_writing_has_ended(
     tmp_path: Path, failures: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After a defect of the writer, waiting callers and orders get an error; the next start applies the changes."""
-    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
-    monkeypatch.setattr(threading, "excepthook", lambda _arguments: None)
+    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0)
 
     def defect(_tables: Tables, _change: Change) -> NoReturn:
         raise RuntimeError("unforeseen")
 
-    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     with monkeypatch.context() as broken:
         broken.setattr(Tables, "statement", defect)
         database.put("thing", "a", 1)
+        with pytest.raises(RuntimeError, match="unforeseen"):
+            database.turn(0)
         with pytest.raises(StoreError, match="writing ended: RuntimeError: unforeseen"):
             await database.settled()
         with pytest.raises(StoreError, match="nothing was changed"):
             database.require_room()
         database.close()
     assert failures == [f"{tmp_path / 'state.db'}: writing ended: RuntimeError: unforeseen"]
-    again = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    again = Database(tmp_path / "state.db", SCHEMA, failed=failures.append, drive=ByHand)
     assert again.query("SELECT name FROM thing") == [("a",)]
     again.close()
 
@@ -210,7 +257,7 @@ def test_a_file_that_is_not_a_database_is_an_error_with_a_remedy(tmp_path: Path)
     file = tmp_path / "state.db"
     file.write_bytes(b"this is not a database" * 100)
     with pytest.raises(StoreError, match=r"state\.db.*move the file away"):
-        Database(file, SCHEMA, failed=pytest.fail)
+        Database(file, SCHEMA, failed=pytest.fail, drive=ByHand)
     assert file.read_bytes().startswith(b"this is not")
 
 
@@ -218,28 +265,29 @@ def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) 
     """Tokens, hosts and revocations would be lost silently. A file that is empty before the first start is new."""
     path = tmp_path / "state.db"
     path.touch()
-    Database(path, SCHEMA, failed=print).close()
+    Database(path, SCHEMA, failed=print, drive=ByHand).close()
     os.truncate(path, 0)
     with pytest.raises(
         StoreError, match=r"state\.db: is empty, but was not .*rosrv restore.* move the file away"
     ):
-        Database(path, SCHEMA, failed=print)
+        Database(path, SCHEMA, failed=print, drive=ByHand)
     path.unlink()
-    Database(path, SCHEMA, failed=print).close()
+    Database(path, SCHEMA, failed=print, drive=ByHand).close()
 
 
 def test_an_unwritable_folder_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
     """With a full disk or a missing folder, the message does not ask to move the state away."""
     with pytest.raises(StoreError, match=r"state\.db.*free space") as caught:
-        Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail)
+        Database(tmp_path / "missing" / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert "move" not in str(caught.value)
 
 
+@pytest.mark.nightly
 def test_statements_queued_by_a_killed_process_are_there_after_the_next_start(tmp_path: Path) -> None:
     """Nothing that `put` took is lost to SIGKILL or reordered, whatever the writer thread had done by then."""
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
-    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert again.query("SELECT count(*) FROM thing") == [(5101,)]
     assert again.query("SELECT size FROM thing WHERE name = ?", ("last",)) == [(4999,)]
     again.close()
@@ -271,6 +319,7 @@ def test_rows_of_one_table_are_one_statement(
     assert rows == expected
 
 
+@pytest.mark.nightly
 def test_a_block_of_statements_is_one_write_and_delays_no_other_thread(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -320,7 +369,7 @@ def leave_behind(path: Path, *changes: Encoded) -> None:
 
 def names_after_start(tmp_path: Path) -> list[str]:
     """Start and stop; return the rows then. The file of changes under way must be empty."""
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     names = [name for (name,) in database.query("SELECT name FROM thing ORDER BY name")]
     database.close()
     assert (tmp_path / "state.ahead").stat().st_size == 0
@@ -380,7 +429,7 @@ def test_changes_that_the_database_has_are_not_repeated(tmp_path: Path) -> None:
     assert names_after_start(tmp_path) == []
     file.write_bytes(old)
     assert names_after_start(tmp_path) == []
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert database.number == 2
     database.close()
 
@@ -395,7 +444,7 @@ def test_a_large_value_that_is_lost_takes_no_later_change_with_it(tmp_path: Path
 
 def test_statements_that_an_earlier_release_left_are_executed(tmp_path: Path) -> None:
     """The first start after an upgrade executes the SQL in its file, without a torn last statement."""
-    Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail).close()
+    Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand).close()
     bodies = [
         msgspec.msgpack.encode(("INSERT OR REPLACE INTO thing VALUES (?, ?), (?, ?)", ["a", 1, "b", 2])),
         msgspec.msgpack.encode(("DELETE FROM thing WHERE name = ?", ["a"])),
@@ -411,7 +460,7 @@ def test_a_change_of_a_later_release_is_an_error_that_names_it(tmp_path: Path) -
     leave_behind(tmp_path / "state.ahead", Encoded(1, body))
     before = (tmp_path / "state.ahead").read_bytes()
     with pytest.raises(StoreError, match=r"state\.ahead: the state has no table 'future'"):
-        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     assert (tmp_path / "state.ahead").read_bytes() == before
 
 
@@ -426,6 +475,7 @@ def test_a_change_that_fits_no_table_is_refused_at_once(database: Database) -> N
     assert database.query("SELECT name FROM thing ORDER BY rowid") == [("before",), ("after",)]
 
 
+@pytest.mark.nightly
 def test_a_feed_has_all_changes_of_the_database_in_its_order(tmp_path: Path) -> None:
     """Threads that make changes at once get different numbers; large values are in the feed as well."""
     database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
@@ -482,24 +532,25 @@ def test_numbers_continue_after_each_start_and_each_start_has_its_own_history(tm
     """A start that changes nothing leaves the stored history as it was: another appliance may have the same state."""
     found: list[tuple[str, int]] = []
     for start in range(3):
-        database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+        database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
         assert database.number == 2 * start
         database.put("thing", "a", start)
         database.put("thing", "b", start)
         found.append((database.history, database.number))
         database.close()
-        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail).close()
+        Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand).close()
         with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
             assert reader.execute("SELECT history, number FROM journal").fetchall() == found[-1:]
     assert len(set(found)) == 3
     leave_behind(tmp_path / "state.ahead", encoded(7, "left"))
-    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail, drive=ByHand)
     query = "SELECT history, number FROM journal"
     assert database.query(query) == [(database.history, 7)]
     assert database.number == 7
     database.close()
 
 
+@pytest.mark.nightly
 def test_a_copy_is_of_one_moment_and_leaves_no_file(tmp_path: Path) -> None:
     """Its rows are those up to its number, while another thread writes; a killed process may have left a part."""
     (tmp_path / "state.new").write_bytes(b"a part")
@@ -559,6 +610,7 @@ class _Gate:
         self.closing.set()
 
 
+@pytest.mark.nightly
 def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that has the descriptor's number writes to that file, also if another thread closes it by then."""
     gate = _Gate()
@@ -594,6 +646,7 @@ def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
     assert (tmp_path / "another").read_bytes() == b"untouched"
 
 
+@pytest.mark.nightly
 def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) -> None:
     """While the database closes, each thread that submits learns which of its rows are kept, and these are there."""
     kept: list[str] = []

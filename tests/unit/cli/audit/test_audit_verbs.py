@@ -14,12 +14,12 @@ import pytest
 
 import appliance
 from appliance.api.unrecorded import CATEGORIES
-from appliance.audit.log import AuditLog
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
 from appliance.specifications.allocation import SERVICE, TOPIC
 from tests.support.audit import decision, settle
 from tests.support.command import rosrv
+from tests.support.engines import open_log
 from tests.support.small_disk import small_disk
 
 _EVIL = "/evil\x1b[31m\u202e\r\n[bold]x[/bold]"
@@ -30,7 +30,7 @@ _LIMIT_SECONDS = 60
 def state(tmp_path: Path) -> Path:
     """Return the state directory of a stopped appliance with a short log."""
     (tmp_path / "control").mkdir()
-    log = AuditLog(tmp_path / "control" / "audit.db")
+    log = open_log(tmp_path / "control" / "audit.db")
     for number in range(20):
         log.record(decision(log, number))
     log.record(
@@ -91,7 +91,7 @@ def test_tail_follows(state: Path) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         assert json.loads(process.stdout.readline())["resource"] == "/arm"
-        log = AuditLog(state / "control" / "audit.db")
+        log = open_log(state / "control" / "audit.db")
         log.record(decision(log, decision="allow"))
         log.record(decision(log, decision="deny", resource="/new"))
         assert settle(log) is None

@@ -10,13 +10,14 @@ from appliance.cli.main import app
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory
+from tests.support.engines import InlineDatabase
 
 
 def state_with(tmp_path: Path, who: str) -> Path:
     """Return a state directory whose last specifications were loaded by `who`."""
     home = tmp_path / "control"
     home.mkdir()
-    store = StateStore(home, failed=print)
+    store = StateStore(home, failed=print, kind=InlineDatabase)
     store.save_monitor_revision(MonitorRevisionRow(7, '{"files": {"a.rv": "old"}}', 0.0, who, ""))
     store.close()
     return tmp_path
@@ -32,7 +33,7 @@ def reset(state: Path, *options: str) -> tuple[int, str]:
 
 def last(state: Path) -> MonitorRevisionRow | None:
     """Return the last revision."""
-    store = StateStore(state / "control", failed=print)
+    store = StateStore(state / "control", failed=print, kind=InlineDatabase)
     try:
         return next(iter(store.monitor_revisions(1)), None)
     finally:

@@ -1,0 +1,80 @@
+"""Run an engine in a thread of its own.
+
+An engine has no thread. Its `turn(now)` does the work that is due, and returns the time of the next turn, or None after
+the last one. A driver calls the turns, one at a time: in the product `EngineThread`, in a test the test itself. All
+times are in monotonic seconds.
+"""
+
+import contextvars
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from appliance.base.clock import now
+
+Turn = Callable[[float], float | None]
+
+
+class Driver(Protocol):
+    """Calls the turns of one engine. All methods are thread-safe."""
+
+    def wake(self) -> None:
+        """Call a turn soon, because there is new work."""
+
+    def hurry(self) -> None:
+        """Call a turn at once, because a caller waits."""
+
+    def end(self, seconds: float | None) -> bool:
+        """Call the last turns at once; return whether the engine ended within `seconds` (None: no limit)."""
+
+
+Drive = Callable[[str, Turn, float], Driver]
+"""Makes a driver of the engine with this name and `turn`, and returns it after the first turn.
+
+After `wake`, the driver gathers work for the given number of seconds.
+"""
+
+
+class EngineThread:
+    """A thread that calls the turns of an engine until the last one, or until a defect ends a turn."""
+
+    def __init__(self, name: str, turn: Turn, gather: float) -> None:
+        self._turn = turn
+        self._gather = gather
+        self._wake = threading.Event()
+        self._hurry = threading.Event()
+        self._begun = threading.Event()
+        context = contextvars.copy_context()  # the name of this process, and its clock
+        self._thread = threading.Thread(target=context.run, args=(self._run,), name=name, daemon=True)
+        self._thread.start()
+        self._begun.wait()
+
+    def wake(self) -> None:
+        """Call a turn after the time for gathering."""
+        if not self._wake.is_set():  # `set` takes a lock
+            self._wake.set()
+
+    def hurry(self) -> None:
+        """Call a turn at once."""
+        self._hurry.set()
+        self._wake.set()
+
+    def end(self, seconds: float | None) -> bool:
+        """Call the last turns at once; return whether the thread ended within `seconds` (None: no limit)."""
+        self.hurry()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            due = self._turn(now())
+        finally:
+            self._begun.set()
+        while due is not None:
+            left = due - now()
+            if left > 0 and self._wake.wait(min(left, threading.TIMEOUT_MAX)):
+                self._hurry.wait(self._gather)
+            # Clear both before the turn: work that comes during the turn sets them again.
+            self._hurry.clear()
+            self._wake.clear()
+            due = self._turn(now())
