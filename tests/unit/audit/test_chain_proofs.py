@@ -23,8 +23,6 @@ from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
-pytestmark = pytest.mark.nightly
-
 STRANGE: dict[str, Any] = {
     "text": 'é"\\\n\x1b',
     "number": 0.1,
@@ -64,6 +62,7 @@ def checked(lines: list[dict[str, Any]], place: Path, key: bytes) -> ExportVerif
     return verify_export(place, key)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("wanted", [Filter(), Filter(decision=("deny",)), Filter(resource="/r77")])
 @pytest.mark.parametrize("page", [1000, 7])
 def test_it_verifies_elsewhere(log: Path, public: bytes, tmp_path: Path, wanted: Filter, page: int) -> None:
@@ -124,6 +123,7 @@ def _sign_otherwise(lines: list[dict[str, Any]]) -> None:
             line["chain"]["checkpoint"]["signature"] = "no signature"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "tamper", [_change, _rename, _drop, _swap, _double, _renumber, _shorten, _reseal, _sign_otherwise]
 )
@@ -136,6 +136,7 @@ def test_tampering_is_found(
     assert not checked(lines, tmp_path / "x.ndjson", public).ok
 
 
+@pytest.mark.nightly
 def test_a_rehashed_record_leads_to_no_checkpoint(log: Path, public: bytes, tmp_path: Path) -> None:
     """A forger who recomputes the hashes of the whole export cannot sign a checkpoint."""
     forged_log = AuditLog(tmp_path / "forged.db", drive=ByHand, checkpoint_every=5)
@@ -152,6 +153,7 @@ def test_a_rehashed_record_leads_to_no_checkpoint(log: Path, public: bytes, tmp_
     assert genuine.proven == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("text", ["", "{}\n", "no json\n", '{"chain": {}}\n', "[]\n"])
 def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: str) -> None:
     """A file without records, or whose records have no positions, is never a valid export."""
@@ -166,6 +168,7 @@ def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: 
         verify_export(tmp_path / "missing", public)
 
 
+@pytest.mark.nightly
 def test_an_export_after_retention_is_proved(
     make_log: MakeLog, path: Path, public: bytes, notary: Notary, time: VirtualClock
 ) -> None:
@@ -185,6 +188,7 @@ def test_an_export_after_retention_is_proved(
     assert result.ok, result.findings
 
 
+@pytest.mark.nightly
 def test_a_log_of_version_0_1_0(path: Path, tmp_path: Path) -> None:
     """A whole export of such a log is proved; for a filtered export the result says that it cannot be proved."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))

@@ -25,8 +25,6 @@ from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import retain
 
-pytestmark = pytest.mark.nightly
-
 
 @pytest.fixture
 def log(make_log: MakeLog, path: Path) -> Path:

@@ -158,7 +158,6 @@ def test_no_reason_has_contents_of_messages() -> None:
     assert "secret" not in msgspec.json.encode(of(said)).decode()
 
 
-@pytest.mark.nightly
 def test_the_summary_counts_the_denials_of_a_search(make_log: MakeLog) -> None:
     """It reads the records of `--deny`, in the same time; a folded flood counts with its number."""
     log = make_log()

@@ -19,8 +19,6 @@ from tests.support.engines import ByHand
 from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
 
-pytestmark = pytest.mark.nightly
-
 _HOLD = """\
 import fcntl, os, struct, sys
 descriptor = os.open(sys.argv[1], os.O_RDONLY)
@@ -51,6 +49,7 @@ def log(tmp_path: Path) -> Iterator[AuditLog]:
     log.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("suffix", "byte"), [("-shm", 120), ("-shm", 121), ("-shm", 122), ("", 0x40000000)])
 def test_the_holder_of_a_writers_lock_is_found(log: AuditLog, suffix: str, byte: int) -> None:
     """The kernel's list names the process until it ends."""
@@ -69,6 +68,7 @@ def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
         eventually(lambda: holders(log.path) == [-1], "the lock is found")
 
 
+@pytest.mark.nightly
 def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
     """An unfinished read holds no lock that the writer needs; locks on other files are ignored."""
     with holding(log.path.with_name(log.path.name + "-shm"), 124), holding(Path(__file__), 120):
@@ -82,6 +82,7 @@ def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
     assert holders(log.path.with_name("nowhere.db")) == []
 
 
+@pytest.mark.nightly
 def test_the_log_names_the_process_that_locks_it(
     tmp_path: Path, time: VirtualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,8 +25,6 @@ from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
-pytestmark = pytest.mark.nightly
-
 OLD_LOG = Path(__file__).with_name("log-0.1.0.db.xz")
 
 

@@ -21,8 +21,6 @@ from tests.support.engines import let_pass
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 
-pytestmark = pytest.mark.nightly
-
 _DAY = 86_400_000_000_000
 
 
@@ -232,6 +230,7 @@ def test_a_flood_of_denials_leaves_those_of_other_hosts(time: VirtualClock) -> N
     assert worth_keeping(few, 1) == []
 
 
+@pytest.mark.nightly
 def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     """Records that the signer has not signed yet stay, however old."""
     old = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)

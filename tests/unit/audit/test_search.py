@@ -14,8 +14,6 @@ from appliance.audit.search import Follower, export, search, show
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog
 
-pytestmark = pytest.mark.nightly
-
 _SECOND = 1_000_000_000
 _BEGIN = 1_700_000_000 * _SECOND
 

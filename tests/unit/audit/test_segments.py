@@ -28,8 +28,6 @@ from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
-pytestmark = pytest.mark.nightly
-
 _LARGEST = 1 << 20
 
 
@@ -127,6 +125,7 @@ def _without_begin(line: bytes) -> bytes:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_changed_segment_is_refused(name: str, segments: list[bytes], public: bytes) -> None:
     """Each change of a segment is found, with its place."""

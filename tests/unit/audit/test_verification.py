@@ -28,8 +28,6 @@ from tests.support.engines import ByHand
 from tests.unit.audit.conftest import MakeLog
 from tests.unit.transcripts import transcripts
 
-pytestmark = pytest.mark.nightly
-
 # ruff: noqa: S608  the attacker's statements are built from names of columns
 
 _RECORDS = 200

@@ -28,8 +28,6 @@ from tests.support.engines import open_log
 from tests.support.requirements import need_root
 from tests.support.small_disk import small_disk
 
-pytestmark = pytest.mark.nightly
-
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
@@ -127,6 +125,7 @@ def test_nothing_is_overwritten(state: Path, tmp_path: Path) -> None:
         restore(file, state)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("size", ["8k", "64k"])
 def test_a_full_disk_is_reported(state: Path, tmp_path: Path, size: str) -> None:
     """The error says to free space, not to change permissions."""
@@ -144,6 +143,7 @@ def test_a_missing_state_directory_is_an_error(tmp_path: Path) -> None:
         back_up(tmp_path, tmp_path / "x.tar.gz")
 
 
+@pytest.mark.nightly
 def test_an_unreadable_part_is_an_error(state: Path, tmp_path: Path) -> None:
     """A backup without the keys would be useless: an unreadable part is an error, and no file is left."""
     need_root()

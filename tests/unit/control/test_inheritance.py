@@ -13,8 +13,6 @@ from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.standby_site import memberships
 
-pytestmark = pytest.mark.nightly
-
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:

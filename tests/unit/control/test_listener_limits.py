@@ -21,12 +21,13 @@ from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
 from tests.support.engines import open_log
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 WAIT = 30.0
 CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("guarded", [True, False])
 async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
     """Idle connections are closed even by the ROS master, which keeps a connection to each node that ever existed."""

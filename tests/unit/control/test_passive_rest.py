@@ -24,7 +24,7 @@ from appliance.store.state_file import StateStore
 from tests.support.answers import example
 from tests.support.engines import InlineDatabase
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class Standby:
@@ -69,6 +69,7 @@ def attached(rest: PassiveRest) -> tuple[Channel, asyncio.Queue[Any]]:
     return api, heard
 
 
+@pytest.mark.nightly
 async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
     """Its first message has every replicated token: with an empty list, users would be signed out.
 
@@ -89,6 +90,7 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
     api.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("count", [0, 1])
 async def test_no_tokens_are_stated_before_they_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int

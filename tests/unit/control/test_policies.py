@@ -30,7 +30,7 @@ from tests.support.engines import InlineDatabase
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 from tests.support.virtual_clock import ShiftedClock, VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 
 
@@ -92,6 +92,7 @@ async def until(policies: Policies, revision: int) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.nightly
 async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Path) -> None:
     """Engineers who locked themselves out may restart the appliance: the timeout still applies."""
     appliance = Appliance(tmp_path)
@@ -111,6 +112,7 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Pa
         assert (policies.revision, policies.confirm_by) == (3, None)
 
 
+@pytest.mark.nightly
 async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The note and the record have the author, but a reload by a signal has none; the text is the disk's."""
     with Appliance(tmp_path).started() as policies:
@@ -126,6 +128,7 @@ async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.Mon
         assert recorded == ["operator", "alice", "disk"]
 
 
+@pytest.mark.nightly
 async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> None:
     """After a power cut the clock may be years back; the rollback comes no later than requested."""
     appliance = Appliance(tmp_path)
@@ -137,6 +140,7 @@ async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> N
         assert policies.current.text == OPEN
 
 
+@pytest.mark.nightly
 async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
     """If the file was changed, the start loads a new policy, and the old timeout never fires, even after a crash."""
     appliance = Appliance(tmp_path)
@@ -150,6 +154,7 @@ async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
         assert (policies.revision, policies.confirm_by) == (3, None)
 
 
+@pytest.mark.nightly
 async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
     """After a crash of control a confirmed change stays confirmed, and an unconfirmed change stays unconfirmed."""
     appliance = Appliance(tmp_path)
@@ -184,6 +189,7 @@ class Slow:
         assert await asyncio.to_thread(self.begun.wait, 10)
 
 
+@pytest.mark.nightly
 async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A long policy with many tests is read, compiled and tested outside the loop."""
     appliance = Appliance(tmp_path)
@@ -198,6 +204,7 @@ async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest
         assert policies.current.text == OTHER
 
 
+@pytest.mark.nightly
 async def test_a_reload_overtaken_by_another_change_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,6 +222,7 @@ async def test_a_reload_overtaken_by_another_change_is_refused(
         assert policies.revision == 2
 
 
+@pytest.mark.nightly
 async def test_hosts_changed_during_the_tests_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,6 +249,7 @@ class DiedError(Exception):
     """Control crashes."""
 
 
+@pytest.mark.nightly
 async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path) -> None:
     """The timeout counts from the time at which the new revision comes into force, so a crash cannot avoid it."""
     appliance = Appliance(tmp_path)
@@ -258,6 +267,7 @@ async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path
         assert policies.current.text == OPEN
 
 
+@pytest.mark.nightly
 async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The store is read in a thread while nodes are served, so a slow disk delays no node."""
     with Appliance(tmp_path).started() as policies:
@@ -293,6 +303,7 @@ async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) 
     return refused.value.findings[0]
 
 
+@pytest.mark.nightly
 async def test_a_site_that_signs_accepts_only_signed_policies(tmp_path: Path) -> None:
     """Start, reload, posted text, rollback, and the start after a crash each check the site's signature."""
     appliance = Appliance(tmp_path)
@@ -321,6 +332,7 @@ async def test_a_site_that_signs_accepts_only_signed_policies(tmp_path: Path) ->
         appliance.started(site_keys=[OTHER_LINE]).__enter__()
 
 
+@pytest.mark.nightly
 async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
     """The revision before an unconfirmed change still has its signature."""
     appliance = Appliance(tmp_path)
@@ -347,6 +359,7 @@ async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
         assert policies.revision == 2
 
 
+@pytest.mark.nightly
 async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
     """Posting the same text again changes nothing, and a running timeout continues; another text is a new revision."""
     with Appliance(tmp_path).started() as policies:

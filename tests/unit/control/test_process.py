@@ -19,7 +19,7 @@ from roswire.uris import parse_node_uri
 from tests.support.engines import InlineDatabase
 from tests.support.idle import idle, idle_class
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 URI = "http://10.0.0.5:4000/"
 
 

@@ -19,7 +19,7 @@ from appliance.recorder.recording_plan import RecordingPlan
 from appliance.recorder.recording_store import MOST_TEMPORARY
 from appliance.telemetry.audit_trail import AuditTrail
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 KEPT = Recording(
     "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""
@@ -96,6 +96,7 @@ async def test_a_missing_recorder_is_reported() -> None:
         await away.orders.now(admin.RecordNow(), "eve")
 
 
+@pytest.mark.nightly
 async def test_a_call_of_the_service_is_an_order() -> None:
     """The order has the node's name and host; the node gets the recording's id, or the reason for the refusal."""
     heard: list[Any] = []
@@ -124,6 +125,7 @@ async def test_a_call_of_the_service_is_an_order() -> None:
     recorder.close()
 
 
+@pytest.mark.nightly
 async def test_a_closed_recording_is_recorded_and_listed() -> None:
     """A removed recording leaves the list for any cause of the removal; reading an unknown recording is an error."""
     heard: list[Any] = []
@@ -160,6 +162,7 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
     recorder.close()
 
 
+@pytest.mark.nightly
 async def test_orders_have_the_name_of_their_operator() -> None:
     """The trigger has the id of the audit record with the operator's name; an invalid order is never recorded."""
 
@@ -194,6 +197,7 @@ async def test_orders_have_the_name_of_their_operator() -> None:
     recorder.close()
 
 
+@pytest.mark.nightly
 async def test_a_fetch_needs_a_record(scene: Scene) -> None:
     """While the audit log cannot be written a fetch is refused."""
     recorder = scene.attach(lambda _message: [])
@@ -206,6 +210,7 @@ async def test_a_fetch_needs_a_record(scene: Scene) -> None:
     recorder.close()
 
 
+@pytest.mark.nightly
 async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
     """The waiting operator gets the reason without a timeout."""
     recorder = scene.attach(lambda _message: [])
@@ -216,6 +221,7 @@ async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
         await asyncio.wait_for(asked, 5)
 
 
+@pytest.mark.nightly
 async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
     """Both the order and the fetch are recorded; the fetched memory stays available for later orders for a while."""
     lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
@@ -244,6 +250,7 @@ async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
     recorder.close()
 
 
+@pytest.mark.nightly
 async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
     """The record of a fetch must name every topic that is read; if the names do not fit, the fetch is rejected."""
     recorder = scene.attach(lambda _message: [])

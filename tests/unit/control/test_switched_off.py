@@ -11,8 +11,6 @@ from appliance.control.switched_off import SwitchedOffWatch
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 
-pytestmark = pytest.mark.nightly
-
 
 class Scene:
     """Monitors and a policy for the watch; `recorded` are the alarms."""
@@ -47,6 +45,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
     store.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.anyio
 async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
     """After `forgotten_after` of running, the monitor is recorded and marked until it is enabled, over restarts."""

@@ -25,7 +25,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import InlineDatabase, open_log
 from tests.support.virtual_clock import VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class Lives:
@@ -243,6 +243,7 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
     assert tokens.usable() == []
 
 
+@pytest.mark.nightly
 async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
     """Wherever the file of queued statements was cut off, exactly one of the two tokens is valid at the next start."""
     tokens = lives.next()

@@ -42,8 +42,6 @@ from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import make_old, retain
 from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
 
-pytestmark = pytest.mark.nightly
-
 Members = dict[str, bytes]
 
 
@@ -97,6 +95,7 @@ def reviewer(capsys: pytest.CaptureFixture[str], pem: Path) -> Reviewer:
     return Reviewer(capsys, pem)
 
 
+@pytest.mark.nightly
 def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: Path) -> None:
     """The system's Python runs the bundle's verifier without an environment, on the file and on the folder."""
     folder = tmp_path / "unpacked"
@@ -111,6 +110,7 @@ def test_it_proves_itself_on_a_bare_machine(bundle: Path, pem: Path, tmp_path: P
     assert "compare it with a copy kept elsewhere" in done.stdout
 
 
+@pytest.mark.nightly
 def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
     """Python 3.8, as in Ubuntu 20.04, supports its syntax, modules and methods; unsupported ones are found."""
     newer = tmp_path / "newer.py"
@@ -153,6 +153,7 @@ def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> N
     assert first == second
 
 
+@pytest.mark.nightly
 def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """Every byte of small members, and a sample of the others, is changed; each change names its member."""
     members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
@@ -167,6 +168,7 @@ def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewe
             assert re.search(named.get(name, re.escape(name)), reviewer.said), (name, place, reviewer.said)
 
 
+@pytest.mark.nightly
 def test_removed_added_or_exchanged_members_are_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
@@ -196,6 +198,7 @@ def test_removed_added_or_exchanged_members_are_named(
         assert "\x1b" not in reviewer.said
 
 
+@pytest.mark.nightly
 def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_path: Path) -> None:
     """A forger may put a json.py beside the verifier, or beside the copy that the reviewer makes."""
     folder = tmp_path / "unpacked"
@@ -209,6 +212,7 @@ def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_pat
     assert "WRONG     'json.py': does not belong to the bundle" in done.stdout
 
 
+@pytest.mark.nightly
 def test_a_bundle_cannot_control_the_terminal(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """An escape sequence instead of a number could erase the result."""
     spoilt = "\x1b[2J\nvalid: the bundle is unchanged since the appliance sealed it"
@@ -228,6 +232,7 @@ def test_a_missing_bundle_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
     assert reviewer.said == f"nothing can be verified: {tmp_path}/gone.zip: No such file or directory\n"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
 def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
     """A text of 100 MB that is small in the ZIP file is read piece by piece."""
@@ -243,6 +248,7 @@ def test_large_members_use_little_memory(bundle: Path, tmp_path: Path, reviewer:
         tracemalloc.stop()
 
 
+@pytest.mark.nightly
 def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """Tools differ in which of two members with the same name they unpack."""
     with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
@@ -251,6 +257,7 @@ def test_a_duplicate_name_is_named(bundle: Path, tmp_path: Path, reviewer: Revie
     assert "'policies/7.ini': is present more than once" in reviewer.said
 
 
+@pytest.mark.nightly
 def test_a_cut_or_damaged_file_is_never_valid(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """After a cut or a changed byte the bundle is invalid, or only a header differs and each text is unchanged."""
     whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
@@ -283,6 +290,7 @@ def _longer(place: Path) -> bytes:
     return whole
 
 
+@pytest.mark.nightly
 def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """ZIP tools hide data before, between and after members, in comments, and in extra fields; here it is named."""
     members, place = members_of(bundle), tmp_path / "x.zip"
@@ -335,6 +343,7 @@ def test_data_outside_members_is_named(bundle: Path, tmp_path: Path, reviewer: R
         assert words in reviewer.said
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["link", "fifo", "folder"])
 def test_a_member_that_is_not_a_file_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, kind: str
@@ -354,6 +363,7 @@ def test_a_member_that_is_not_a_file_is_named(
     assert "'policies/7.ini': is missing" in reviewer.said
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson", "audit.pub"])
 def test_a_pipe_does_not_block(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
     """A named pipe is never opened as a member, bundle, key or file of checkpoints."""
@@ -369,6 +379,7 @@ def test_a_pipe_does_not_block(bundle: Path, tmp_path: Path, reviewer: Reviewer,
     assert "is not a regular file" in reviewer.said
 
 
+@pytest.mark.nightly
 def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
     """An empty bundle, folder or key is invalid, with a reason; an empty file of checkpoints has none."""
     empty = tmp_path / "empty"
@@ -400,6 +411,7 @@ def test_a_zip_bomb_is_not_unpacked(
         assert "overlap" in reviewer.said
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("runs", [[[1, 5], [3, 9]], [[5, 9], [1, 3]], [[4, 3]], [[1, 3], [4, 9]]])
 def test_runs_are_in_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, runs: list[Any]) -> None:
     """Overlapping, touching or descending runs are rejected, because lookups use binary search."""
@@ -480,6 +492,7 @@ def _invent(records: list[dict[str, Any]]) -> None:
     load["detail"] = json.dumps({**json.loads(load["detail"]), "sha256": "0" * 64})
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("change", [_hide, _take_out, _swap, _cut, _unseal, _invent])
 def test_a_forger_who_rehashes_has_no_signature(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, change: Callable[[list[dict[str, Any]]], None]
@@ -490,6 +503,7 @@ def test_a_forger_who_rehashes_has_no_signature(
     assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
 
 
+@pytest.mark.nightly
 def test_another_policy_with_a_matching_manifest_is_named(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
@@ -500,6 +514,7 @@ def test_another_policy_with_a_matching_manifest_is_named(
         assert f"{place}: does not match the hash in the log" in reviewer.said
 
 
+@pytest.mark.nightly
 def test_a_bundle_of_another_key_is_invalid(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -512,6 +527,7 @@ def test_a_bundle_of_another_key_is_invalid(
     assert "is not signed with the key" in unknown.said
 
 
+@pytest.mark.nightly
 def test_copied_checkpoints_show_a_rewritten_history(
     bundle: Path, control: Control, tmp_path: Path, reviewer: Reviewer
 ) -> None:
@@ -532,6 +548,7 @@ def test_copied_checkpoints_show_a_rewritten_history(
     assert "differs from the one kept elsewhere, which is not signed with the key" in reviewer.said
 
 
+@pytest.mark.nightly
 def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     """The bag matches the hash in the log and has the recording's time and reason; a different bag is named."""
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
@@ -557,6 +574,7 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
         export(control.log.path, kept._replace(id="../audit"), control.ask)
 
 
+@pytest.mark.nightly
 def test_unproven_facts_are_listed(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     """Covers a load without a hash, a text that the appliance lost, and time before the first load."""
     control.load_policy(8, "[Nodes]\n", sha256=None)
@@ -575,6 +593,7 @@ def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
     return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
 
 
+@pytest.mark.nightly
 def test_a_load_before_the_upgrade_is_listed_as_unproven(
     make_log: MakeLog, tmp_path: Path, reviewer: Reviewer
 ) -> None:
@@ -601,6 +620,7 @@ def test_a_load_before_the_upgrade_is_listed_as_unproven(
     assert re.search(r"WRONG +records \d+ to \d+: lead to no checkpoint", reviewer.said)
 
 
+@pytest.mark.nightly
 def test_records_removed_by_retention_are_listed(
     make_log: MakeLog, path: Path, notary: Notary, tmp_path: Path, reviewer: Reviewer
 ) -> None:
@@ -621,6 +641,7 @@ def test_records_removed_by_retention_are_listed(
     assert re.search(r"unproven  records before \d+: removed by retention", reviewer.said)
 
 
+@pytest.mark.nightly
 def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     """Records that retention copied to the end of the log belong to their original time."""
     until = time.time_ns()

@@ -27,8 +27,6 @@ from tests.support.audit import decision, settle
 from tests.support.syslog import Message, parse
 from tests.unit.forwarding.conftest import MakeLog, Notary
 
-pytestmark = pytest.mark.nightly
-
 _DAY = 86_400_000_000_000
 
 

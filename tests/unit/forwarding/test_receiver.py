@@ -13,8 +13,6 @@ from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import LIMIT
 from tests.support.syslog import DatagramCollector, StreamCollector
 
-pytestmark = pytest.mark.nightly
-
 HOST = "127.0.0.1"
 
 
@@ -33,6 +31,7 @@ def server_context(certificates: Certificates, *, clients: bool = False) -> ssl.
     return context
 
 
+@pytest.mark.nightly
 def test_udp_sends_datagrams() -> None:
     """Each message is one datagram."""
     with DatagramCollector() as collector:
@@ -43,6 +42,7 @@ def test_udp_sends_datagrams() -> None:
         receiver.close()
 
 
+@pytest.mark.nightly
 def test_tcp_counts_octets() -> None:
     """Each message is sent with its length before it, on one connection that stays open."""
     with StreamCollector() as collector:
@@ -55,6 +55,7 @@ def test_tcp_counts_octets() -> None:
         receiver.close()
 
 
+@pytest.mark.nightly
 def test_a_closed_connection_is_an_error() -> None:
     """The error is raised before further messages count as sent; the next connection works."""
     with StreamCollector() as collector:
@@ -74,6 +75,7 @@ def test_a_closed_connection_is_an_error() -> None:
         receiver.close()
 
 
+@pytest.mark.nightly
 def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Unacknowledged data does not count as sent: the error is raised within the timeout."""
     monkeypatch.setattr("appliance.forwarding.receiver._SEND_SECONDS", 0.3)
@@ -88,6 +90,7 @@ def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPat
         receiver.close()
 
 
+@pytest.mark.nightly
 def test_tls_checks_the_receiver(certificates: Certificates) -> None:
     """The certificate must be from the given authority, for the receiver's address or the given name."""
     with StreamCollector(context=server_context(certificates)) as collector:
@@ -100,6 +103,7 @@ def test_tls_checks_the_receiver(certificates: Certificates) -> None:
         collector.wait_for(lambda messages: len(messages) == 2)
 
 
+@pytest.mark.nightly
 def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: Path) -> None:
     """A certificate of another authority, or for another name, gets no record."""
     other = make_certificates(tmp_path / "other")
@@ -112,6 +116,7 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
         assert collector.messages == []
 
 
+@pytest.mark.nightly
 def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: pytest.MonkeyPatch) -> None:
     """The receiver accepts our certificate; without one, its refusal is an error although TLS 1.3 reports it late."""
     monkeypatch.setattr("appliance.forwarding.receiver._OBJECTION_SECONDS", LIMIT)
@@ -139,6 +144,7 @@ def test_unreadable_files_are_errors(tmp_path: Path, certificates: Certificates)
         tls_context(certificates.ca, certificates.certificate, tmp_path / "nowhere.key")
 
 
+@pytest.mark.nightly
 def test_a_receiver_without_tls_gets_nothing(certificates: Certificates) -> None:
     """If TLS is configured, a receiver without TLS is an error and gets no record."""
     with socket.socket() as listener:

@@ -21,8 +21,6 @@ from appliance.signing.signed_statements import checkpoint_hash
 from tests.support.audit import decision
 from tests.unit.forwarding.conftest import MakeLog
 
-pytestmark = pytest.mark.nightly
-
 
 class Collector(CollectorConnection):
     """A collector without a network, which keeps the pushed numbers; the test replaces its answers."""

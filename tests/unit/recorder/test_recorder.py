@@ -25,8 +25,6 @@ from tests.support.audit import decision, settle
 from tests.support.engines import open_log
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
-pytestmark = pytest.mark.nightly
-
 SECOND = 1_000_000_000
 BEGAN = 1_000 * SECOND
 TEXT = (5).to_bytes(4, "little") + b"hello"

@@ -9,8 +9,6 @@ import pytest
 
 from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, EventLoop
 
-pytestmark = pytest.mark.nightly
-
 
 @pytest.fixture
 def loop() -> Iterator[EventLoop]:
@@ -20,6 +18,7 @@ def loop() -> Iterator[EventLoop]:
     loop.close()
 
 
+@pytest.mark.nightly
 def test_a_handler_is_not_called_for_what_was_discarded_in_the_same_turn(loop: EventLoop) -> None:
     """The handler of the first of two ready sockets closes the other; the other's handler never runs."""
     pairs = [socket.socketpair() for _ in range(2)]
@@ -113,6 +112,7 @@ def costs() -> Iterator[Costs]:
     costs.close()
 
 
+@pytest.mark.nightly
 def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) -> None:
     """While two hundred hosts always have costly messages, the robot's message waits for only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
@@ -128,6 +128,7 @@ def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) 
         costs.turns_until(lambda: len(costs.order) >= before + 10)  # noqa: B023  as above
 
 
+@pytest.mark.nightly
 def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) -> None:
     """Two hundred hosts that arrive at once with a costly message each delay the robot by only one of them."""
     costs.ready("robot", QUANTUM // 50, 1)
@@ -144,6 +145,7 @@ def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) ->
         assert costs.order[before:].index("robot") <= 2
 
 
+@pytest.mark.nightly
 def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(costs: Costs) -> None:
     """Both hosts are served in turn, however many descriptors are ready."""
     for _ in range(400):
@@ -153,6 +155,7 @@ def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(cos
     assert 450 <= costs.order.count("robot") <= 550
 
 
+@pytest.mark.nightly
 def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
     """A handler that uses up the quantum each time starves no other descriptor of its host."""
     costs.ready("guest", 2 * QUANTUM)
@@ -163,6 +166,7 @@ def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
         costs.loop.change(later.fileno(), READ)  # the handler was served, and unwatched itself
 
 
+@pytest.mark.nightly
 def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
     """All unknown hosts together get as much time as the robot alone; the same holds for new connections."""
     for _ in range(200):
@@ -176,6 +180,7 @@ def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
     }
 
 
+@pytest.mark.nightly
 def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
     """A handler that takes twenty quanta is followed by twenty handlers of the other host."""
     costs.ready("guest", 20 * QUANTUM)
@@ -184,6 +189,7 @@ def test_a_host_that_overdraws_waits_for_the_others(costs: Costs) -> None:
     assert 38 <= costs.order.count("robot") <= 42
 
 
+@pytest.mark.nightly
 def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None:
     """Between any two of them, a host within its quantum is served, even if it has used more than each of them."""
     for number in range(200):
@@ -197,6 +203,7 @@ def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None
     assert "ggg" not in guests
 
 
+@pytest.mark.nightly
 def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> None:
     """The costly host gets as much processor time as each of the others."""
     costs.ready("camera", 10 * QUANTUM)
@@ -206,6 +213,7 @@ def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> 
     assert 90 <= costs.order.count("10.9.0.0") <= 110
 
 
+@pytest.mark.nightly
 def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
     """However many hosts are ready, the relay's own descriptors come first."""
     for number in range(100):
@@ -219,6 +227,7 @@ def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
     assert max(after - before for before, after in itertools.pairwise(served)) <= 2
 
 
+@pytest.mark.nightly
 def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -> None:
     """Time that a host used while no other host was ready does not count later."""
     costs.ready("guest", 5 * QUANTUM)
@@ -228,6 +237,7 @@ def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -
     assert costs.order.count("robot") <= 30
 
 
+@pytest.mark.nightly
 def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) -> None:
     """Postponed work is charged to its payer, and starves neither the payer's events nor another host."""
 
@@ -245,6 +255,7 @@ def test_postponed_work_takes_turns_with_events_and_other_hosts(costs: Costs) ->
     assert 40 <= shares["left"] <= 60
 
 
+@pytest.mark.nightly
 def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
     """Work done for a host in another payer's handler counts for that host."""
     costs.ready("guest", QUANTUM)
@@ -256,6 +267,7 @@ def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
     assert costs.order.count("robot") >= 29
 
 
+@pytest.mark.nightly
 def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
     """The robot connected for hours while no other host was active; a new guest still does not come first."""
 
@@ -276,6 +288,7 @@ def test_connections_made_while_alone_leave_no_debt(costs: Costs) -> None:
     assert costs.order.count("guest") <= 2
 
 
+@pytest.mark.nightly
 def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Costs) -> None:
     """Ten thousand timers delay a message by one quantum."""
     called: list[None] = []

@@ -12,8 +12,6 @@ from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import settle
 from tests.support.engines import open_log
 
-pytestmark = pytest.mark.nightly
-
 NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")
 
 

@@ -21,7 +21,7 @@ from tests.support.audit import RecordingTrail
 from tests.support.engines import open_log
 from tests.support.stated import parts_here
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 def spec(name: str, *topics: str) -> str:
@@ -159,6 +159,7 @@ async def test_a_refusal_of_one_relay_stops_all(world: World) -> None:
     assert world.rollout.relay_of("b") == 1
 
 
+@pytest.mark.nightly
 async def test_a_relay_that_dies_counts_as_a_refusal(world: World) -> None:
     """An absent relay receives the change when it returns, and does not stop the others."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
@@ -322,6 +323,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     log.close()
 
 
+@pytest.mark.nightly
 async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
     world: World,
 ) -> None:

@@ -12,7 +12,7 @@ from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.engines import InlineDatabase
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class RefusedError(Exception):
@@ -68,12 +68,14 @@ def keeper(tmp_path: Path) -> Iterator[Keeper]:
     store.close()
 
 
+@pytest.mark.nightly
 async def test_a_rollback_without_a_number_takes_the_previous_revision(keeper: Keeper) -> None:
     """It is the last stored revision below the present one, also where numbers are missing."""
     assert await keeper.wanted(None) == row(5)
     assert await keeper.wanted(4) == row(4)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("asked", "said"), [(None, "before this one"), (0, "0"), (6, "6")])
 async def test_the_error_names_the_missing_and_the_stored_revisions(
     keeper: Keeper, asked: int | None, said: str
@@ -85,6 +87,7 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
     assert caught.value.args == ([f"there is no revision {said}; kept are: 4, 5, 7"],)
 
 
+@pytest.mark.nightly
 async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keeper: Keeper) -> None:
     """The limit starts again with the second change; a change without a limit ends it."""
     begun = time.time()

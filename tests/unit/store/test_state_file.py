@@ -19,8 +19,6 @@ from appliance.store.state_file import (
 )
 from tests.support.engines import InlineDatabase
 
-pytestmark = pytest.mark.nightly
-
 
 def incarnation(key: str) -> IncarnationRow:
     """A row that differs by its key."""
@@ -151,6 +149,7 @@ def test_revisions_are_listed_newest_first(tmp_path: Path) -> None:
     again.close()
 
 
+@pytest.mark.nightly
 def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> None:
     """The next control has the changes, in order, though the tree was not saved since and nothing was closed."""
 
@@ -170,6 +169,7 @@ def test_a_parameter_that_was_just_set_outlasts_the_process(tmp_path: Path) -> N
     last.close()
 
 
+@pytest.mark.nightly
 def test_owners_of_parameters_outlast_the_process(tmp_path: Path) -> None:
     """The next control has the owners of keys; removing a key removes the keys below it, and no similar name."""
 

@@ -32,7 +32,7 @@ from tests.support.small_disk import small_disk
 from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 KILLED = """
 import os, signal, sys
@@ -70,6 +70,7 @@ def database(tmp_path: Path, failures: list[str]) -> Iterator[Database]:
     database.close()
 
 
+@pytest.mark.nightly
 async def test_queued_statements_are_in_the_file_once_settled(database: Database, tmp_path: Path) -> None:
     """After `settled` another connection sees every statement, in order."""
     for size in range(500):
@@ -164,6 +165,7 @@ async def test_a_thread_writes_changes(tmp_path: Path) -> None:
     database.close()
 
 
+@pytest.mark.nightly
 def test_a_waiting_caller_learns_that_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
