@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from appliance.base.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
+from tests.support import autojump
 
 
 def test_an_order_of_a_disconnected_client_does_not_take_effect() -> None:
@@ -37,4 +38,4 @@ def test_only_orders_are_withdrawn() -> None:
     async def play() -> None:
         await (await order())
 
-    asyncio.run(play())
+    autojump.run(play())

@@ -1,6 +1,5 @@
 """The address at which hosts reach the appliance."""
 
-import asyncio
 from typing import Any
 
 import pytest
@@ -10,6 +9,7 @@ from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Ipsec, Settings
 from appliance.hosts.enrolment import find_endpoint
 from appliance.hosts.host_table import HostRefusedError
+from tests.support import autojump
 
 
 def _settings(endpoint: str | None = None, **more: Any) -> Settings:
@@ -26,14 +26,14 @@ async def _several() -> EndpointFound:
 
 def test_the_configured_endpoint_comes_first() -> None:
     """Nothing is searched then, so the setting also helps where no endpoint can be found."""
-    assert asyncio.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
+    assert autojump.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
         "robot.example.org", "ipsec.endpoint of the configuration"
     )
 
 
 def test_the_address_found_by_the_supervisor_comes_with_its_reason() -> None:
     """The reason lets a person judge the choice."""
-    assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint(
+    assert autojump.run(find_endpoint(_settings(), _found)) == Endpoint(
         "10.0.0.5", "the only address of this machine"
     )
 
@@ -41,7 +41,7 @@ def test_the_address_found_by_the_supervisor_comes_with_its_reason() -> None:
 def test_an_unknown_endpoint_is_refused_with_advice() -> None:
     """The error has flag, REST field and key; it is not a defect of the appliance (not `ours`)."""
     with pytest.raises(HostRefusedError) as caught:
-        asyncio.run(find_endpoint(_settings(), _several))
+        autojump.run(find_endpoint(_settings(), _several))
     for words in ("10.0.0.5, 10.0.1.5", "--appliance ADDRESS", "ipsec: {endpoint: ADDRESS}", "`endpoint`"):
         assert words in str(caught.value), words
     assert not caught.value.ours
@@ -51,5 +51,5 @@ def test_an_unknown_endpoint_is_refused_with_advice() -> None:
 def test_without_tunnels_no_endpoint_is_needed(endpoint: str | None) -> None:
     """The error names the missing requirement."""
     with pytest.raises(HostRefusedError, match="`isolation: netns` or `container`") as caught:
-        asyncio.run(find_endpoint(_settings(endpoint, isolation="none"), _found))
+        autojump.run(find_endpoint(_settings(endpoint, isolation="none"), _found))
     assert "--appliance" not in str(caught.value)

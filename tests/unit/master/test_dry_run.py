@@ -1,6 +1,5 @@
 """A dry run names exactly what a reload revokes, for generated policies, registries and grants."""
 
-import asyncio
 import ipaddress
 from typing import Any
 
@@ -12,6 +11,7 @@ from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.policy_compiler import compile_policy
 from appliance.store.state_file import PermissionRow
 from roswire.uris import parse_node_uri
+from tests.support import autojump
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
 from tests.support.parameters import mirror
@@ -124,6 +124,6 @@ def test_a_dry_run_names_exactly_what_a_reload_revokes(
     tree: dict[str, Any],
 ) -> None:
     """Publications, subscriptions, services, calls and parameters of all nodes are compared."""
-    named, gone, count = asyncio.run(taken(text_of(written), registrations, grants, tree))
+    named, gone, count = autojump.run(taken(text_of(written), registrations, grants, tree))
     assert named == gone
     assert bool(count) == bool(gone)

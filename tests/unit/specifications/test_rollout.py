@@ -17,6 +17,7 @@ from appliance.specifications.specification_files import (
     SpecificationsRefusedError,
 )
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support import autojump
 from tests.support.audit import RecordingTrail
 from tests.support.engines import open_log
 from tests.support.stated import parts_here
@@ -110,7 +111,7 @@ class World:
         self.fleet = Fleet(self.trail)
         self.rollout = self.fleet.rollout
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
-        asyncio.run(self.rollout.start(revision(1, **self.files), restarted=False, kept=""))
+        autojump.run(self.rollout.start(revision(1, **self.files), restarted=False, kept=""))
         self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
 
 

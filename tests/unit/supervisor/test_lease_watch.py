@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 
 from appliance.base import clock
 from appliance.supervisor.lease_watch import LeaseWatch
-from tests.support.processes import LIMIT
+from tests.support import autojump
 from tests.support.virtual_clock import VirtualClock
 
 
@@ -23,7 +23,7 @@ class Role:
 
     async def until_passive(self) -> float:
         """Return the time when it became passive."""
-        await asyncio.wait_for(self.passive.wait(), LIMIT)
+        await self.passive.wait()
         return clock.since_boot()
 
 
@@ -33,7 +33,7 @@ def run(work: Callable[[Role], Awaitable[None]], *, member: bool = True) -> None
     async def inside() -> None:
         await work(Role(member=member))
 
-    asyncio.run(inside())
+    autojump.run(inside())
 
 
 def test_it_is_passive_until_the_lease_is_held() -> None:

@@ -10,6 +10,7 @@ from appliance.supervisor import shutdown
 from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.roles import Role
+from tests.support import autojump
 
 pytestmark = pytest.mark.anyio
 
@@ -31,7 +32,7 @@ class Crowd:
 
     def end(self) -> list[tuple[str, str]]:
         """End all processes, and return the actions."""
-        asyncio.run(shutdown.end_all(self.slots, self.died))
+        autojump.run(shutdown.end_all(self.slots, self.died))
         return self.done
 
 

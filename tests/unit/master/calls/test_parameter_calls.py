@@ -19,6 +19,7 @@ from appliance.master.parameter_mirror import ParameterMirror
 from appliance.rpc.server import Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.errors import EncodingError, ProtocolError
+from tests.support import autojump
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 from tests.support.parameters import mirror, put
@@ -157,7 +158,7 @@ def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
     peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
     caller = Caller(peer, "/me", 0)
     writes = [ParameterWrite(caller, key, value[0] if value else None) for _method, key, *value in calls]
-    return asyncio.run(server.calls.write(writes))
+    return autojump.run(server.calls.write(writes))
 
 
 def test_a_run_is_one_request_in_its_order() -> None:
@@ -266,7 +267,7 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
     else:
         peer = Peer(ipaddress.ip_address("10.0.0.1"), "10.0.0.1", "10.0.0.2")
         for _method, *arguments in calls:
-            asyncio.run(server.calls.set_param(Caller(peer, "/me", 0), *arguments))
+            autojump.run(server.calls.set_param(Caller(peer, "/me", 0), *arguments))
     assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
     assert server.parameters.weight == measure(server.parameters.tree)[0]
 

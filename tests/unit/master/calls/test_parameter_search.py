@@ -1,6 +1,5 @@
 """searchParam finds readable keys as the ROS master does, and reveals no unreadable keys."""
 
-import asyncio
 import ipaddress
 from typing import Any, cast
 
@@ -13,6 +12,7 @@ from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from roswire.parameter_tree import standing_at
+from tests.support import autojump
 from tests.support.parameters import mirror
 
 HOST = "10.0.0.5"
@@ -53,7 +53,7 @@ class Site:
         """Make one search."""
         peer = Peer(ipaddress.ip_address(HOST), HOST, "10.0.0.1")
         caller = Caller(peer, caller_id, 0, own=own)
-        return asyncio.run(self.calls.search_param(caller, key))
+        return autojump.run(self.calls.search_param(caller, key))
 
 
 @pytest.mark.parametrize(

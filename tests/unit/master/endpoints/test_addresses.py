@@ -1,12 +1,12 @@
 """The address of the appliance in answers to a peer."""
 
-import asyncio
 import ipaddress
 
 import pytest
 
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.rpc.server import Peer
+from tests.support import autojump
 
 
 def peer(host: str, local: str) -> Peer:
@@ -39,7 +39,7 @@ def test_configured_and_translated_addresses_come_first() -> None:
     advertised = [(ipaddress.ip_network("172.16.0.0/12"), ipaddress.ip_address("172.16.0.9"))]
     addresses = AdvertisedAddresses(advertised, route, "0.0.0.0")
     for host in ("10.0.0.5", "10.0.0.6", "172.16.0.1"):
-        asyncio.run(addresses.learn(peer(host, "10.0.0.1")))
+        autojump.run(addresses.learn(peer(host, "10.0.0.1")))
     assert addresses.address_for(peer("10.0.0.5", "10.0.0.1")) == "192.168.1.7"
     assert addresses.address_for(peer("10.0.0.6", "10.0.0.1")) == "10.0.0.1"
     assert addresses.address_for(peer("172.16.0.1", "10.0.0.1")) == "172.16.0.9"

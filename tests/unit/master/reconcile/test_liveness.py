@@ -161,9 +161,8 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
     for _ in range(5):
         await asyncio.sleep(0)
     world.liveness.look_at(robot)
-    async with asyncio.timeout(5):
-        while robot.life is Life.LIVE:
-            await asyncio.sleep(0.01)
+    while robot.life is Life.LIVE:
+        await asyncio.sleep(1)
     silence.set()
     await world.settle()
 
