@@ -41,16 +41,20 @@ def _isolations(incomplete: str) -> list[tuple[str, str]]:
     return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
 
 
+# Not `readable`, which click checks with the rights of root alone: see `base/owner_access.py`.
 def up(  # noqa: PLR0917  typer gives every flag by its name
     config: Annotated[
-        Path | None, typer.Option(help="Configuration file (default: ./appliance.yaml)")
+        Path | None, typer.Option(readable=False, help="Configuration file (default: ./appliance.yaml)")
     ] = None,
     policy: Annotated[
-        Path | None, typer.Option(help="Access policy file; `rosrv policy reload` reads it again")
+        Path | None,
+        typer.Option(readable=False, help="Access policy file; `rosrv policy reload` reads it again"),
     ] = None,
     monitors: Annotated[
         Path | None,
-        typer.Option(help="Folder of specifications (.rv); `rosrv monitor reload` reads it again"),
+        typer.Option(
+            readable=False, help="Folder of specifications (.rv); `rosrv monitor reload` reads it again"
+        ),
     ] = None,
     enable: Annotated[
         str | None,
