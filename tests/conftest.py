@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from appliance.base import clock
 from appliance.network.namespaces import has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -21,9 +22,12 @@ from tests.support.own_namespace import own_loopback
 from tests.support.processes import ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.site import Masters, Site
+from tests.support.virtual_clock import VirtualClock
 
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
 _MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
+_CLOCK = pytest.StashKey[VirtualClock]()
+_WALL = 1_790_000_000.0  # seconds since the epoch: the same date for each run
 _NIGHTLY = (
     "tests/integration/",
     "tests/system/",
@@ -105,7 +109,8 @@ def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) ->
 def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
     if may_depend_on_chance(item):
         return (yield)
-    with WATCH.watching() as found:
+    machine = item.stash.setdefault(_CLOCK, VirtualClock(wall=_WALL))
+    with clock.using(machine), WATCH.watching() as found:
         result = yield
     if found:  # the product may have caught the error
         pytest.fail(f"this test {'; '.join(dict.fromkeys(found))}: mark it `nightly`", pytrace=False)

@@ -142,8 +142,9 @@ def _place(coroutine: Any) -> str:
 
 @contextlib.contextmanager
 def autojump(machine: VirtualClock | None = None) -> Iterator[Callable[[], AutojumpLoop]]:
-    """Yield what makes loops with virtual time; `machine` is the clock of the block."""
-    machine = machine or VirtualClock()
+    """Yield what makes loops with virtual time; `machine` is the clock of the block, or the test's own."""
+    present = clock.source()
+    machine = machine or (present if isinstance(present, VirtualClock) else VirtualClock())
     with clock.using(machine):
         yield lambda: AutojumpLoop(machine)
 

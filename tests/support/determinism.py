@@ -77,7 +77,7 @@ class Watch:
     def _clock(self, name: str, read: Callable[..., Any]) -> Callable[..., Any]:
         def reading(*arguments: Any) -> Any:
             if self._watched and next(callers(2), "").startswith(_OURS):
-                pass
+                self._refuse(f"reads time.{name}")
             return read(*arguments)
 
         return reading
