@@ -1,8 +1,7 @@
-"""Run an engine in a thread of its own.
+"""Run an engine in a thread of its own, or in its caller's.
 
 An engine has no thread. Its `turn(now)` does the work that is due, and returns the time of the next turn, or None after
-the last one. A driver calls the turns, one at a time: in the product `EngineThread`, in a test the test itself. All
-times are in monotonic seconds.
+the last one. A driver calls the turns, one at a time. All times are in monotonic seconds.
 """
 
 import contextvars
@@ -78,3 +77,27 @@ class EngineThread:
             self._hurry.clear()
             self._wake.clear()
             due = self._turn(now())
+
+
+class InCaller:
+    """Calls the turns of an engine in the thread of its only caller: first, last, and when the caller waits."""
+
+    def __init__(self, _name: str, turn: Turn, _gather: float) -> None:
+        self._turn = turn
+        self.due: float | None = None
+        self.hurry()
+
+    def wake(self) -> None:
+        """Leave new work to a later turn."""
+
+    def hurry(self) -> None:
+        """Call the turns that are due."""
+        time = now()
+        self.due = self._turn(time)
+        while self.due is not None and self.due <= time:
+            self.due = self._turn(time)
+
+    def end(self, _seconds: float | None) -> bool:
+        """Call the last turns; return whether the engine ended."""
+        self.hurry()
+        return self.due is None

@@ -25,6 +25,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from appliance.base.engine_thread import InCaller
 from appliance.standby.replication_frames import (
     Changes,
     FromActive,
@@ -50,7 +51,8 @@ class Replica:
         self, path: Path, schema: str, *, failed: Callable[[str], None], largest: int = LARGEST_STATE
     ) -> None:
         self._path = path
-        database = Database(path, schema, failed=failed)  # writes the changes that a killed process left
+        # Opening writes the changes that a killed process left.
+        database = Database(path, schema, failed=failed, drive=InCaller)
         database.close()
         self._tables = database.tables
         self._lock = threading.Lock()

@@ -8,7 +8,6 @@ from appliance.audit.record import AuditRecord, RuleReference
 from appliance.base import clock
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import let_pass
-from tests.support.virtual_clock import VirtualClock
 
 
 class RecordingTrail(AuditTrail):
@@ -44,17 +43,17 @@ def decision(log: AuditLog, number: int = 0, **changes: Any) -> AuditRecord:
     return AuditRecord(**fields | changes)
 
 
-def settle(log: AuditLog, time: VirtualClock | None = None) -> str | None:
+def settle(log: AuditLog, seconds: float = 0.0) -> str | None:
     """Wait until all records are on disk; return the reason if they cannot be written.
 
-    With `time`, half a second passes, after which a log that could not be written tries again.
+    Virtual time passes for some `seconds`: a log that could not be written tries again after half a second.
     """
 
     async def settled() -> str | None:
         waiting = asyncio.ensure_future(log.wait_durable())
         await asyncio.sleep(0)
-        if time is not None:
-            let_pass(log, time, 0.5)
-        return await asyncio.wait_for(waiting, 4)
+        if seconds:
+            let_pass(log, seconds)
+        return await asyncio.wait_for(waiting, 60)
 
     return asyncio.run(settled())

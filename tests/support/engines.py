@@ -10,20 +10,18 @@ from typing import Any
 
 from appliance.audit.log import AuditLog
 from appliance.base import clock
-from appliance.base.engine_thread import Turn
+from appliance.base.engine_thread import InCaller, Turn
 from appliance.store.writer_thread import Database
 from tests.support.virtual_clock import VirtualClock
 
 
-class ByHand:
+class ByHand(InCaller):
     """Calls turns only while a caller waits; otherwise the test calls them, with `let_pass`."""
 
-    def __init__(self, _name: str, turn: Turn, _gather: float) -> None:
-        self._turn = turn
+    def __init__(self, name: str, turn: Turn, gather: float) -> None:
         self._wanted = False
-        self._due: float | None = None
         self._turning = threading.Lock()
-        self.hurry()
+        super().__init__(name, turn, gather)
 
     def wake(self) -> None:
         """Leave new work to a later turn, unless it comes during one."""
@@ -36,17 +34,9 @@ class ByHand:
         while self._wanted and self._turning.acquire(blocking=False):
             try:
                 self._wanted = False
-                now = clock.now()
-                self._due = self._turn(now)
-                while self._due is not None and self._due <= now:
-                    self._due = self._turn(now)
+                super().hurry()
             finally:
                 self._turning.release()
-
-    def end(self, _seconds: float | None) -> bool:
-        """Call the turns that are left."""
-        self.hurry()
-        return self._due is None
 
 
 class Inline(ByHand):
@@ -59,14 +49,16 @@ class Inline(ByHand):
     def hurry(self) -> None:
         """Call the turns that are due, and the next one when it is: a log that failed answers only then."""
         super().hurry()
-        if self._due is not None and self._due < math.inf:
+        if self.due is not None and self.due < math.inf:
             with contextlib.suppress(RuntimeError):  # no loop runs
                 loop = asyncio.get_running_loop()
-                loop.call_later(self._due - clock.now(), super().hurry)
+                loop.call_later(self.due - clock.now(), super().hurry)
 
 
-def let_pass(engine: AuditLog | Database, time: VirtualClock, seconds: float) -> None:
-    """Let time pass, and call the turns of an engine as they become due."""
+def let_pass(engine: AuditLog | Database, seconds: float) -> None:
+    """Let the virtual time pass, and call the turns of an engine as they become due."""
+    time = clock.source()
+    assert isinstance(time, VirtualClock)
     end = clock.now() + seconds
     due = engine.turn(clock.now())
     while due is not None and due <= end:

@@ -19,7 +19,6 @@ from appliance.audit.signatures import read_public_key
 from appliance.evidence.export_verification import ExportUnreadableError, ExportVerification, verify_export
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
-from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
@@ -170,18 +169,18 @@ def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: 
 
 @pytest.mark.nightly
 def test_an_export_after_retention_is_proved(
-    make_log: MakeLog, path: Path, public: bytes, notary: Notary, time: VirtualClock
+    make_log: MakeLog, path: Path, public: bytes, notary: Notary
 ) -> None:
     """The records that retention left can be proved, from the first to the last."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1900
     for number in range(200):
         log.record(decision(log, number))
     settle(log)
-    retain(log, time)
+    retain(log)
     result = checked(exported(path, Filter()), path.with_name("x.ndjson"), public)
     assert result.proven
     log.close()

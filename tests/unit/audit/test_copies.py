@@ -21,7 +21,6 @@ from appliance.audit.retention import Retention
 from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
-from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import retain
 
@@ -132,7 +131,7 @@ def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
 
 
 def test_checkpoints_of_removed_records_contradict_nothing(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+    make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
     """Checkpoints whose records were removed prove nothing, and the result says so."""
     notary.ago = 2 * 86_400_000_000_000
@@ -144,7 +143,7 @@ def test_checkpoints_of_removed_records_contradict_nothing(
     copies = signed_checkpoints(path)
     notary.ago = 0
     log = make_log(checkpoint_every=20, retention=Retention(days=1))
-    retain(log, time)
+    retain(log)
     log.close()
     newer = signed_checkpoints(path)
     result = verify(path, copies=copies + newer)

@@ -14,7 +14,6 @@ from appliance.quotas.pool import QuotaClass
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand, let_pass
 from tests.support.small_disk import small_disk
-from tests.support.virtual_clock import VirtualClock
 
 _RESERVE = 16 << 20
 
@@ -26,7 +25,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         yield place
 
 
-def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path, time: VirtualClock) -> None:
+def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path) -> None:
     """Below the reserve an alarm is raised and hosts in debt wait; with free space again all is as before."""
     budget = Budget(lambda _host: QuotaClass.REGISTERED)
     with capture_logs() as said:
@@ -36,7 +35,7 @@ def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path, time: Vir
         assert log.degraded is None
         filler = disk / "filler"
         filler.write_bytes(b"x" * (20 << 20))
-        let_pass(log, time, 1)
+        let_pass(log, 1)
     assert [one["event"] for one in said] == ["disk nearly full"]
     assert "make room" in said[0]["reason"]
     assert "reserve" in (log.degraded or "")
@@ -49,7 +48,7 @@ def test_low_space_raises_an_alarm_before_the_disk_is_full(disk: Path, time: Vir
     assert budget.pause("10.0.0.1") == 0
     assert settle(log) is None
     filler.unlink()
-    let_pass(log, time, 1)
+    let_pass(log, 1)
     assert log.degraded is None
     assert budget.pause("10.0.0.66") == 0
     assert log.close() is None

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit import log_database
 from appliance.audit.lock_holders import holders
 from appliance.audit.log import AuditLog
 from appliance.audit.log_database import open_for_reading
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
-from tests.support.virtual_clock import VirtualClock
 from tests.support.waiting import eventually
+
+pytestmark = pytest.mark.nightly
 
 _HOLD = """\
 import fcntl, os, struct, sys
@@ -49,7 +49,6 @@ def log(tmp_path: Path) -> Iterator[AuditLog]:
     log.close()
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(("suffix", "byte"), [("-shm", 120), ("-shm", 121), ("-shm", 122), ("", 0x40000000)])
 def test_the_holder_of_a_writers_lock_is_found(log: AuditLog, suffix: str, byte: int) -> None:
     """The kernel's list names the process until it ends."""
@@ -68,7 +67,6 @@ def test_a_lock_without_a_process_is_found(log: AuditLog) -> None:
         eventually(lambda: holders(log.path) == [-1], "the lock is found")
 
 
-@pytest.mark.nightly
 def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
     """An unfinished read holds no lock that the writer needs; locks on other files are ignored."""
     with holding(log.path.with_name(log.path.name + "-shm"), 124), holding(Path(__file__), 120):
@@ -80,21 +78,3 @@ def test_an_ordinary_reader_is_not_reported(log: AuditLog) -> None:
         )
         connection.close()
     assert holders(log.path.with_name("nowhere.db")) == []
-
-
-@pytest.mark.nightly
-def test_the_log_names_the_process_that_locks_it(
-    tmp_path: Path, time: VirtualClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The alarm and the reason of the refusal name the process; after its end the log continues."""
-    told: list[list[int]] = []
-    monkeypatch.setattr(log_database, "_BUSY_SECONDS", 0)
-    log = AuditLog(tmp_path / "audit.db", drive=ByHand, held_by=told.append)
-    log.record(decision(log, 1))
-    assert settle(log) is None
-    with holding(tmp_path / "audit.db-shm", 120) as pid:
-        log.record(decision(log, 2))
-        assert f"locked by process {pid}" in (settle(log) or "")
-    assert told == [[pid]]
-    assert settle(log, time) is None
-    log.close()

@@ -1,6 +1,7 @@
 """Tests of the log on real files, also with a full disk and a killed process."""
 
 import asyncio
+import os
 import signal
 import sqlite3
 import subprocess
@@ -15,6 +16,8 @@ import msgspec
 import pytest
 import structlog
 
+from appliance.audit import log as log_module
+from appliance.audit import log_database
 from appliance.audit.folding import FoldSettings
 from appliance.audit.log import AuditLog, Durability
 from appliance.audit.log_writer import ChainWriter
@@ -50,9 +53,9 @@ def test_durable_records_are_on_disk(make_log: MakeLog, path: Path, durability: 
     assert log.lag.records == 0
 
 
-def tried_again(log: AuditLog, time: VirtualClock) -> str | None:
+def tried_again(log: AuditLog) -> str | None:
     """Let a second pass, in which the log tries to write; return why it cannot."""
-    let_pass(log, time, 1)
+    let_pass(log, 1)
     return log.failed
 
 
@@ -198,7 +201,7 @@ def test_counted_denials_survive_a_kill(path: Path) -> None:
     assert entry.record.detail["recovered"] is True
 
 
-def test_flood_of_denials(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
+def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
     """A hundred thousand identical denials leave a handful of records that count every one of them."""
     log = make_log(fold=FoldSettings(seconds=10))
     before = decision(log, decision="deny", resource="/evidence")
@@ -206,7 +209,7 @@ def test_flood_of_denials(make_log: MakeLog, path: Path, time: VirtualClock) -> 
     for _ in range(10):
         for _ in range(10_000):
             log.record(decision(log, decision="deny"))
-        let_pass(log, time, 2)
+        let_pass(log, 2)
     assert log.close() is None
     records = [entry.record for entry in export(path, Filter(decision=("deny",)))]
     assert records[0] == before
@@ -253,8 +256,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         yield place
 
 
-@pytest.mark.nightly
-def test_full_disk(disk: Path, time: VirtualClock) -> None:
+def test_full_disk(disk: Path) -> None:
     """With a full disk the log reports the failure, keeps its queue, and writes the queue once there is space."""
     path = disk / "audit.db"
     filler = disk / "filler"
@@ -270,10 +272,10 @@ def test_full_disk(disk: Path, time: VirtualClock) -> None:
         assert count < 100_000
     assert "full" in log.failed
     assert str(path) in log.failed
-    assert settle(log, time) == log.failed
+    assert settle(log, 0.5) == log.failed
     log.record(decision(log, count, resource="/while-failed"))
     filler.unlink()
-    assert tried_again(log, time) is None
+    assert tried_again(log) is None
     assert settle(log) is None
     assert events(path)["decision"] == count + 2
     assert len(search(path, Filter(resource="/while-failed")).entries) == 1
@@ -284,8 +286,7 @@ def test_full_disk(disk: Path, time: VirtualClock) -> None:
     assert verify(path).ok
 
 
-@pytest.mark.nightly
-def test_failure_and_recovery_are_printed_once(disk: Path, time: VirtualClock) -> None:
+def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
     """Standard error names the failure with file and reason, and later the recovery."""
     filler = disk / "filler"
     with structlog.testing.capture_logs() as said:
@@ -295,9 +296,9 @@ def test_failure_and_recovery_are_printed_once(disk: Path, time: VirtualClock) -
         while log.failed is None:
             log.record(decision(log))
             settle(log)
-        settle(log, time)
+        settle(log, 0.5)
         filler.unlink()
-        assert tried_again(log, time) is None
+        assert tried_again(log) is None
         assert log.close() is None
     assert [one["event"] for one in said] == [
         "the audit log cannot be written",
@@ -307,7 +308,6 @@ def test_failure_and_recovery_are_printed_once(disk: Path, time: VirtualClock) -
     assert "full" in said[0]["reason"]
 
 
-@pytest.mark.nightly
 def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualClock) -> None:
     """Records that do not fit in the queue while the disk is full are counted, and the count is recorded."""
     path = disk / "audit.db"
@@ -327,7 +327,7 @@ def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualCl
     time.advance(3)
     assert log.lag.seconds == pytest.approx(3)
     filler.unlink()
-    assert tried_again(log, time) is None
+    assert tried_again(log) is None
     assert log.close() is None
     (lost,) = search(path, Filter(event="records lost")).entries
     assert events(path)["decision"] + lost.record.detail["count"] == sent
@@ -335,14 +335,14 @@ def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualCl
 
 
 @pytest.mark.parametrize("content", [b"", b"not a database" * 1000, b"SQLite format 3\0" + b"\0" * 5000])
-def test_a_damaged_file_is_an_error_and_stays(path: Path, content: bytes, time: VirtualClock) -> None:
+def test_a_damaged_file_is_an_error_and_stays(path: Path, content: bytes) -> None:
     """A file that is not a log is named in the error and stays unchanged."""
     path.write_bytes(content)
     log = AuditLog(path, drive=ByHand)
     assert log.failed is not None
     assert str(path) in log.failed
     log.record(decision(log))
-    assert settle(log, time) is not None
+    assert settle(log, 0.5) is not None
     assert log.close() is not None
     assert path.read_bytes() == content
 
@@ -372,16 +372,16 @@ def test_a_changed_end_stops_writing(make_log: MakeLog, path: Path) -> None:
     log.close()
 
 
-def test_a_removed_file_is_noticed(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
+def test_a_removed_file_is_noticed(make_log: MakeLog, path: Path) -> None:
     """A log file removed or replaced while it is written stops the log with a reason."""
     log = make_log()
     assert settle(log) is None
     path.rename(path.with_name("stolen.db"))
     log.record(decision(log))
-    assert "removed or replaced" in (settle(log, time) or "")
+    assert "removed or replaced" in (settle(log, 0.5) or "")
 
 
-def test_a_second_writer_is_refused(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
+def test_a_second_writer_is_refused(make_log: MakeLog, path: Path) -> None:
     """The second process reports the reason and takes over when the first ends."""
     first = make_log()
     second = AuditLog(path, drive=ByHand)
@@ -389,20 +389,35 @@ def test_a_second_writer_is_refused(make_log: MakeLog, path: Path, time: Virtual
     assert "another process" in second.failed
     second.record(decision(second))
     first.close()
-    assert tried_again(second, time) is None
+    assert tried_again(second) is None
     assert second.close() is None
     assert events(path)["decision"] == 1
     assert verify(path).ok
 
 
-def test_a_missing_directory_is_a_failure(tmp_path: Path, time: VirtualClock) -> None:
+def test_the_process_that_locks_the_log_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The owner and the reason of the failure name other processes; once the lock ends, the log continues."""
+    told: list[list[int]] = []
+    monkeypatch.setattr(log_database, "_BUSY_SECONDS", 0)
+    monkeypatch.setattr(log_module, "holders", lambda _path: [os.getpid(), 4711])
+    log = AuditLog(path, drive=ByHand, held_by=told.append)
+    with closing(sqlite3.connect(path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        log.record(decision(log))
+        assert settle(log) == f"{path}: database is locked by process 4711"
+    assert told == [[4711]]
+    assert settle(log, 0.5) is None
+    assert log.close() is None
+
+
+def test_a_missing_directory_is_a_failure(tmp_path: Path) -> None:
     """The failure names the directory, and the log works once it exists."""
     path = tmp_path / "missing" / "audit.db"
     log = AuditLog(path, drive=ByHand)
     assert str(path) in (log.failed or "")
     log.record(decision(log))
     path.parent.mkdir()
-    assert tried_again(log, time) is None
+    assert tried_again(log) is None
     assert log.close() is None
     assert events(path)["decision"] == 1
 
@@ -430,7 +445,7 @@ def test_waiting_on_a_closed_log_is_an_error(make_log: MakeLog) -> None:
     assert "closed" in (settle(log) or "")
 
 
-def test_recovery_counts_denials_once(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
+def test_recovery_counts_denials_once(make_log: MakeLog, path: Path) -> None:
     """Denials being counted when the log failed are counted once, not twice."""
     log = make_log(fold=FoldSettings(seconds=3600))
     for _ in range(50):
@@ -439,10 +454,10 @@ def test_recovery_counts_denials_once(make_log: MakeLog, path: Path, time: Virtu
     stolen = path.with_name("stolen.db")
     path.rename(stolen)
     log.record(decision(log, decision="deny"))
-    assert tried_again(log, time) is not None
+    assert tried_again(log) is not None
     assert not path.exists(), "no new log takes the place of one that was removed"
     stolen.rename(path)
-    assert tried_again(log, time) is None
+    assert tried_again(log) is None
     assert log.close() is None
     denials = [entry.record for entry in export(path, Filter(decision=("deny",)))]
     counted = sum(one.detail["count"] for one in denials if one.event == "denials folded")
@@ -471,7 +486,7 @@ def test_a_signature_can_be_requested_at_once(make_log: MakeLog, path: Path) -> 
     assert events(path)["checkpoint"] == before + 1
 
 
-def test_a_refused_signature_is_reported(make_log: MakeLog, time: VirtualClock) -> None:
+def test_a_refused_signature_is_reported(make_log: MakeLog) -> None:
     """The caller gets the signer's reason; without an answer the caller decides how long to wait."""
     asked: list[int] = []
     log = make_log(checkpoint_seconds=3600, signer=lambda number, _text: asked.append(number))
@@ -482,7 +497,7 @@ def test_a_refused_signature_is_reported(make_log: MakeLog, time: VirtualClock) 
         await asyncio.sleep(0)
         assert not waiting.done()
         log.refused(asked[-1], "it does not follow")
-        let_pass(log, time, 1)
+        let_pass(log, 1)
         return await waiting
 
     assert asyncio.run(asyncio.wait_for(refused(), _LIMIT_SECONDS)) == "it does not follow"

@@ -21,7 +21,6 @@ from appliance.base import clock
 from appliance.signing.signed_statements import Removal
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
-from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
@@ -101,14 +100,12 @@ def test_another_signature_does_not_help(fresh: Path, whose: str) -> None:
     assert kinds(verify(fresh)) == {FindingKind.REMOVAL_UNFOUNDED}
 
 
-def test_a_signed_removal_covers_no_other(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_a_signed_removal_covers_no_other(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """After a real removal of old records, its signature does not cover a removal of new ones."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log, decision="deny", host="10.0.0.66"))
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1900
     for number in range(300):
         log.record(decision(log, number))
@@ -123,7 +120,7 @@ def test_a_signed_removal_covers_no_other(
 
 
 def test_the_signer_refuses_removals_beyond_its_settings(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
+    make_log: MakeLog, path: Path, notary: Notary
 ) -> None:
     """A control that asks for more than the signer's settings allow gets no signature, and all records stay."""
     make_old(make_log, notary)
@@ -131,7 +128,7 @@ def test_the_signer_refuses_removals_beyond_its_settings(
     notary.kept = type(notary.kept)()  # forever
     log.record(decision(log))
     settle(log)
-    retain(log, time)
+    retain(log)
     assert "the signer refuses" in (log.degraded or "")
     log.close()
     assert next(export(path, Filter())).sequence == 1

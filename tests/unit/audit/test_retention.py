@@ -29,9 +29,9 @@ def first_sequence(path: Path) -> int:
     return next(export(path, Filter(), page=1)).sequence
 
 
-def retain(log: AuditLog, time: VirtualClock) -> None:
+def retain(log: AuditLog) -> None:
     """Let a minute pass, in which the log removes what it may."""
-    let_pass(log, time, 60)
+    let_pass(log, 60)
 
 
 def make_old(make_log: MakeLog, notary: Notary) -> None:
@@ -48,15 +48,13 @@ def make_old(make_log: MakeLog, notary: Notary) -> None:
     notary.ago = 0
 
 
-def test_old_records_are_removed_and_that_is_recorded(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_old_records_are_removed_and_that_is_recorded(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """Records past the limit are removed, the log names them, and verification proves the rest."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     fresh = decision(log, reason="fresh")
     log.record(fresh)
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1900
     settle(log)
     log.close()
@@ -74,37 +72,33 @@ def test_old_records_are_removed_and_that_is_recorded(
     assert result.removed == removed
 
 
-def test_removal_by_age_waits_for_receipts(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_removal_by_age_waits_for_receipts(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """With `fleet.retention_waits`, old records stay until the collector has them; then they are removed."""
     make_old(make_log, notary)
     received = [700]
     log = make_log(checkpoint_every=100, retention=Retention(days=1, collected=lambda: received[0]))
     log.record(decision(log))
     settle(log)
-    retain(log, time)
+    retain(log)
     log.housekeeping.remover.sealed()
-    retain(log, time)
+    retain(log)
     assert 400 < first_sequence(path) <= 701
     received[0] = 2100
     log.housekeeping.remover.sealed()
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1900
     log.close()
     assert verify(path).ok
 
 
-def test_removal_by_size_does_not_wait_for_receipts(
-    make_log: MakeLog, path: Path, time: VirtualClock
-) -> None:
+def test_removal_by_size_does_not_wait_for_receipts(make_log: MakeLog, path: Path) -> None:
     """The log's size limit wins: uncollected records are removed."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20, collected=lambda: 0))
     for number in range(6000):
         log.record(decision(log, number, reason="x" * 400))
         if number % 200 == 199:
             settle(log)
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1
 
 
@@ -119,9 +113,7 @@ def test_young_records_stay(make_log: MakeLog, path: Path) -> None:
     assert search(path, Filter()).entries[-1].sequence
 
 
-def test_records_with_future_times_delay_no_removal(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_records_with_future_times_delay_no_removal(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """After a year of a fast clock, its records delay no removal and are not removed early."""
     now = itertools.count(clock.wall_ns() - 7 * _DAY, 1000)
     notary.ago, ahead = 7 * _DAY, 0
@@ -135,15 +127,13 @@ def test_records_with_future_times_delay_no_removal(
     notary.ago = 0
     log = make_log(checkpoint_every=10, retention=Retention(days=1))
     log.record(decision(log))
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 250
     log.close()
     assert verify(path).ok
 
 
-def test_waiting_for_the_signers_clock_is_not_an_alarm(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_waiting_for_the_signers_clock_is_not_an_alarm(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """The machine's clock is a year ahead: the signer waits, nothing is removed, and no delay is reported."""
     log = make_log(checkpoint_every=10, retention=Retention(days=30))
     for number in range(100):
@@ -158,14 +148,12 @@ def test_waiting_for_the_signers_clock_is_not_an_alarm(
     )
     log.record(decision(log))
     settle(log)
-    retain(log, time)
+    retain(log)
     assert (told[0], log.degraded) == (True, None)
     assert first_sequence(path) == 1
 
 
-def test_a_log_past_its_size_loses_its_oldest_records(
-    make_log: MakeLog, path: Path, time: VirtualClock
-) -> None:
+def test_a_log_past_its_size_loses_its_oldest_records(make_log: MakeLog, path: Path) -> None:
     """The log stays near its limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     for number in range(12_000):
@@ -173,7 +161,7 @@ def test_a_log_past_its_size_loses_its_oldest_records(
         if number % 200 == 0:
             settle(log)
     settle(log)
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 3000
     log.close()
     result = verify(path)
@@ -181,7 +169,7 @@ def test_a_log_past_its_size_loses_its_oldest_records(
     assert "larger than" in search(path, Filter(event="records removed")).entries[0].record.reason
 
 
-def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path, time: VirtualClock) -> None:
+def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path) -> None:
     """A flood of allows removes no denial: each denial is copied with its id, time and original position."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))
     early = decision(log, decision="deny", host="10.0.0.66", resource="/cmd_vel", reason="no")
@@ -193,7 +181,7 @@ def test_denials_and_alarms_are_removed_last(make_log: MakeLog, path: Path, time
             number += 1
             log.record(decision(log, number))
         settle(log)
-        let_pass(log, time, 5)
+        let_pass(log, 5)
     settle(log)
     log.close()
     (kept,) = search(path, Filter(decision=("deny",))).entries
@@ -246,14 +234,12 @@ def test_unsigned_records_stay(make_log: MakeLog, path: Path) -> None:
     assert next(export(path, Filter())).sequence == 1
 
 
-def test_removal_beyond_retention_is_found(
-    make_log: MakeLog, path: Path, notary: Notary, time: VirtualClock
-) -> None:
+def test_removal_beyond_retention_is_found(make_log: MakeLog, path: Path, notary: Notary) -> None:
     """Removing more records than the retention record names is found."""
     make_old(make_log, notary)
     log = make_log(retention=Retention(days=1))
     log.record(decision(log))
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1
     log.close()
     first = next(export(path, Filter())).sequence

@@ -24,7 +24,6 @@ from appliance.audit.segments import (
     write_segment,
 )
 from tests.support.audit import decision, settle
-from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import first_sequence, make_old, retain
 
@@ -184,13 +183,13 @@ def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: 
 
 
 def test_retention_leaves_a_segment_after_the_removed_records(
-    make_log: MakeLog, path: Path, notary: Notary, public: bytes, time: VirtualClock
+    make_log: MakeLog, path: Path, notary: Notary, public: bytes
 ) -> None:
     """After a removal, the first remaining checkpoint has a segment, which begins after the removed records."""
     make_old(make_log, notary)
     log = make_log(checkpoint_every=100, retention=Retention(days=1))
     log.record(decision(log))
-    retain(log, time)
+    retain(log)
     assert first_sequence(path) > 1900
     settle(log)
     number = next_segment(path, 0)

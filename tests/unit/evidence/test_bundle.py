@@ -630,7 +630,7 @@ def test_records_removed_by_retention_are_listed(
     with clock.using(passing):
         log = make_log(checkpoint_every=100, retention=Retention(days=1))
         log.record(decision(log))
-        retain(log, passing)
+        retain(log)
         log.close()
     running = Control(make_log())
     running.begun = 0

@@ -95,40 +95,38 @@ class Peer:
         self.sock.close()
 
 
+class HeldWork:
+    """Work beside the loop that is not done yet."""
+
+    def __init__(self, do: Callable[[], None]) -> None:
+        self.do: Callable[[], None] | None = do
+
+    def discard(self) -> None:
+        """Forget the work."""
+        self.do = None
+
+
 class WorldLoop(EventLoop):
     """A loop that does the work beside it at its next turn, without a thread, and not while the test `holds` it."""
 
     holds = False
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._works: list[_HeldWork] = []
-
     def beside(self, work: Callable[[], T], done: Callable[[T], None]) -> WorkBeside:
         """Do the work at the next turn."""
-        held = _HeldWork(self._works, lambda: done(work()))
-        self.after(0, self._work)
-        return held
+        self._work = HeldWork(lambda: done(work()))
+        self.after(0, self._do)
+        return self._work
 
     def release(self) -> None:
         """Do the work that the test held."""
         self.holds = False
-        self.after(0, self._work)
+        self.after(0, self._do)
 
-    def _work(self) -> None:
-        while self._works and not self.holds:
-            self._works.pop(0).do()
-
-
-class _HeldWork:
-    def __init__(self, works: list["_HeldWork"], do: Callable[[], None]) -> None:
-        self._works = works
-        self.do = do
-        works.append(self)
-
-    def discard(self) -> None:
-        """Forget the work."""
-        self._works.remove(self)
+    def _do(self) -> None:
+        do = self._work.do
+        if do is not None and not self.holds:
+            self._work.discard()
+            do()
 
 
 class World:

@@ -1,4 +1,4 @@
-"""The thread that compiles specifications beside the relay's loop."""
+"""Loading of compiled specifications in a process of its own."""
 
 import subprocess
 import sys
@@ -24,6 +24,7 @@ print(len(gc.get_objects()))
 """
 
 
+@pytest.mark.nightly
 def test_the_garbage_collector_looks_at_the_specifications_and_not_at_what_compiles_them() -> None:
     """The parser and libraries are exempt: scanning their hundred thousand objects would delay messages."""
     data = stated(1, [("m.rv", TEXT)]).part
