@@ -4,6 +4,7 @@ A named pipe may block its reader forever, a device may be endless, and a file m
 an `OSError` that names the cause, so callers report it like a missing file.
 """
 
+import contextlib
 import errno
 import io
 import os
@@ -50,6 +51,23 @@ def read_given(path: Path, longest: int = LONGEST) -> bytes:
     if len(data) > longest:
         raise OSError(errno.EFBIG, f"longer than {longest} bytes", str(path))
     return data
+
+
+@contextlib.contextmanager
+def path_for_library(path: Path) -> Iterator[Path]:
+    """Provide the path of a file for a library that opens it: of a copy in memory if only its owner may read it.
+
+    Raises `OSError`.
+    """
+    if os.access(path, os.R_OK):
+        yield path
+        return
+    content, memory = read_given(path), os.memfd_create(path.name)
+    try:
+        os.write(memory, content)
+        yield Path(f"/proc/self/fd/{memory}")
+    finally:
+        os.close(memory)
 
 
 def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:

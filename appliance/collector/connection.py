@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import httpcore
 
 from appliance.base import clock
+from appliance.base.input_files import path_for_library
 
 _EXCHANGE_SECONDS = 60.0  # a collector answers late when a thousand robots ask at once
 _SILENT_SECONDS = 90.0  # the collector sends a comment on the event stream every 30 s
@@ -267,7 +268,8 @@ def trusting_context(ca: Path) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
-        context.load_verify_locations(ca)
+        with path_for_library(ca) as authority:
+            context.load_verify_locations(authority)
     except OSError as error:
         raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(ca)) from error
     return context
@@ -277,7 +279,8 @@ def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
     """Return the TLS context of a robot: it trusts only `ca`, and presents `certificate`. Raises `OSError`."""
     context = trusting_context(ca)
     try:
-        context.load_cert_chain(certificate, key)
+        with path_for_library(certificate) as chain, path_for_library(key) as private:
+            context.load_cert_chain(chain, private)
     except OSError as error:
         raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(certificate)) from error
     return context

@@ -18,11 +18,12 @@ import ssl
 import struct
 import termios
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Protocol
 
 from appliance.base import clock
+from appliance.base.input_files import path_for_library
 
 _CONNECT_SECONDS = 5.0
 _SEND_SECONDS = 10.0
@@ -115,13 +116,15 @@ def tls_context(ca: Path | None, certificate: Path | None, key: Path | None) -> 
     Raises `OSError`, which names the unreadable file.
     """
     try:
-        context = ssl.create_default_context(cafile=ca)
+        with nullcontext() if ca is None else path_for_library(ca) as authority:
+            context = ssl.create_default_context(cafile=authority)
     except OSError as error:
         raise OSError(f"{ca}: {error.strerror or error}: the authority cannot be read") from error
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if certificate is not None:
         try:
-            context.load_cert_chain(certificate, key)
+            with path_for_library(certificate) as chain, path_for_library(key or certificate) as private:
+                context.load_cert_chain(chain, private)
         except OSError as error:
             raise OSError(
                 f"{certificate}, {key}: {error.strerror or error}: the forwarder's own certificate cannot be read"

@@ -213,6 +213,7 @@ ROLES = (
     _ours(
         "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
         ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        inputs=lambda facts: facts.syslog_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
             families=ROUTES,
@@ -223,6 +224,7 @@ ROLES = (
     _ours(
         "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
         ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
             families=ROUTES,
@@ -232,7 +234,7 @@ ROLES = (
     ),
     _ours(
         "bundles", "rosrv-bundles", "bundles", "appliance.bundles.process:main",
-        ended_early=600, after="control", dispensable=True,
+        ended_early=600, after="control", dispensable=True, inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
             families=ROUTES,

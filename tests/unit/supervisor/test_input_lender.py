@@ -10,6 +10,7 @@ from typing import Final
 import pytest
 
 from appliance.supervisor.input_lender import Borrower, lend_inputs
+from tests.support.certificates import make_certificates
 from tests.support.requirements import need_root
 
 USER: Final = 61099
@@ -19,6 +20,21 @@ from pathlib import Path
 from appliance.base.input_files import read_given_text
 from appliance.specifications.specification_files import read_folder
 print(read_given_text(Path(sys.argv[1])), read_folder(Path(sys.argv[2])).named())
+"""
+
+_TLS = """
+import os, sys
+from pathlib import Path
+from appliance.base.owner_access import FileLender
+from appliance.collector.connection import robot_context
+from appliance.forwarding.receiver import tls_context
+files = [Path(name) for name in sys.argv[1:]]
+lent = [{path: os.open(path, os.O_RDONLY) for path in files} for _time in range(2)]
+os.setresgid(61099, 61099, 61099)
+os.setresuid(61099, 61099, 61099)
+for context, given in zip((robot_context, tls_context), lent):
+    FileLender.install(given.get)
+    assert context(*files).get_ca_certs()
 """
 
 
@@ -83,6 +99,16 @@ def test_a_link_cannot_lend_the_files_of_another_user(
         borrower.open(home / "monitors/x.rv")
     with pytest.raises(NotADirectoryError):
         borrower.open(home / "monitors/msg/q/secret")
+
+
+def test_a_library_reads_a_copy_of_a_lent_file(tmp_path: Path) -> None:
+    """The forwarders present a certificate whose files only root may read; OpenSSL opens them by a path."""
+    need_root()
+    made = make_certificates(tmp_path / "closed")
+    made.ca.parent.chmod(0o700)
+    command = [sys.executable, "-c", _TLS, str(made.ca), str(made.certificate), str(made.key)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_root_of_a_container_reads_the_files_of_an_owner(home: Path) -> None:
