@@ -11,9 +11,12 @@ import yaml
 
 from appliance.configuration.config_sources import ConfigError, json_schema, plain, resolve
 
-_CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
+_CheckedFile = Annotated[
+    Path | None, typer.Argument(readable=False, metavar="[FILE]", help="The same as --config FILE")
+]
 _File = Annotated[
-    Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
+    Path | None,
+    typer.Option("--config", readable=False, help="Configuration file (default: ./appliance.yaml)"),
 ]
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 

@@ -241,8 +241,10 @@ def test_a_container_reads_what_only_its_owner_may() -> None:
     command = ["setpriv", f"--bounding-set=-all,{rights}", ROSRV, "up", "--json", "--isolation", "container"]
     command += ["--policy", str(above / "policies" / "robot.ini"), "--monitors", str(above / "monitors")]
     command += ["--state", str(above / "state"), "--listen", "10.85.0.2:11311"]
+    check = [*command[:2], ROSRV, "policy", "check", str(above / "policies" / "robot.ini")]
     environment = os.environ | {"ROSRV_HOSTS": str(above / "ipsec" / "hosts.yaml")}
     try:
+        subprocess.run(check, check=True)
         with Lab("rosrv-first") as lab:
             machine = lab.host("machine", "10.85.0.2/24")
             with Process(machine, command, env=environment, label="rosrv up") as up:

@@ -129,7 +129,7 @@ def disable(
 @speaks
 def load(
     appliance: Appliance,
-    files: Annotated[list[Path], typer.Argument(metavar="FILE…", show_default=False)],
+    files: Annotated[list[Path], typer.Argument(readable=False, metavar="FILE…", show_default=False)],
     msg: Annotated[
         list[Path] | None,
         typer.Option("--msg", metavar="DIR", help="Folder of message definitions (repeatable)"),

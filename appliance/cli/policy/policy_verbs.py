@@ -35,10 +35,12 @@ from appliance.policy.policy_findings import FindingSeverity, PolicyError, Polic
 from appliance.policy.rights import needs_node, rights_of
 from rosmop.tool.terminal import counted, refused, say
 
-_File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
+_File = Annotated[Path, typer.Argument(readable=False, metavar="FILE", help="The policy", show_default=False)]
 OptionalFile = Annotated[
     Path | None,
-    typer.Argument(metavar="FILE", help="The policy (default: the one in force)", show_default=False),
+    typer.Argument(
+        readable=False, metavar="FILE", help="The policy (default: the one in force)", show_default=False
+    ),
 ]
 
 

@@ -28,7 +28,8 @@ _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 def selftest(
     appliance: Appliance,
     config: Annotated[
-        Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
+        Path | None,
+        typer.Option("--config", readable=False, help="Configuration file (default: ./appliance.yaml)"),
     ] = None,
 ) -> None:
     """Check whether this machine can run the appliance, and whether a running appliance works.
