@@ -16,12 +16,15 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 
 
 class _Requires:
-    """A dependency that returns the bearer and requires at least the role `least`."""
+    """A dependency that returns the bearer and requires at least the role `least`.
+
+    It is asynchronous, like each dependency here: FastAPI would call any other in a thread, for every request.
+    """
 
     def __init__(self, least: TokenRole) -> None:
         self.least = least
 
-    def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
+    async def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
         bearer: Bearer = request.scope[BEARER]
         if not may(bearer.role, self.least):
             text = f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role}"
@@ -44,7 +47,7 @@ def reads_contents(bearer: Bearer) -> bool:
     return bearer.role != "viewer"
 
 
-def _no_viewer(bearer: Viewer) -> Bearer:
+async def _no_viewer(bearer: Viewer) -> Bearer:
     if not reads_contents(bearer):
         text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
         raise problem_of("forbidden", text)

@@ -1,17 +1,19 @@
-"""Send requests to an ASGI application that runs in the test's own process."""
+"""Send requests to an ASGI application that runs in the test's own process, without sockets and threads."""
 
-import asyncio
 from typing import Any
 
 import httpx
 
+from tests.support.inline_loop import run
+
+
+async def sent(app: Any, method: str, path: str, host: str = "10.0.0.1", **given: Any) -> httpx.Response:
+    """Return the answer to one request from a host."""
+    transport = httpx.ASGITransport(app, client=(host, 4))
+    async with httpx.AsyncClient(transport=transport, base_url="http://api") as client:
+        return await client.request(method, path, **given)
+
 
 def requested(app: Any, method: str, path: str, host: str = "10.0.0.1", **given: Any) -> httpx.Response:
-    """Return the answer to one request from a host."""
-
-    async def play() -> httpx.Response:
-        transport = httpx.ASGITransport(app, client=(host, 4))
-        async with httpx.AsyncClient(transport=transport, base_url="http://api") as client:
-            return await client.request(method, path, **given)
-
-    return asyncio.run(play())
+    """Return the answer to one request, which runs in a loop of its own."""
+    return run(sent(app, method, path, host, **given))

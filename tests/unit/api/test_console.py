@@ -4,10 +4,11 @@ import hashlib
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 
 import appliance.api
 from appliance.api.console import VIEWS, routes
@@ -32,7 +33,10 @@ class Client:
     """Sends requests to the console's routes only."""
 
     def __init__(self, settings: Settings) -> None:
-        app = FastAPI(exception_handlers={ProblemError: lambda _request, error: error.response()})
+        async def problem(_request: Request, error: Any) -> Any:
+            return error.response()
+
+        app = FastAPI(exception_handlers={ProblemError: problem})
         app.include_router(routes(settings))
         self._app = app
 
@@ -120,7 +124,6 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
     }  # fmt: skip
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     "path",
     [

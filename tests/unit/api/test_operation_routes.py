@@ -1,46 +1,34 @@
-"""Each operation over REST, from the gate to control's link: its order, roles, dry run and ETag."""
+"""Each operation over REST, from the gate to the part of control that carries it out: order, roles, dry run, ETag."""
 
 import asyncio
 import functools
+import json
 import re
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import msgspec
 import pytest
-from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
+from structlog.testing import capture_logs
 
-from appliance.api.access import Bearer, TokenAuthenticator
-from appliance.api.app import build_app
-from appliance.api.control import ControlLink, _made
-from appliance.api.history import SampleHistory
-from appliance.api.journal import Journal
-from appliance.api.request_gate import RequestGate, is_console
-from appliance.api.services import Services
+from appliance.api.access import Bearer
+from appliance.api.request_gate import is_console
+from appliance.base.withdrawal import WithdrawnError
 from appliance.channel import admin
-from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest, answer_to
-from appliance.channel.answers.graph_answers import Registrations
-from appliance.channel.answers.host_answers import Endpoint
-from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.monitor_answers import Monitors
-from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.channel.messages.api import RequestMade, TokenKept
+from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest
+from appliance.channel.messages.api import RequestMade
 from appliance.channel.rest_meaning import call_of, filled_in, meant
 from appliance.channel.rest_operation import Operation
-from appliance.configuration.settings import ApiLimits, Settings
-from appliance.store.access_tokens import make_token
-from tests.support.answers import example
-from tests.support.asgi import requested
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.policies import RevisionChangedError
+from appliance.control.token_orders import TokenRefusedError
+from appliance.hosts.host_table import HostForbiddenError
+from appliance.specifications.specification_manager import MonitorsChangedError
+from appliance.store.writer_thread import StoreError
+from tests.support.rest_world import ROLES, RestWorld, routes_of_api
 
-LOOKS: dict[type, Any] = {
-    admin.PolicyWanted: example(PolicyKnown, revision=7, text="[Nodes]\n", file="f"),
-    admin.RegistrationsWanted: example(Registrations),
-    admin.HostEndpoint: Endpoint("10.0.0.9", "the route"),
-    admin.MonitorsWanted: example(Monitors, files={"safeZone": "text"}),
-}
 FILES = {"a.rv": "text"}
 FIELDS = {"id": "a" * 20, "revision": 3, "topic": "/scan"}
 REQUESTS: list[tuple[str, str, Any]] = [
@@ -106,7 +94,6 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("PUT", "/v1/hosts/10.0.0.7/ports", {"state": "open", "open": [11311], "checked": 1.5}),
     ("PUT", "/v1/hosts/laptop/ports", {"state": "open", "checked": "2026-11-20T06:20:46Z"}),
 ]  # fmt: skip
-ROLES = ("viewer", "investigator", "operator", "admin")
 BY_ROLE = {
     "viewer": set(ROLES), "investigator": {"investigator"}, "operator": {"operator", "admin"}, "admin": {"admin"},
 }  # fmt: skip
@@ -142,69 +129,13 @@ LEAST = {
 
 PROBLEM = "urn:rosrv:problem:"
 IDS = [f"{method} {path} {number}" for number, (method, path, _body) in enumerate(REQUESTS)]
-
-
-def _empty(request: AdminRequest[Any]) -> Any:
-    kind: Any = answer_to(type(request))
-    return example(kind)
-
-
-class Listening(ControlLink):
-    """Control's end of the link: answers questions, collects orders and rejects them."""
-
-    def __init__(self) -> None:
-        super().__init__(lambda _tokens: None, lambda: None)
-        self.orders: list[RequestMade] = []
-
-    async def ask(
-        self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
-    ) -> AdminAnswer[A]:  # fmt: skip
-        """Return what control answers."""
-        if type(request) in CHANGES:
-            self.orders.append(_made(0, request, bearer))
-            return AdminAnswer(False, error="noted", trouble="busy")
-        return AdminAnswer(True, LOOKS.get(type(request)) or _empty(request))
+TAGS = (None, "*", '"7"', "", "7", 'W/"7"', '"7", "8"')  # missing, valid, valid, and four that are none
 
 
 @functools.cache
-def api() -> tuple[RequestGate, Listening, dict[str, str]]:
-    """Return the api with a token of each role."""
-    made = {role: make_token("alice", role, now=time.time(), seconds=6000) for role in ROLES}
-    door, control, journal = (
-        TokenAuthenticator(10, lambda _token: None),
-        Listening(),
-        Journal(lambda _call: None),
-    )
-    door.state([
-        TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
-        for row, _token in made.values()
-    ])  # fmt: skip
-    limits = ApiLimits(burst=100_000)
-    gate = RequestGate(
-        application(control, door, journal), limits=limits, doorkeeper=door, journal=journal, names=["api"]
-    )
-    return gate, control, {role: token for role, (_row, token) in made.items()}
-
-
-def application(control: ControlLink, door: TokenAuthenticator, journal: Journal) -> FastAPI:
-    """The routes of the api."""
-
-    async def nothing() -> Measures:
-        return example(Measures)
-
-    return build_app(Services(Settings(), control, door, journal, asyncio.Event(), SampleHistory(nothing)))
-
-
-def asked(method: str, target: str, body: Any, role: str, tag: str | None) -> httpx.Response:
-    """Return the api's answer to a request by a role; `Listening.orders` has the orders of this request."""
-    _gate, control, tokens = api()
-    control.orders.clear()
-    headers = {"Authorization": f"Bearer {tokens[role]}"} | ({} if tag is None else {"If-Match": tag})
-    if isinstance(body, str):
-        return requested(
-            api()[0], method, target, headers=headers | {"Content-Type": "text/plain"}, content=body
-        )
-    return requested(api()[0], method, target, headers=headers, json=body)
+def world() -> RestWorld:
+    """Return the api and control, which the tests share: each request begins with empty records."""
+    return RestWorld()
 
 
 def sample(operation: Operation) -> tuple[str, str, Any]:
@@ -229,19 +160,21 @@ def fields_of(operation: Operation) -> set[str]:
     return {field.name for field in operation.fields().values() if field.required}
 
 
-def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[RequestMade]:
-    """Return the orders that an honest api sends to control for a request by a role that may make it."""
+def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
+    """Return the order that control carries out for a request by a role that may make it."""
     role = "investigator" if target == "/v1/recordings/memory" else "admin"
-    assert "noted" in asked(method, target, body, role, tag).text
-    return list(api()[1].orders)
+    answer = world().asked(method, target, body, role, tag)
+    assert answer.status_code in (200, 201), answer.text
+    [made] = world().made
+    assert world().part.carried_out == [(made.request, f"a-{role}")]
+    return made
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("tag", ["*", '"7"'])
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_the_api_and_control_understand_the_same(method: str, target: str, body: Any, tag: str) -> None:
-    """For every way to give an order, control derives the order that the api made."""
-    [made] = ordered(method, target, body, tag)
+    """For every way to give an order, control derives the order that the api made, and carries out this one."""
+    made = ordered(method, target, body, tag)
     assert made.asked is not None
     assert (made.asked.method, made.asked.target) == (method, target)
     assert filled_in(meant(made.asked), made.request) == made.request
@@ -252,43 +185,115 @@ MATRIX = [
 ]
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("operation", "dry"), MATRIX, ids=[f"{one.name}{' dry' * dry}" for one, dry in MATRIX]
 )
-def test_role_then_etag_decide_whether_an_operation_reaches_control(operation: Operation, dry: bool) -> None:
-    """A wrong role gets 403 whatever its ETag.
+def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operation, dry: bool) -> None:
+    """A role that is too low gets 401 or 403 whatever its ETag; then a missing ETag gets 428, an invalid one 412.
 
-    Then a missing ETag gets 428, and an invalid ETag 412; a dry run needs no ETag.
+    A dry run is for operators, needs no ETag and changes nothing. Every other change takes effect once. Each request of
+    a token for a change leaves one record with its author, and each rejection is a problem document.
     """
     method, target, body = sample(operation)
     target += ("&" if "?" in target else "?") + "dry_run=1" if dry else ""
-    allowed = BY_ROLE[LEAST[operation.name]] if not dry else BY_ROLE["operator"]
+    allowed = BY_ROLE["operator" if dry else LEAST[operation.name]]
     tagged = operation.is_change and "expected" in operation.fields()
-    for role in ROLES:
-        for tag in (None, "", "7", 'W/"7"', '"7", "8"', "*", '"7"'):
-            answer = asked(method, target, body, role, tag)
+    for role in (None, *ROLES):
+        for tag in TAGS if tagged and role in allowed else TAGS[:3]:
+            answer = world().asked(method, target, body, role, tag)
+            expected = 401, "not-recognised"
+            if role in allowed:
+                wrong = tagged and tag not in TAGS[:3] and not (dry and not tag)
+                missing = tagged and tag is None and not dry
+                expected = (
+                    (412, "changed-meanwhile")
+                    if wrong
+                    else (428, "precondition-required")
+                    if missing
+                    else (operation.status, "")
+                )
+            elif role is not None:
+                expected = 403, "not-for-this-role"
             case = (role, tag, answer.text)
-            wrong = tag not in (None, "*", '"7"') and not (dry and tag == "")
-            if role not in allowed:
-                assert (answer.status_code, answer.json()["type"]) == (403, f"{PROBLEM}not-for-this-role"), (
-                    case
-                )
-            elif tagged and tag is None and not dry:
-                assert (answer.status_code, answer.json()["type"]) == (
-                    428,
-                    f"{PROBLEM}precondition-required",
-                ), case
-            elif tagged and wrong:
-                assert (answer.status_code, answer.json()["type"]) == (412, f"{PROBLEM}changed-meanwhile"), (
-                    case
-                )
-            elif operation.is_change and not dry:
-                assert (answer.status_code, len(api()[1].orders)) == (503, 1), case
-                continue
-            else:
-                assert answer.status_code == 200, case
-            assert not api()[1].orders, case
+            assert answer.status_code == expected[0], case
+            if expected[1]:
+                require_problem(answer, *expected)
+            changes = operation.is_change and not dry and not expected[1]
+            assert [who for _order, who in world().part.carried_out] == [f"a-{role}"] * changes, case
+            if role is None:  # the journal folds equal calls without a token
+                assert {one["decision"] for one in world().trail.records} <= {"deny"}
+            elif operation.is_change:
+                [record] = world().trail.records
+                denied = bool(expected[1]) and (expected[0] in (401, 403) or not dry)
+                assert (record["event"], record["decision"], record["who"], record["status"]) == (
+                    "rest call", "deny" if denied else "allow", f"a-{role}", expected[0],
+                ), case  # fmt: skip
+
+
+@pytest.mark.parametrize("request_type", sorted(CHANGES, key=str), ids=lambda one: one.__name__)
+def test_control_itself_denies_what_the_api_should_have_denied(request_type: type[AdminRequest[Any]]) -> None:
+    """An order of a compromised api, without a client's request, is refused and recorded with a token of any role."""
+    made = next(
+        made.request
+        for made in (ordered(method, target, body) for method, target, body in REQUESTS)
+        if type(made.request) is request_type
+    )
+    for role in ROLES:
+        world().bypassing(made, role)
+        assert not world().part.carried_out
+        [record] = world().trail.records
+        assert (record["event"], record["decision"], record["who"]) == (
+            "order refused",
+            "deny",
+            f"a-{role}",
+        ), role
+
+
+REJECTIONS = (
+    (RevisionChangedError(7, 8), 412, "changed-meanwhile"),
+    (MonitorsChangedError("other", "3.1"), 412, "changed-meanwhile"),
+    (UnknownThingError("none"), 404, "unknown"),
+    (SenselessError("odd"), 422, "bad-input"),
+    (TokenRefusedError("wrong"), 422, "refused"),
+    (HostForbiddenError("no"), 403, "not-for-this-role"),
+    (WithdrawnError(), 503, "busy"),
+    (StoreError("full"), 503, "not-available"),
+    (RuntimeError("a secret detail"), 503, "not-available"),
+)
+
+
+@pytest.mark.parametrize("request_", REQUESTS[::9], ids=IDS[::9])
+@pytest.mark.parametrize(
+    ("error", "status", "kind"), REJECTIONS, ids=[type(one[0]).__name__ for one in REJECTIONS]
+)
+def test_a_rejection_by_control_is_a_problem(
+    error: Exception, status: int, kind: str, request_: tuple[str, str, Any]
+) -> None:
+    """The status and the kind follow from the error; a defect reveals nothing of itself."""
+    method, target, body = request_
+    if kind == "refused" and target.startswith("/v1/monitors"):
+        kind = "specifications-refused"
+    world().part.error = error
+    try:
+        with capture_logs():
+            answer = world().asked(method, target, body, tag="*")
+    finally:
+        world().part.error = None
+    assert answer.status_code == status, answer.text
+    require_problem(answer, status, kind)
+    assert "secret" not in answer.text
+    assert ("ETag" in answer.headers) is isinstance(error, MonitorsChangedError)
+    [record] = world().trail.records
+    assert (record["decision"], record["status"]) == ("deny", status)
+
+
+def require_problem(answer: httpx.Response, status: int, kind: str) -> None:
+    """Fail unless an answer is a problem document (RFC 9457) of this kind with an explanation."""
+    assert answer.headers["content-type"] == "application/problem+json"
+    document = json.loads(answer.text)
+    assert (document["type"], document["status"]) == (f"{PROBLEM}{kind}", status)
+    assert document["title"]
+    assert document["detail"]
 
 
 def test_the_matrix_has_every_operation() -> None:
@@ -307,14 +312,13 @@ def test_rows_name_fields_of_their_requests() -> None:
         assert set(re.findall(r"{(\w+)", one.path)) <= {*one.fields()}, one.path
 
 
-@pytest.mark.nightly
 def test_pruning_is_for_admins() -> None:
     """Operators load the folder's files; only admins remove monitors whose files the folder does not have."""
-    for role, status in (("operator", 403), ("admin", 503)):
-        assert asked("POST", "/v1/monitors/reload?prune=1", None, role, "*").status_code == status
-    assert "removing files that the folder does not have is for admins" in asked(
-        "POST", "/v1/monitors/reload?prune=1", None, "operator", "*"
-    ).text  # fmt: skip
+    target = "/v1/monitors/reload?prune=1"
+    assert world().asked("POST", target, None, "admin", "*").status_code == 200
+    answer = world().asked("POST", target, None, "operator", "*")
+    assert "removing files that the folder does not have is for admins" in answer.text
+    assert not world().part.carried_out
 
 
 BY_HAND = {
@@ -343,12 +347,11 @@ BY_HAND = {
 
 def routes() -> dict[str, set[str]]:
     """Return the least roles of each method and path, without the console's."""
-    app = application(Listening(), TokenAuthenticator(10, lambda _token: None), Journal(lambda _call: None))
     return {
         f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
             role for role in roles_of(route.dependant) if role
         }
-        for route in iter_route_contexts(app.routes)
+        for route in iter_route_contexts(routes_of_api())
         for method in route.methods or ()
         if not is_console(str(route.path))
     }
@@ -376,20 +379,15 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
             yield from roles_of(one)
 
 
-@pytest.mark.nightly
 def test_every_order_has_its_way() -> None:
     """`REQUESTS` has a request for every kind of order that the api may send."""
-    found = {
-        type(ordered(method, target, body)[0].request) for method, target, body in REQUESTS
-    }  # fmt: skip
-    assert found == CHANGES
+    assert {type(ordered(method, target, body).request) for method, target, body in REQUESTS} == CHANGES
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_no_field_of_an_order_can_be_another(method: str, target: str, body: Any) -> None:
     """A compromised api cannot change a field of an order, except those that the appliance fills in."""
-    [made] = ordered(method, target, body, '"7"')
+    made = ordered(method, target, body, '"7"')
     assert made.asked is not None
     body = body if isinstance(body, dict) else {}
     for field in msgspec.structs.fields(made.request):
@@ -417,10 +415,9 @@ def _other(value: Any) -> Any:
             return value + 1
 
 
-@pytest.mark.nightly
 def test_control_hears_of_a_client_that_disconnects() -> None:
     """When the client of an order disconnects, its bearer ends, and control withdraws the order."""
-    gate, control, tokens = api()
+    gate, control, tokens = world().gate, world().control, world().tokens.texts
     seen: list[Any] = []
 
     async def receive() -> Any:
@@ -449,5 +446,5 @@ def test_control_hears_of_a_client_that_disconnects() -> None:
     }  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(control, "ask", asked)
-        asyncio.run(gate(scope, receive, send))
+        world().play(lambda: gate(scope, receive, send))
     assert seen == ["body", admin.PolicyConfirm]

@@ -1,6 +1,5 @@
 """A recording that is removed during its download."""
 
-import asyncio
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +17,8 @@ from appliance.channel.answers.recording_answers import Recording
 from appliance.recorder.bag_writer import BagMessage, BagWriter
 from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
+from tests.support.inline_loop import run
 from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
-
-pytestmark = pytest.mark.nightly
 
 _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
@@ -50,15 +48,15 @@ def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
         shutil.rmtree(kept)
         return b"".join([piece async for piece in response.body_iterator if isinstance(piece, bytes)])
 
-    assert asyncio.run(fetched()) == whole
+    assert run(fetched()) == whole
     with pytest.raises(ProblemError, match="no longer exists") as gone:
-        asyncio.run(_asked(services, mcap=mcap))
+        run(_asked(services, mcap=mcap))
     assert gone.value.status == 503
     kept.mkdir()
     (kept / "recording.bag").write_bytes(b"")
     if mcap:
         with pytest.raises(ProblemError, match="cannot be read"):
-            asyncio.run(_asked(services, mcap=mcap))
+            run(_asked(services, mcap=mcap))
 
 
 async def _asked(services: Services, *, mcap: bool) -> StreamingResponse:

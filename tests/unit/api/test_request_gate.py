@@ -5,20 +5,18 @@ import re
 import httpx
 import pytest
 
-from tests.support.asgi import requested
-from tests.unit.api.test_operation_routes import BY_HAND, api, routes
-
-pytestmark = pytest.mark.nightly
+from tests.support.asgi import sent as sent_to
+from tests.unit.api.test_operation_routes import BY_HAND, routes, world
 
 
 def sent(method: str, path: str, headers: dict[str, str], host: str = "10.0.0.1") -> httpx.Response:
     """Return the answer to a request."""
-    return requested(api()[0], method, path, host, headers=headers)
+    return world().play(lambda: sent_to(world().gate, method, path, host, headers=headers))
 
 
 def get(path: str, **headers: str) -> httpx.Response:
     """Return the answer to a viewer's request."""
-    return sent("GET", path, {"Authorization": f"Bearer {api()[2]['viewer']}"} | headers)
+    return sent("GET", path, {"Authorization": f"Bearer {world().tokens.texts['viewer']}"} | headers)
 
 
 def test_every_route_but_the_public_ones_needs_a_token() -> None:
@@ -39,7 +37,7 @@ def test_every_route_but_the_public_ones_needs_a_token() -> None:
 
 def test_an_invalid_token_is_refused() -> None:
     """Wrong schemes, empty, malformed and unknown tokens, and a valid id with another secret get 401."""
-    right = f"Bearer {api()[2]['viewer']}"
+    right = f"Bearer {world().tokens.texts['viewer']}"
     secret = right[:-4] + ("AAAA" if not right.endswith("AAAA") else "BBBB")
     unknown = "bearer rosrv_0123456789ab_" + "A" * 43
     for number, header in enumerate(
@@ -71,7 +69,9 @@ def test_other_origins_are_refused(origin: str, status: int) -> None:
     """Every request from a page of another origin gets 403, and no answer has a CORS header."""
     for method in ("GET", "OPTIONS", "POST"):
         answer = sent(
-            method, "/v1/policy", {"Origin": origin, "Authorization": f"Bearer {api()[2]['viewer']}"}
+            method,
+            "/v1/policy",
+            {"Origin": origin, "Authorization": f"Bearer {world().tokens.texts['viewer']}"},
         )
         assert (answer.status_code == 403) is (status == 403)
         assert not any(header.startswith("access-control") for header in answer.headers)

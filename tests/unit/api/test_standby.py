@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from appliance.api.history import SampleHistory, measures_of
 from appliance.api.journal import Journal
 from appliance.api.request_gate import RequestGate
 from appliance.api.services import Services
+from appliance.base.clock import using
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.channel.answers.standby_answers import StandbyState
@@ -26,11 +27,14 @@ from appliance.control.standby_orders import on_standby
 from appliance.store.access_tokens import make_token
 from tests.support.answers import example
 from tests.support.asgi import requested
+from tests.support.inline_loop import run
+from tests.support.virtual_clock import VirtualClock
 
 STATE = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a", "address": "10.0.0.1"})
 TEXT = "this appliance is the standby of a (10.0.0.1); give the command there"
 ENROLMENT = json.loads(Path(examples.__file__).with_name("examples.json").read_text())["Enrolment"]
-ROW, TOKEN = make_token("alice", "admin", now=time.time(), seconds=86_400)
+NOW = 1_700_000_000.0
+ROW, TOKEN = make_token("alice", "admin", now=NOW, seconds=86_400)
 
 
 class Standby(ControlLink):
@@ -49,7 +53,7 @@ class Standby(ControlLink):
 
 
 @pytest.fixture
-def gate() -> RequestGate:
+def gate() -> Iterator[RequestGate]:
     """Return the api of a standby, which has sampled it once."""
     door, control, journal = (
         TokenAuthenticator(10, lambda _token: None),
@@ -58,9 +62,10 @@ def gate() -> RequestGate:
     )
     door.state([TokenKept(ROW.id, ROW.name, ROW.role, ROW.salt, ROW.hash, ROW.expires)])
     history = SampleHistory(lambda: measures_of(control))
-    asyncio.run(history.look())
     app = build_app(Services(Settings(), control, door, journal, asyncio.Event(), history))
-    return RequestGate(app, limits=ApiLimits(), doorkeeper=door, journal=journal, names=["api"])
+    with using(VirtualClock(wall=NOW)):
+        run(history.look())
+        yield RequestGate(app, limits=ApiLimits(), doorkeeper=door, journal=journal, names=["api"])
 
 
 def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Response:
@@ -69,7 +74,6 @@ def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Res
     return requested(gate, method, target, headers=headers, **more)
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("method", "target"),
     [
@@ -97,7 +101,6 @@ def test_a_host_that_enrols_gets_the_same_problem(gate: RequestGate) -> None:
     assert (answer.status_code, answer.json()["active"]) == (503, "10.0.0.1")
 
 
-@pytest.mark.nightly
 def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
     """A standby is not `down` for Prometheus, and answers questions about itself."""
     assert asked(gate, "GET", "/v1/standby").json()["other"]["name"] == "a"
@@ -106,7 +109,6 @@ def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
     assert 'rosrv_standby_role{role="standby"} 1.0' in page.text
 
 
-@pytest.mark.nightly
 def test_no_other_problem_has_the_address(gate: RequestGate) -> None:
     """The address is part of this problem only, and only for valid tokens."""
     answer = requested(gate, "GET", "/v1/status", headers={"Authorization": "Bearer wrong"})

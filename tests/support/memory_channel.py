@@ -1,0 +1,81 @@
+"""A link between two processes of the appliance, both of which are in the test: messages are encoded and decoded."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from appliance.channel.channel import Channel
+from appliance.channel.messages import Message
+
+
+class MemoryChannel(Channel):
+    """One end; its `peer` gets each message in a later turn of the loop, as over a socket."""
+
+    def __init__(self, union: Any) -> None:
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._decode = msgspec.msgpack.Decoder(union).decode
+        self._arrived: deque[bytes] = deque()
+        self._received: Callable[[Any, tuple[int, ...]], None] | None = None
+        self._ended: Callable[[], None] = lambda: None
+        self._refused: Callable[[str], None] = lambda _reason: None
+        self.peer = self
+        self.closed = False
+        self.messages: list[Any] = []
+        """All messages that this end has got."""
+
+    def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
+        """Send a message to the other end."""
+        assert not descriptors, "a file descriptor needs a socket"
+        self.send_raw(self._encode(message))
+
+    def send_raw(self, body: bytes) -> None:
+        """Send bytes that need not be a message of the link."""
+        if not self.peer.closed:
+            self.peer._arrived.append(body)
+            asyncio.get_running_loop().call_soon(self.peer._deliver)
+
+    def attach(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        received: Callable[[Any, tuple[int, ...]], None],
+        closed: Callable[[], None],
+        refused: Callable[[str], None] | None = None,
+    ) -> None:
+        """Begin to pass on messages, as `Channel.attach`."""
+        self._received, self._ended = received, closed
+        self._refused = refused if refused is not None else lambda _reason: closed()
+        loop.call_soon(self._deliver)
+
+    def _deliver(self) -> None:
+        while self._arrived and self._received is not None and not self.closed:
+            try:
+                message = self._decode(self._arrived.popleft())
+            except ValueError as error:
+                self.close()
+                self._refused(str(error))
+                return
+            self.messages.append(message)
+            self._received(message, ())
+
+    def close(self) -> None:
+        """End the link; the other end hears of it after the messages before."""
+        if not self.closed:
+            self.closed = True
+            if not self.peer.closed:
+                asyncio.get_running_loop().call_soon(self.peer._end)
+
+    def _end(self) -> None:
+        self._deliver()
+        if not self.closed:
+            self.close()
+            self._ended()
+
+
+def memory_link(union: Any) -> tuple[MemoryChannel, MemoryChannel]:
+    """Return both ends of a link."""
+    here, there = MemoryChannel(union), MemoryChannel(union)
+    here.peer, there.peer = there, here
+    return here, there

@@ -1,0 +1,208 @@
+"""REST in one process: the api's real gate, routes and link, and control's real link, authentication and dispatch.
+
+Only the parts of control that answer requests are models. There is no socket, no thread and no real clock.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar, cast
+
+import httpx
+from fastapi import FastAPI
+
+from appliance.api.access import TokenAuthenticator
+from appliance.api.app import build_app
+from appliance.api.control import ControlLink
+from appliance.api.history import SampleHistory
+from appliance.api.journal import Journal
+from appliance.api.request_gate import RequestGate
+from appliance.api.services import Services
+from appliance.base.clock import using
+from appliance.channel import admin
+from appliance.channel.admin import CHANGES, AdminRequest, answer_to
+from appliance.channel.answers.graph_answers import Registrations
+from appliance.channel.answers.host_answers import Endpoint, KitParts
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.monitor_answers import Monitors
+from appliance.channel.answers.policy_answers import PolicyKnown
+from appliance.channel.messages.api import ApiLink, RequestMade, TokenKept
+from appliance.configuration.settings import ApiLimits, Settings
+from appliance.control.administration import Administration
+from appliance.control.request_methods import request_methods
+from appliance.control.rest import RestLink
+from appliance.store.access_tokens import TokenRow, make_token
+from tests.support.answers import example
+from tests.support.asgi import sent
+from tests.support.inline_loop import InlineLoop
+from tests.support.memory_channel import memory_link
+from tests.support.virtual_clock import VirtualClock
+
+T = TypeVar("T")
+ROLES = ("viewer", "investigator", "operator", "admin")
+_NOW = 1_700_000_000.0
+_ANSWERS: dict[type, Any] = {
+    admin.PolicyWanted: example(PolicyKnown, revision=7, text="[Nodes]\n", file="f"),
+    admin.RegistrationsWanted: example(Registrations),
+    admin.HostEndpoint: Endpoint("10.0.0.9", "the route"),
+    **dict.fromkeys(
+        (admin.HostAdd, admin.HostRenew),
+        example(KitParts, name="laptop", address="10.9.0.2", appliance="10.9.0.1"),
+    ),
+    admin.MonitorsWanted: example(Monitors, files={"safeZone": "text"}),
+}
+
+
+class Part:
+    """Every part of control that answers requests, and each of its methods; an order ends with `error` if it is set."""
+
+    revision = 7
+
+    def __init__(self) -> None:
+        self.carried_out: list[tuple[AdminRequest[Any], str | None]] = []
+        """The orders that took effect, each with its author."""
+        self.error: Exception | None = None
+
+    def __getattr__(self, _name: str) -> "Part":
+        return self
+
+    async def __call__(self, request: AdminRequest[Any], who: str | None = None) -> Any:
+        """Answer a request with an example."""
+        if type(request) in CHANGES:
+            if self.error is not None:
+                raise self.error
+            self.carried_out.append((request, who))
+        return _ANSWERS.get(type(request)) or example(cast(Any, answer_to(type(request))))
+
+
+class Tokens:
+    """A token of each role."""
+
+    def __init__(self) -> None:
+        made = {role: make_token(f"a-{role}", role, now=_NOW, seconds=6000) for role in ROLES}
+        self.rows = {row.id: row for row, _text in made.values()}
+        self.texts = {role: text for role, (_row, text) in made.items()}
+
+    def usable(self) -> list[TokenKept]:
+        """Return what the api gets of them."""
+        return [
+            TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+            for row in self.rows.values()
+        ]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """Return one of them."""
+        return self.rows.get(token_id)
+
+    def used(self, token_id: str) -> None:
+        """Ignore the use of a token."""
+
+
+class Trail:
+    """The audit trail: keeps the records."""
+
+    obstacle: str | None = None
+
+    def __init__(self) -> None:
+        self.records: list[dict[str, Any]] = []
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """Keep a record."""
+        self.records.append({"event": event, "reason": reason, **fields})
+        return "id"
+
+    async def durable(self) -> None:
+        """Return as if the records were written."""
+
+
+class RestWorld:
+    """The api and control, with an empty audit trail; `asked` sends a request."""
+
+    def __init__(self) -> None:
+        with using(VirtualClock(wall=_NOW)):
+            self._runner = asyncio.Runner(loop_factory=InlineLoop)
+            self._runner.get_loop()  # which keeps this clock
+        self.part, self.tokens, self.trail = Part(), Tokens(), Trail()
+        self.gate, self.control = make_api()
+        self._ends = memory_link(ApiLink)
+        self._runner.run(self._connect())
+
+    async def _connect(self) -> None:
+        part: Any = self.part
+        methods = request_methods(
+            queries=part, policies=part, monitors=part, hosts=part, certification=part, tokens=part,
+            recordings=part, blocks=part, evidence=part, standby=part,
+        )  # fmt: skip
+        administration = Administration(part, methods, durable=self.trail.durable, require_room=lambda: None)
+        rest = RestLink(
+            administration, cast(Any, self.tokens), cast(Any, self.trail), served=lambda _pin: None, require_proof=False
+        )  # fmt: skip
+        rest.attach(self._ends[0])
+        self.control.attach(self._ends[1])
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+
+    @property
+    def made(self) -> list[RequestMade]:
+        """The orders that control got from the api since the last request began."""
+        return [
+            one for one in self._ends[0].messages if isinstance(one, RequestMade) and type(one.request) in CHANGES
+        ]  # fmt: skip
+
+    def asked(
+        self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None
+    ) -> httpx.Response:
+        """Return the answer to a request by a role (None: without a token), after its record was made."""
+        headers = {} if role is None else {"Authorization": f"Bearer {self.tokens.texts[role]}"}
+        headers |= {} if tag is None else {"If-Match": tag}
+        given: dict[str, Any] = {"json": body}
+        if isinstance(body, str):
+            headers["Content-Type"] = "text/plain"
+            given = {"content": body}
+        self._ends[0].messages.clear()
+        self.trail.records.clear()
+        self.part.carried_out.clear()
+        return self.play(lambda: sent(self.gate, method, target, headers=headers, **given))
+
+    def bypassing(self, request: AdminRequest[Any], role: str) -> None:
+        """Send control an order with a token, as a compromised api would, without the client's HTTP request."""
+        self.trail.records.clear()
+        self.part.carried_out.clear()
+
+        async def play() -> None:
+            self._ends[1].send(RequestMade(10_000, request, self.tokens.texts[role]))
+
+        self.play(play)
+
+    def play(self, what: Callable[[], Awaitable[T]]) -> T:
+        """Run something, and what follows from it."""
+
+        async def playing() -> T:
+            result = await what()
+            for _turn in range(20):
+                await asyncio.sleep(0)
+            return result
+
+        return self._runner.run(playing())
+
+
+def routes_of_api() -> Any:
+    """Return the routes of the application."""
+    return _application(
+        ControlLink(lambda _tokens: None, lambda: None), TokenAuthenticator(10, lambda _token: None), Journal(print)
+    ).routes  # fmt: skip
+
+
+def make_api() -> tuple[RequestGate, ControlLink]:
+    """Return the api's gate and its link to control, which states the tokens."""
+    door = TokenAuthenticator(10, lambda _token: None)
+    control = ControlLink(door.state, lambda: None)
+    journal = Journal(control.tell)
+    app, limits = _application(control, door, journal), ApiLimits(burst=100_000)
+    return RequestGate(app, limits=limits, doorkeeper=door, journal=journal, names=["api"]), control
+
+
+def _application(control: ControlLink, door: TokenAuthenticator, journal: Journal) -> FastAPI:
+    async def nothing() -> Measures:
+        return example(Measures)
+
+    return build_app(Services(Settings(), control, door, journal, asyncio.Event(), SampleHistory(nothing)))
