@@ -21,6 +21,7 @@ class MemoryChannel(Channel):
         self._received: Callable[[Any, tuple[int, ...]], None] | None = None
         self._ended: Callable[[], None] = lambda: None
         self._refused: Callable[[str], None] = lambda _reason: None
+        self._runs_in: asyncio.AbstractEventLoop | None = None
         self.peer = self
         self.closed = False
         self.messages: list[Any] = []
@@ -35,7 +36,7 @@ class MemoryChannel(Channel):
         """Send bytes that need not be a message of the link."""
         if not self.peer.closed:
             self.peer._arrived.append(body)
-            asyncio.get_running_loop().call_soon(self.peer._deliver)
+            self.peer._soon(self.peer._deliver)
 
     def attach(
         self,
@@ -47,7 +48,12 @@ class MemoryChannel(Channel):
         """Begin to pass on messages, as `Channel.attach`."""
         self._received, self._ended = received, closed
         self._refused = refused if refused is not None else lambda _reason: closed()
-        loop.call_soon(self._deliver)
+        self._runs_in = loop
+        self._soon(self._end if self.peer.closed else self._deliver)
+
+    def _soon(self, act: Callable[[], None]) -> None:
+        if self._runs_in is not None and not self._runs_in.is_closed():
+            self._runs_in.call_soon(act)
 
     def _deliver(self) -> None:
         while self._arrived and self._received is not None and not self.closed:
@@ -65,7 +71,7 @@ class MemoryChannel(Channel):
         if not self.closed:
             self.closed = True
             if not self.peer.closed:
-                asyncio.get_running_loop().call_soon(self.peer._end)
+                self.peer._soon(self.peer._end)
 
     def _end(self) -> None:
         self._deliver()

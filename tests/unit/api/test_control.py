@@ -1,8 +1,6 @@
-"""Tests of `appliance.api.control` over a real link."""
+"""Tests of `appliance.api.control`."""
 
 import asyncio
-import socket
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -12,6 +10,7 @@ import pytest
 from appliance.api import control as module
 from appliance.api.access import Bearer
 from appliance.api.control import ControlAwayError, ControlLink
+from appliance.base import clock
 from appliance.channel.admin import AdminAnswer, PolicyConfirm, StatusWanted, encode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel
@@ -26,16 +25,16 @@ from appliance.channel.messages.api import (
 )
 from tests.support.answers import example
 from tests.support.heard import Heard
+from tests.support.memory_channel import memory_link
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
 
 class Control:
     """Control's end of the link: collects messages, and answers when the test says so."""
 
     def __init__(self, link: ControlLink, ends: list[Channel]) -> None:
-        here, there = socket.socketpair()
-        api, self.channel = Channel(here, ApiLink), Channel(there, ApiLink)
+        api, self.channel = memory_link(ApiLink)
         ends += [api, self.channel]
         link.attach(api)
         self._ear = Heard(self.channel)
@@ -132,10 +131,10 @@ async def test_an_order_without_an_answer_says_how_to_find_out(
 async def test_an_order_is_withdrawn_when_its_client_disconnects(link: ControlLink, there: Control) -> None:
     """Control is notified at once that a client disconnected, and knows the deadline of its order."""
     gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-    began = time.monotonic()
+    began = clock.now()
     asking = asyncio.create_task(link.ask(PolicyConfirm(), replace(bearer("w"), gone=gone), seconds=7.0))
     (made,) = await there.until(1)
-    assert began + 7.0 <= made.until <= time.monotonic() + 7.0
+    assert began + 7.0 <= made.until <= clock.now() + 7.0
     gone.set_result(None)
     assert (await there.until(2))[1] == RequestWithdrawn(made.number)
     there.channel.send(

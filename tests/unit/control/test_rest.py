@@ -1,14 +1,15 @@
-"""Tests of `appliance.control.rest` over a real link; administration, tokens and audit trail are test doubles."""
+"""Tests of `appliance.control.rest`; administration, tokens and audit trail are test doubles."""
 
 import asyncio
 import socket
-import time
 from collections.abc import Iterator
 from typing import Any
 
 import msgspec
 import pytest
 
+from appliance.base import clock
+from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
@@ -30,11 +31,15 @@ from appliance.control.rest import RestLink
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.heard import Heard
+from tests.support.memory_channel import memory_link
+from tests.support.virtual_clock import VirtualClock
 
-pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+pytestmark = pytest.mark.anyio
 
-VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=time.time(), seconds=86_400)
-ADMIN, TOKEN = make_token("w", "admin", now=time.time(), seconds=86_400)
+NOW = 1_700_000_000.0
+
+VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=NOW, seconds=86_400)
+ADMIN, TOKEN = make_token("w", "admin", now=NOW, seconds=86_400)
 
 
 def kept(row: TokenRow) -> TokenKept:
@@ -97,11 +102,7 @@ class Api:
     """The api's end of the link."""
 
     def __init__(self, world: Everything, link: RestLink) -> None:
-        here, there = socket.socketpair()
-        self.raw = there
-        self.channel = Channel(there, ApiLink)
-        control = Channel(here, ApiLink)
-        world.ends += [self.channel, control]
+        control, self.channel = memory_link(ApiLink)
         self.closed = asyncio.Event()
         link.attach(control)
         self._ear = Heard(self.channel, self.closed.set)
@@ -122,7 +123,8 @@ def pins() -> list[str]:
 def world() -> Iterator[Everything]:
     """Return the parts around the link, whose channels are closed at the end."""
     world = Everything()
-    yield world
+    with using(VirtualClock(wall=NOW, now=NOW)):
+        yield world
     for end in world.ends:
         end.close()
 
@@ -204,7 +206,7 @@ async def test_abandoned_orders_do_not_take_effect(world: Everything, api: Api, 
     """An order past its timeout, or whose client or api is gone, is withdrawn; others take effect."""
     world.go.clear()
     api.channel.send(loading(1, "answered"))
-    api.channel.send(msgspec.structs.replace(loading(2, "late"), until=time.monotonic() - 1.0))
+    api.channel.send(msgspec.structs.replace(loading(2, "late"), until=clock.now() - 1.0))
     api.channel.send(loading(3, "gone"))
     api.channel.send(RequestWithdrawn(3))
     api.channel.send(RequestWithdrawn(77))
@@ -263,7 +265,7 @@ async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) 
     ):
         api = Api(world, link)
         await api.until(1)
-        api.raw.sendall(len(body).to_bytes(4, "big") + body)
+        api.channel.send_raw(body)
         async with asyncio.timeout(20):
             await api.closed.wait()
     assert world.asked == []
@@ -288,6 +290,7 @@ async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everythin
     assert [who for _request, who in world.asked].count("alice") <= 1
 
 
+@pytest.mark.nightly
 async def test_an_api_that_does_not_read_loses_its_link(world: Everything, link: RestLink) -> None:
     """If the api does not read its answers, control closes the link before memory grows."""
     here, there = socket.socketpair()

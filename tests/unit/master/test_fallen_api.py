@@ -3,7 +3,6 @@
 The link, the tokens, their keys and the proofs are control's own code. Orders are only recorded.
 """
 
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ import pytest
 from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
-from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
 from appliance.control.rest import RestLink
 from appliance.control.token_orders import TokenOrders
@@ -22,6 +20,7 @@ from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.heard import Heard
+from tests.support.memory_channel import memory_link
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
@@ -69,8 +68,7 @@ class Api:
     """The api's end of the link, which sends any message."""
 
     def __init__(self, world: World) -> None:
-        here, there = socket.socketpair()
-        self.channel, self.control = Channel(there, ApiLink), Channel(here, ApiLink)
+        self.channel, self.control = memory_link(ApiLink)
         world.link.attach(self.control)
         self._ear = Heard(self.channel)
         self._answers = 0
