@@ -24,6 +24,7 @@ TELL, SCRIPT = 4096, 8192
 """Offsets after the first frame: of the end of the notes, and of the results of the functions."""
 
 _I32, _I64 = b"\x7f", b"\x7e"
+_ZEROS = {_I64: b"\x42\x00", b"\x7d": b"\x43" + bytes(4), b"\x7c": b"\x44" + bytes(8)}  # of i64, f32 and f64
 _ADD, _LESS = b"\x6a", b"\x48"  # i32.add, i32.lt_s
 _NO_RESULT, _LOOP, _IF, _END = b"\x40", b"\x03", b"\x04", b"\x0b"
 _COPY_MEMORY = b"\xfc\x0a\x00\x00"
@@ -67,7 +68,7 @@ def _stub(module: WasmModule, number: int, kind: bytes) -> bytes:
     if result == _I32:
         code += _load_i32(module.frames + SCRIPT + 4 * number)
     else:
-        code += b"\x42\x00"  # i64.const 0
+        code += _ZEROS[result]
     return _function(code)
 
 

@@ -1,21 +1,20 @@
 """Build sets: certify the properties, serialize a set, and translate its modules to machine code."""
 
 from collections.abc import Collection, Iterable, Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 from rosmop.certify.properties import DEFECT, certificates_of
 from rosmop.certify.steps import StepDiffersError, check_steps
 from rosmop.fast.abi import CompiledModule, SetPart
 from rosmop.fast.batch_codegen import WasmModule, written_of
+from rosmop.fast.load import loaded
 from rosmop.fast.serialization import decoded, encoded, encoded_part
-from rosmop.fast.wasm_instance import translated
+from rosmop.fast.wasm_instance import WasmError, translated
 from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
-from rosmop.form.findings import SpecificationError
-
-
-class ModuleDefectError(Exception):
-    """The module of a set is wrong, which is a defect of the compiler; the text is for the user."""
+from rosmop.form.findings import Diagnostic, SpecificationError
+from rosmop.run.engine import MonitorSet
 
 
 class CertifiedSet(NamedTuple):
@@ -36,27 +35,58 @@ def certified(compiled: Compiled) -> CertifiedSet:
     return CertifiedSet(certificates, encoded(compiled))
 
 
+def require_loadable(data: bytes) -> None:
+    """Build the module of a whole certified set, and load it as a relay does. Raises the errors of `parts_of`."""
+    names = tuple(one.name for one in _set(data).specifications)
+    for part in parts_of(data, [(names, ())]):
+        compiled, fast = loaded(part)
+        MonitorSet.of(compiled, fast=fast)
+
+
 def parts_of(data: bytes, wanted: Iterable[tuple[Collection[str], Collection[str]]]) -> Iterator[bytes]:
     """Yield the parts of a certified set as bytes: for each, the specifications in it, and those in shadow mode.
 
-    Each part is independent of the rest; `rosmop.fast.load` loads it. Raises `ModuleDefectError`, and
-    `msgspec.ValidationError` if `data` is not a set.
+    Each part is independent of the rest; `rosmop.fast.load` loads it. Raises `SpecificationError` if its module cannot
+    be built, which is a defect, and `msgspec.ValidationError` if `data` is not a set.
     """
-    whole = decoded(data)
+    whole = _set(data)
     for names, shadows in wanted:
         try:
-            part = part_of(whole, names, shadows)
-        except StepDiffersError as error:
-            raise ModuleDefectError(
-                f"the code of a step differs from its automaton: {error}; {DEFECT}"
-            ) from error
-        yield encoded_part(part)
+            yield _part(data, tuple(names), tuple(shadows))
+        except (StepDiffersError, WasmError) as error:
+            raise SpecificationError(_defects(whole, names) or _defect(whole, names, error)) from error
+
+
+_set = lru_cache(maxsize=1)(decoded)
+
+
+@lru_cache(maxsize=1)  # a relay that has all specifications runs the part of `require_loadable`
+def _part(data: bytes, names: tuple[str, ...], shadows: tuple[str, ...]) -> bytes:
+    return encoded_part(part_of(_set(data), names, shadows))
+
+
+def _defects(whole: Compiled, names: Collection[str]) -> list[Diagnostic]:
+    """Return an error for each group of specifications whose module alone cannot be built."""
+    found = []
+    for group in whole.groups(names):
+        try:
+            part_of(whole, group, ())
+        except (StepDiffersError, WasmError) as error:
+            found += _defect(whole, group, error)
+    return found
+
+
+def _defect(whole: Compiled, names: Collection[str], error: Exception) -> list[Diagnostic]:
+    first = next(one for one in whole.specifications if one.name in names)
+    how = "differs from its automata" if isinstance(error, StepDiffersError) else "cannot be run"
+    return [Diagnostic(first.position, "error", f"the code of {first.name} {how}: {error}; {DEFECT}")]
 
 
 def part_of(compiled: Compiled, names: Collection[str], shadows: Collection[str]) -> SetPart:
     """Return the part of a set with these specifications, independent of the rest. `shadows` are in shadow mode.
 
-    Raises `StepDiffersError` if the steps of the module differ from the automata, which is a defect.
+    Raises `StepDiffersError` if the steps of the module differ from the automata, and `WasmError` if the module is
+    invalid; both are defects.
     """
     alone = compiled.alone(names)
     acting = alone.without(shadows)

@@ -7,12 +7,14 @@ import pytest
 
 from rosmop.check.loops import MAX_NESTED
 from rosmop.check.members import TIME_METHODS
+from rosmop.check.sources import compiled_from
 from rosmop.check.standard_functions import LIBRARY
 from rosmop.check.string_members import TEXT_METHODS
 from rosmop.check.vector_members import VECTOR_METHODS
+from rosmop.fast.build import certified, require_loadable
 from rosmop.runtime.action_context import BUDGET, MAX_BYTES, MAX_CALLS
 from rosmop.runtime.numbers import MATH
-from rosmop.tests.acting import load
+from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
@@ -29,6 +31,35 @@ def test_the_example_of_a_property_loads() -> None:
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
     text = CODE[1]
     assert load(f"s() {{ {events} {text} }}").monitors[0].properties
+
+
+def in_specification(members: str, action: str = "") -> str:
+    """Return a file with these members of a specification, and an event whose action is given."""
+    events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
+    drive = f"event drive(double v) /cmd_vel geometry_msgs/Twist '{{linear.x:v}}' {{ {action} }}"
+    return f"s() {{ {members} {events} {drive} }}"
+
+
+HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
+
+
+@pytest.mark.parametrize(
+    "text", [CODE[0], in_specification(CODE[1]), CODE[2], in_specification(HELPER, "v = half(v);")]
+)
+def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
+    """The samples are not only checked: their modules are built and loaded."""
+    require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["bool", "char", "short", "int", "long", "unsigned long", "float", "double", "std::string", "ros::Time"],
+)
+def test_helpers_that_return_any_type_are_loaded(kind: str) -> None:
+    """A module has a stub of each helper while its steps are checked."""
+    helper = f"{kind} of({kind} x) {{ return x; }} {kind} kept;"
+    text = in_specification(helper, "kept = of(kept); if (v > 1) { return; }")
+    require_loadable(certified(compiled_from({"sample.rv": text}, definitions())).data)
 
 
 def row(head: str) -> str:

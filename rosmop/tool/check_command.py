@@ -4,7 +4,7 @@ from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
-from rosmop.certify.properties import certificates_of
+from rosmop.fast.build import certified, require_loadable
 from rosmop.fast.slow_paths import slow_paths
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -36,8 +36,10 @@ def check(
         raise program.usage_error("--prove needs the package z3-solver: pip install z3-solver")
     try:
         monitors = MonitorSet.of(load(program, files, folders))
-        certificates, wrong = certificates_of(monitors.compiled.specifications)
-        findings = [*wrong, *monitors.warnings]
+        certificates, data = certified(monitors.compiled)
+        if find_spec("wasmtime") is not None:
+            require_loadable(data)
+        findings = [*monitors.warnings]
     except SpecificationError as error:
         monitors, certificates = None, {}
         findings = list(error.findings)
