@@ -47,6 +47,8 @@ EVENTS: dict[str, str] = {
     " files, and the hashes of all files and of the compiled modules that relays run.",
     "specifications refused": "Specifications have errors and were rejected as a whole; the previous ones stay in"
     " force.",
+    "monitor not built": "The file of a monitor has an error at the start, for example after an upgrade. The appliance"
+    " starts without the monitor, which holds its topics unless it is declared `begin`.",
     "monitor enabled": "A monitor was enabled; `detail` has who enabled it.",
     "monitor disabled": "A monitor was disabled: its topics' messages pass unchanged; `detail` has who disabled it,"
     " and `until` if it is enabled again automatically.",
@@ -167,8 +169,8 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel refused",
         ),
         Severity.ALARM: (
-            "forwarding gap", "monitors restarted", "probe failed", "process failing", "protection forgotten",
-            "publication refused", "records lost", "topics held",
+            "forwarding gap", "monitor not built", "monitors restarted", "probe failed", "process failing",
+            "protection forgotten", "publication refused", "records lost", "topics held",
         ),
     }.items()
     for name in names

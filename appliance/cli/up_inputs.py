@@ -18,6 +18,7 @@ from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
+from rosmop.tool.terminal import refused
 
 _STATE = Path("control", "state.db")
 _VALID = "valid"
@@ -78,14 +79,22 @@ def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
 
 
 def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
-    from appliance.specifications.checking import check  # noqa: PLC0415  the compiler: only in this child
+    from appliance.specifications.checking import (  # noqa: PLC0415  the compiler: only in this child
+        check,
+        contents_at_start,
+    )
     from appliance.specifications.specification_files import (  # noqa: PLC0415  as above
         SpecificationsRefusedError,
         read_folder,
     )
 
     try:
-        check(read_folder(folder), site_keys)
+        sources = read_folder(folder)
+        try:
+            check(sources, site_keys)
+        except SpecificationsRefusedError as error:
+            unbuilt = check(sources, site_keys, compiler=contents_at_start).unbuilt
+            refused([*error.findings, f"started without {', '.join(unbuilt)}: rosrv monitor list"])
     except SpecificationsRefusedError as error:
         return "\n".join(error.findings)
     return ""

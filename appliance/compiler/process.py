@@ -24,6 +24,7 @@ from appliance.specifications.specification_files import SpecificationsRefusedEr
 
 _MEMORY = 1 << 30  # bytes of address space, of which the compiler's own libraries take 50 MiB
 _WORK_SECONDS = 60  # seconds of processor time for one question of an order to load
+_START_SECONDS = 2 * _WORK_SECONDS  # for both questions of an order, and the search for files with errors
 _DRY_RUN_SECONDS = DRY_RUNS.bounds.host  # seconds of processor time for a dry run
 _SPARE_SECONDS = 5  # seconds of processor time beyond the budget; then the kernel kills the process
 _IDLE_SECONDS = 60.0
@@ -98,7 +99,11 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
 
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
-        return messages.ContentsFound(wanted.number, checking.contents(wanted.files, wanted.definitions))
+        if wanted.at_start:
+            found = checking.contents_at_start(wanted.files, wanted.definitions)
+        else:
+            found = checking.contents(wanted.files, wanted.definitions, load=wanted.dry_run)
+        return messages.ContentsFound(wanted.number, found)
     except SpecificationsRefusedError as error:
         return messages.CompilationRefused(wanted.number, error.findings)
     except (MemoryError, SystemError):  # Python 3.11 reports some lack of memory as `SystemError`
@@ -113,13 +118,19 @@ def _used() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _is_dry_run(wanted: _Question) -> bool:
-    return isinstance(wanted, messages.ContentsWanted) and wanted.dry_run
-
-
 def _budget(wanted: _Question) -> int:
-    return _DRY_RUN_SECONDS if _is_dry_run(wanted) else _WORK_SECONDS
+    match wanted:
+        case messages.ContentsWanted(dry_run=True):
+            return _DRY_RUN_SECONDS
+        case messages.ContentsWanted(at_start=True):
+            return _START_SECONDS
+    return _WORK_SECONDS
 
 
 def _purpose(wanted: _Question) -> str:
-    return "a dry run" if _is_dry_run(wanted) else "a load"
+    match wanted:
+        case messages.ContentsWanted(dry_run=True):
+            return "a dry run"
+        case messages.ContentsWanted(at_start=True):
+            return "a start"
+    return "a load"

@@ -159,6 +159,7 @@ def _make_monitors(
         told=[log.reported] if settings.monitors_on_rosout else [],
         site_keys=settings.site_keys,
         check=compiler.check,
+        check_at_start=compiler.check_at_start,
         try_out=compiler.try_out,
         parts=compiler.parts,
         live=lambda: published_now(core.registry, core.carried.traffic),

@@ -71,7 +71,7 @@ class PassiveControl:
         self.tunnels = StandbyTunnels()
         endpoint = host_endpoint(settings, membership)
         self._replica_sync = ReplicaSync(self._replica, self._folder)
-        self._check = TakeoverCheck(settings, membership, compiler.check)
+        self._check = TakeoverCheck(settings, membership, compiler.check_at_start)
         self._complete = False  # whether no acknowledged change is missing
         self._receiver = ReplicationReceiver(
             self._replica,

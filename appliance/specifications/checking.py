@@ -1,6 +1,6 @@
 """Compile whole sets of specifications; for control, this runs in the process `compiler`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
 from appliance.channel.messages import Contents, PartNames
@@ -12,7 +12,7 @@ from appliance.specifications.specification_files import (
     require_bounded,
 )
 from rosmop.check.sources import compiled_from
-from rosmop.fast.build import ModuleDefectError, certified, parts_of
+from rosmop.fast.build import certified, parts_of, require_loadable
 from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
@@ -22,27 +22,33 @@ from roswire.standard import standard_definitions
 _LONGEST = 32 << 20  # bytes: half of what a channel carries
 
 
-def check(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Compile everything in the caller's process. Raises `SpecificationsRefusedError` with all errors.
+def contents(
+    files: Mapping[str, str],
+    texts: Mapping[str, str],
+    *,
+    load: bool = False,
+    unbuilt: Mapping[str, str] = {},
+) -> Contents:
+    """Compile these files with these definitions. Raises `SpecificationsRefusedError` with all errors.
 
-    With `site_keys`, each text must be signed with one of these keys.
+    With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt` do
+    nothing, for the reason given.
     """
-    if not sources.files:
-        return CheckedSpecifications()
-    require_bounded(sources)
-    return checked(contents(sources.files, sources.definitions), sources, site_keys)
-
-
-def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
-    """Compile these files with these definitions. Raises `SpecificationsRefusedError` with all errors."""
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.of(compiled_from(files, definitions))
+        monitors = MonitorSet.of(compiled_from(files, definitions, without_code=unbuilt))
         certificates, data = certified(monitors.compiled)
+        if load:
+            require_loadable(data)
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
         raise SpecificationsRefusedError([f"msg/{error}"]) from error
+    except (MemoryError, SystemError):  # of the whole process, not of these files
+        raise
+    except Exception as error:  # a defect of the compiler is a reason to refuse, no more
+        text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
+        raise SpecificationsRefusedError([text]) from error
     topics, services = (
         {
             monitor.name: frozenset(
@@ -68,7 +74,61 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         certificates,
         _bounded(data),
         _places(monitors),
+        {one.name: unbuilt[one.code.file] for one in monitors.monitors if one.code.file in unbuilt},
     )
+
+
+def contents_at_start(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
+    """Compile these files; the monitors of files with errors do nothing (`Contents.unbuilt`).
+
+    Raises `SpecificationsRefusedError` with the errors if the topics of a file with errors are not known: it cannot be
+    parsed, or the type of a message is not defined.
+    """
+    try:
+        return contents(files, texts, load=True)
+    except SpecificationsRefusedError as error:
+        refusal = error
+    good, errors = _good(files, texts)
+    try:
+        return contents(
+            files, texts, load=True, unbuilt={file: errors[file] for file in files if file not in good}
+        )
+    except SpecificationsRefusedError:
+        raise refusal from None
+
+
+def check(
+    sources: Sources, site_keys: Sequence[str], *, compiler: Callable[..., Contents] = contents
+) -> CheckedSpecifications:
+    """Compile everything in the caller's process. Raises `SpecificationsRefusedError` with all errors.
+
+    With `site_keys`, each text must be signed with one of these keys.
+    """
+    if not sources.files:
+        return CheckedSpecifications()
+    require_bounded(sources)
+    return checked(compiler(sources.files, sources.definitions), sources, site_keys)
+
+
+def _good(files: Mapping[str, str], texts: Mapping[str, str]) -> tuple[set[str], dict[str, str]]:
+    """Return the files that compile together, and the last error of each file that has had one."""
+    errors: dict[str, str] = {}
+
+    def grown(good: set[str], more: Sequence[str]) -> set[str]:
+        try:
+            contents({file: files[file] for file in files if file in {*good, *more}}, texts, load=True)
+        except SpecificationsRefusedError as error:
+            if len(more) == 1:
+                errors[more[0]] = error.findings[0]
+                return good
+            half = len(more) // 2
+            return grown(grown(good, more[:half]), more[half:])
+        return good | {*more}
+
+    good, before = set[str](), None
+    while good != before:  # a file may need the variables of one that came after it
+        good, before = grown(good, [file for file in files if file not in good]), good
+    return good, errors
 
 
 def _places(monitors: MonitorSet) -> dict[str, str]:
@@ -87,8 +147,8 @@ def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
     """Return the parts of a set (`Contents.compiled`) for these relays. Raises `SpecificationsRefusedError`."""
     try:
         return [*map(_bounded, parts_of(compiled, [(names.monitors, names.shadows) for names in wanted]))]
-    except ModuleDefectError as error:
-        raise SpecificationsRefusedError([str(error)]) from error
+    except SpecificationError as error:
+        raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
 
 
 def _bounded(data: bytes) -> bytes:

@@ -61,12 +61,26 @@ class SpecificationCompiler:
 
     async def check(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
         """Compile for an order. Raises `SpecificationsRefusedError`, also if the compiler does not answer."""
+        return await self._checked(sources, site_keys, at_start=False)
+
+    async def check_at_start(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+        """Compile for a start: files with errors do not keep the others from coming into force (`Contents.unbuilt`).
+
+        Raises the errors of `check`.
+        """
+        return await self._checked(sources, site_keys, at_start=True)
+
+    async def _checked(
+        self, sources: Sources, site_keys: Sequence[str], *, at_start: bool
+    ) -> CheckedSpecifications:
         if not sources.files:
             return CheckedSpecifications()
         require_bounded(sources)
         with self._order():
             answer = await self._asked(
-                lambda number: messages.ContentsWanted(number, sources.files, sources.definitions)
+                lambda number: messages.ContentsWanted(
+                    number, sources.files, sources.definitions, at_start=at_start
+                )
             )
         return checked(answer.contents, sources, site_keys)
 

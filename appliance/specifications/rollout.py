@@ -360,6 +360,7 @@ class Rollout:
             self.slices,
             inherited.lost,
             inherited.left,
+            {name: why for name, why in revision.checked.unbuilt.items() if name in names.monitors},
         )
 
     # --- messages of the relays ---

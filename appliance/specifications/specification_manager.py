@@ -125,11 +125,15 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         told: Collection[Callable[[messages.MonitorEvent], None]],
         site_keys: Sequence[str],
         check: Check,
+        check_at_start: Check,
         try_out: Check,
         parts: Parts,
         live: Callable[[], Published],
     ) -> None:
-        """`check` compiles for an order, `try_out` for a dry run; `live()` returns the topics published now."""
+        """`check` compiles for an order, `check_at_start` for a start, and `try_out` for a dry run.
+
+        `live()` returns the topics published now.
+        """
         super().__init__(
             store, store.monitor_revisions, store.save_monitor_revision, NOTHING, "confirm monitors"
         )
@@ -137,6 +141,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
         self._check = check
+        self._check_at_start = check_at_start
         self._try_out = try_out
         self._live = live
         self._trail = trail
@@ -167,7 +172,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
         named = () if restarted else self.switches.named
         sources, checked = await specifications_at_start(
-            last, self._folder, self._check, self.site_keys, named=named
+            last, self._folder, self._check_at_start, self.site_keys, named=named
         )
         if last is not None or (self.revision and sources_of(self.in_force) == sources):
             self._enforce(sources, checked)
@@ -178,6 +183,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 self._keep(sources, checked, who=DISK, note="read at start")
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        for name, error in checked.unbuilt.items():
+            self._say_unbuilt(name, error)
         self.returns.start(self._disabled())
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown:  # the monitors were removed while the robot ran
@@ -442,6 +449,16 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         await self.store.settled()
         await self.rollout.carried_out()
         return changed
+
+    def _say_unbuilt(self, name: str, error: str) -> None:
+        file = self.checked.monitors[name]
+        self._trail.happened(
+            "monitor not built",
+            f"{name} does nothing, because {file} has an error: {error};"
+            f" load a version without the error: rosrv monitor load {file}",
+            category="monitor",
+            resource=name,
+        )
 
     def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
         until = self.returns.until(name)

@@ -1,6 +1,7 @@
 """Parse and compile the texts of specifications."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
@@ -10,15 +11,46 @@ from rosmop.text.parser import parse
 from roswire.definitions import Definitions
 
 
-def compiled_from(sources: Mapping[str, str], definitions: Definitions, *, margins: bool = False) -> Compiled:
-    """Compile files (name to text) in this order; raises `SpecificationError` with all errors."""
+def compiled_from(
+    sources: Mapping[str, str],
+    definitions: Definitions,
+    *,
+    margins: bool = False,
+    without_code: Collection[str] = (),
+) -> Compiled:
+    """Compile files (name to text) in this order; raises `SpecificationError` with all errors.
+
+    The specifications of files in `without_code` keep only their names, topics and services, and do nothing.
+    """
     files: list[tree.SpecificationFile] = []
     findings: list[Diagnostic] = []
     for name, text in sources.items():
         try:
-            files.append(parse(text, name))
+            parsed = parse(text, name)
+            files.append(_without_code(parsed) if name in without_code else parsed)
         except SpecificationError as error:
             findings += error.findings
     if findings:
         raise SpecificationError([*findings, *findings_of(files, definitions)])
     return compile_files(files, definitions, margins=margins)
+
+
+def _without_code(file: tree.SpecificationFile) -> tree.SpecificationFile:
+    return replace(file, specifications=tuple(map(_idle, file.specifications)))
+
+
+def _idle(specification: tree.Specification) -> tree.Specification:
+    events = tuple(
+        replace(
+            event,
+            modifiers=(),
+            parameters=(),
+            trigger=replace(event.trigger, pattern=(), when=None),
+            action=replace(event.action, statements=()),
+        )
+        for event in specification.events
+        if isinstance(event.trigger, tree.MessageTrigger)
+    )
+    return replace(
+        specification, parameters=(), declarations=(), functions=(), inits=(), events=events, properties=()
+    )

@@ -23,7 +23,7 @@ OUTSIDE = frozenset(
     master.endpoints.topic_taps_control master.endpoints.traffic master.parameter_charges
     master.reconcile.arrivals master.reconcile.entries master.reconcile.liveness master.rosmaster
     policy.policy_lint quotas.descriptors quotas.pool quotas.queue quotas.table recorder.ring
-    relay.connections.named_subscribers relay.context relay.loop relay.monitors.fast_path_counts
+    relay.connections.named_subscribers relay.context relay.loop relay.monitors.fast_path_counts relay.monitors.holds
     relay.monitors.monitor_sets relay.monitors.observation_points relay.monitors.observations
     relay.monitors.observer relay.monitors.shadow relay.monitors.state_keeper relay.monitors.state_memory
     relay.monitors.time_budget relay.recorder_ring relay.relay_limits relay.report relay.topic_taps

@@ -13,6 +13,9 @@ class Contents(msgspec.Struct, frozen=True):
     definition. `certificates` has each property of a monitor, and whether its automaton was proved equal to its
     formula. `places` maps a topic to its first position in the files (`file:line:column`). Each relay runs its part of
     `compiled` (`PartsWanted`).
+
+    `unbuilt` has the monitors of files with errors, each with its first error. They do nothing; the relay holds their
+    topics.
     """
 
     monitors: dict[str, str] = {}
@@ -27,18 +30,21 @@ class Contents(msgspec.Struct, frozen=True):
     certificates: dict[str, list[str]] = {}
     compiled: bytes = b""
     places: dict[str, str] = {}
+    unbuilt: dict[str, str] = {}
 
 
 class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text), given these message definitions.
 
-    A `dry_run` gets less processor time than an order.
+    A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do not
+    keep the others from being compiled (`Contents.unbuilt`).
     """
 
     number: int
     files: dict[str, str]
     definitions: dict[str, str]
     dry_run: bool = False
+    at_start: bool = False
 
 
 class ContentsFound(Message):

@@ -303,6 +303,9 @@ class SpecificationsStated(Message):
 
     After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`). If they left
     none, `lost` is the reason. In both cases the relay does not use its own memory.
+
+    `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they are
+    declared `begin`, they hold their topics.
     """
 
     revision: int
@@ -317,6 +320,7 @@ class SpecificationsStated(Message):
     slices: int = 100_000
     lost: str = ""
     left: tuple[bytes, ...] = ()
+    unbuilt: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class StateWanted(Message):

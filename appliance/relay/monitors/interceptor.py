@@ -30,6 +30,7 @@ from appliance.channel.messages import (
     StateWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
+from appliance.relay.monitors.holds import hold_begun
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
@@ -158,13 +159,7 @@ class Interceptor:
             outcome = result.succeed(before, now, self.shadow.settle())
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
-        for monitor in result.monitors:
-            if monitor.name in message.moved and monitor.name in began and not monitor.held:
-                result.hold_lost(
-                    monitor, "it moved to another relay process, and its state remained in the previous one"
-                )
-            if monitor.why_held and monitor.name in began and not self._switches.get(monitor.name, True):
-                monitor.resume()  # a disabled monitor guarded nothing, so it need not hold its topics
+        hold_begun(result, message, self._switches)
         if self._keeper is not None:
             self._keeper.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)

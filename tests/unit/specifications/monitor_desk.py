@@ -29,7 +29,7 @@ from appliance.base.actors import UNCONFIRMED
 from appliance.channel import admin, messages
 from appliance.channel.answers.monitor_answers import Replacement
 from appliance.specifications.allocation import Allocation, Move, Resource
-from appliance.specifications.checking import check
+from appliance.specifications.checking import check, contents_at_start
 from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -68,6 +68,11 @@ TEXTS = {
 async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
     """Compile in this process."""
     return await asyncio.to_thread(check, sources, site_keys)
+
+
+async def here_at_start(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+    """Compile for a start, in this process."""
+    return await asyncio.to_thread(check, sources, site_keys, compiler=contents_at_start)
 
 
 class Desk:
@@ -115,6 +120,7 @@ class Desk:
             told=[],
             site_keys=site_keys,
             check=lambda sources, keys: self.check(sources, keys),  # noqa: PLW0108  of whatever it is then
+            check_at_start=here_at_start,
             try_out=self.try_out,
             parts=parts_here,
             live=lambda: self.live,

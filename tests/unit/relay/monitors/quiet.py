@@ -1,0 +1,78 @@
+"""The monitors of a relay without its sockets, threads and clocks: statements and messages in, reports out."""
+
+from collections.abc import Callable
+from typing import Any
+
+from appliance.channel.messages import Message, SpecificationsStated, SpecificationsTaken
+from appliance.relay.loop import LoopTimer
+from appliance.relay.monitors.interceptor import Interceptor
+from appliance.relay.monitors.loader import Loader
+from rosmop.run.outcomes import Outcome
+from tests.support.stated import stated
+
+
+class Timers:
+    """The part of the loop that monitors use; the test calls what is due."""
+
+    def __init__(self) -> None:
+        self.due: list[tuple[float, LoopTimer]] = []
+
+    def over(self) -> bool:
+        """Whether the turn is over: never."""
+        return False
+
+    def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
+        """Note a timer."""
+        timer = LoopTimer(callback)
+        self.due.append((seconds, timer))
+        return timer
+
+
+class Reports:
+    """The messages to control."""
+
+    attached = True
+
+    def __init__(self) -> None:
+        self.sent: list[Message] = []
+
+    def send(self, message: Message) -> None:
+        """Note a message."""
+        self.sent.append(message)
+
+
+class QuietMonitors:
+    """An interceptor whose specifications are loaded at once; `published` has what its monitors publish."""
+
+    def __init__(self) -> None:
+        self.reports = Reports()
+        self.published: list[tuple[str, bytes]] = []
+        loop: Any = Timers()
+        reporter: Any = self.reports
+        self.interceptor = Interceptor(
+            loop,
+            reporter,
+            budget=1.0,
+            publish=lambda topic, data: self.published.append((topic, data)),
+            changed=lambda _topics: None,
+        )
+        self.interceptor._loader = self  # type: ignore[assignment]  # without its thread
+
+    busy = False
+
+    def later(self, message: SpecificationsStated) -> None:
+        """Load at once."""
+        self.interceptor.loaded(message, Loader.load(message, self.interceptor.holder_of))
+
+    def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
+        """Load these files, and return the relay's answer."""
+        files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
+        self.interceptor.state(stated(1, files, {}, **more))
+        answer = self.reports.sent[-1]
+        assert isinstance(answer, SpecificationsTaken)
+        return answer
+
+    def process(self, topic: str, data: bytes, time: int = 1) -> Outcome:
+        """Return the outcome of a message."""
+        assert self.interceptor.monitors is not None
+        return self.interceptor.monitors.process(topic, data, time)

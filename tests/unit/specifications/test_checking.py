@@ -1,0 +1,88 @@
+"""Files with errors do not keep an appliance from starting; what `check` accepts can be loaded."""
+
+from collections.abc import Callable
+
+import pytest
+
+from appliance.channel.messages import PartNames
+from appliance.specifications.checking import contents, contents_at_start, parts
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from rosmop.fast import batch_codegen, build
+from rosmop.fast.wasm_instance import WasmError
+from rosmop.form.compiled import Compiled
+
+TWIST = "event e(double v) /cmd_vel geometry_msgs/Twist '{linear.x:v}'"
+GOOD = f"good() {{ double last = 0; {TWIST} {{ last = v; }} }}"
+WRONG = f"wrong() {{ {TWIST} {{ v = missing; }} event t() every 1s {{ }} }}"
+USER = f"begin user() {{ {TWIST} {{ v = last; }} }}"
+
+
+def unbuilt(**files: str) -> dict[str, str]:
+    """Return the monitors that a start leaves without code, with the errors."""
+    return contents_at_start({f"{name}.rv": text for name, text in files.items()}, {}).unbuilt
+
+
+def test_a_start_leaves_out_only_the_files_with_errors() -> None:
+    """The others come into force, wherever they are in the order; the topics of those left out are known."""
+    found = contents_at_start(
+        {"a.rv": USER, "b.rv": WRONG, "c.rv": GOOD, "d.rv": WRONG.replace("wrong", "d")}, {}
+    )
+    assert {name: text.split(": ")[0] for name, text in found.unbuilt.items()} == {
+        "wrong": "b.rv:1:79", "d": "d.rv:1:75"
+    }  # fmt: skip
+    assert list(found.monitors) == ["user", "wrong", "good", "d"]
+    assert found.topics["wrong"] == {"/cmd_vel"}
+
+
+def test_a_file_is_left_out_with_the_file_whose_variables_it_uses() -> None:
+    """Without its variables it would judge by nothing."""
+    assert set(unbuilt(a=USER, b=GOOD.replace("last = v", "last = x"))) == {"good", "user"}
+
+
+def test_nothing_is_left_out_without_an_error() -> None:
+    """A start then compiles what a load compiles."""
+    files = {"a.rv": GOOD, "b.rv": USER}
+    assert contents_at_start(files, {}) == contents(files, {})
+
+
+@pytest.mark.parametrize("text", ["wrong() {", "wrong() { event e() /x nobody/Knows '{}' { } }"])
+def test_a_file_whose_topics_are_unknown_is_refused_at_a_start(text: str) -> None:
+    """Nothing could hold its topics."""
+    with pytest.raises(SpecificationsRefusedError, match=r"wrong\.rv"):
+        unbuilt(good=GOOD, wrong=text)
+
+
+def test_a_defect_of_the_compiler_leaves_out_one_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is raised while a module is made, the other files come into force."""
+    written = batch_codegen.written_of
+
+    def broken(compiled: Compiled) -> object:
+        if any(one.name == "wrong" and one.variables for one in compiled.specifications):
+            raise KeyError("f64")
+        return written(compiled)
+
+    monkeypatch.setattr(build, "written_of", broken)
+    files = {"a": GOOD, "b": f"wrong() {{ int n; {TWIST} {{ n = 1; }} }}"}
+    assert unbuilt(**files) == {"wrong": "a defect of rosrv, please report it: KeyError: 'f64'"}
+
+
+def test_an_invalid_module_is_an_error_of_its_specification(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A load is refused with the position of the specification whose code the runtime rejects."""
+
+    data = contents({"a.rv": GOOD, "b.rv": WRONG.replace("missing", "2")}, {}).compiled
+    monkeypatch.setattr(build, "check_steps", rejecting("wrong"))
+    with pytest.raises(
+        SpecificationsRefusedError, match=r"^b.rv:1:1: error: the code of wrong cannot be run: type"
+    ):
+        parts(data, [PartNames(("good", "wrong"), ())])
+
+
+def rejecting(name: str) -> Callable[[Compiled, object], int]:
+    """Return a check of modules that finds an invalid one if it has this specification."""
+
+    def check_steps(compiled: Compiled, _module: object) -> int:
+        if any(one.name == name for one in compiled.specifications):
+            raise WasmError("type mismatch")
+        return 0
+
+    return check_steps
