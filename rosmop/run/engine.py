@@ -30,6 +30,7 @@ from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
 from rosmop.run.execution import Asked, MonitorExecution, OnFault
 from rosmop.run.fast_path import MESSAGE_FUEL, BatchOptions, FastLane, FastPath, Lanes
+from rosmop.run.guards import guards_of
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.margins import begin_margins, taken_margins
 from rosmop.run.monitor import MonitorGroup, MonitorInstance, Step, monitors_of
@@ -39,7 +40,6 @@ from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
     GroupSnapshot,
     encoded,
-    guards,
     kept_monitor,
     refused,
     restore,
@@ -183,7 +183,8 @@ class MonitorSet:
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices, holder_of)
         begin_margins(self._monitors, self.interpreter.variables)
         self.groups = tuple(_groups(compiled, self._monitors))
-        self._guards = guards(compiled)
+        self._guards = guards_of(compiled)
+        self._holds = True
         self._types = types_of(compiled)
         self._beginnings: dict[str, bytes] = {}
         """The known initial states of the monitors that guard topics, as returned by `shape`."""
@@ -191,7 +192,7 @@ class MonitorSet:
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
-        self._execution = MonitorExecution(self.interpreter, on_fault)
+        self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._broken = False
@@ -234,6 +235,7 @@ class MonitorSet:
                 deadlines=deadlines,
                 holder_of=holder_of,
             )
+            shadow._holds = False
             for monitor in shadow._monitors:
                 monitor.context.most = SHADOW_BUDGET
             shadowed.append(shadow)
@@ -492,7 +494,7 @@ class MonitorSet:
         The monitor holds its topics if it is declared `hold`, or if its actions depend on a state and it is not
         declared `begin`.
         """
-        if monitor.code.hold or (monitor.name in self._guards and not monitor.code.begins):
+        if monitor.code.hold or (monitor.name in self._guards.names and not monitor.code.begins):
             monitor.hold(why)
 
     def _start(
@@ -502,7 +504,7 @@ class MonitorSet:
         outcome = self._execution.begin(monitors, time_ns)
         for monitor in monitors:
             monitor.touch()
-            if monitor.name in self._guards:
+            if monitor.name in self._guards.names:
                 self._beginnings[monitor.name] = shape(monitor, self.interpreter.variables)
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
             for timer in monitor.timers:
@@ -570,7 +572,7 @@ class MonitorSet:
 
     def has_departed(self, monitor: MonitorInstance) -> bool:
         """Return whether a monitor that guards topics may have left its initial state."""
-        if monitor.name not in self._guards:
+        if monitor.name not in self._guards.names:
             return False
         beginning = self._beginnings.get(monitor.name)
         return beginning is None or shape(monitor, self.interpreter.variables) != beginning
@@ -619,9 +621,11 @@ class MonitorSet:
         """Process a message: the bytes of its fields, received at this time on this topic."""
         outcome, steps = Outcome(buffer, time_ns), self.steps.get(topic, ())
         if self._agenda.has_come(time_ns):
-            outcome.before = self._agenda.advance(time_ns)
+            outcome.before = self.advance(time_ns)
         if steps:
             self._execution.message(steps, buffer, outcome, sender)
+            if outcome.faults:
+                self._after_faults(outcome)
             self._agenda.schedule()
         return outcome
 
@@ -668,7 +672,35 @@ class MonitorSet:
 
     def advance(self, time_ns: int) -> list[Outcome]:
         """Process the ticks up to this time and the deadlines before it, in the order of their times."""
-        return self._agenda.advance(time_ns)
+        outcomes = self._agenda.advance(time_ns)
+        for outcome in outcomes:
+            if outcome.faults:
+                self._after_faults(outcome)
+        return outcomes
+
+    def _after_faults(self, outcome: Outcome) -> None:
+        """Handle monitors that cannot judge, because an event that keeps a state up to date has faulted.
+
+        Those that are declared `begin` start again; the others hold their topics and keep their state. In shadow mode
+        none holds its topics.
+        """
+        for fault in outcome.faults if self.on_fault == "drop" else ():
+            monitors = [
+                self.monitor(name) for name in self._guards.depending[fault.monitor] if fault.outdates
+            ]
+            holding = [one for one in monitors if self._holds and not one.held and not one.code.begins]
+            for monitor in holding:
+                monitor.touch()
+                monitor.hold(f"an event that it depends on had a fault: {fault.position}: {fault.text}")
+            outcome.began_holding = (*outcome.began_holding, *(one.name for one in holding))
+            if any(one.code.begins for one in monitors):
+                began = self.began
+                again = dict.fromkeys([fault.monitor, *(one.name for one in monitors if one.code.begins)])
+                outcome.before = [
+                    *outcome.before,
+                    self._start([*map(self.monitor, again)], outcome.time, None),
+                ]
+                self.began = began
 
     # The set
 

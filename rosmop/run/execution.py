@@ -11,7 +11,7 @@ subscribers saw. Variables, output and other properties keep the effects of the 
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -48,7 +48,11 @@ TICK_BUDGET = 2_000
 class MonitorExecution:
     """Runs the events, properties and handlers of compiled specifications on the state of their monitors."""
 
-    def __init__(self, interpreter: Interpreter, on_fault: OnFault) -> None:
+    def __init__(self, interpreter: Interpreter, on_fault: OnFault, judging: Collection[str]) -> None:
+        """A fault of an event's function in `judging` only drops the message (`Guards.judging`)."""
+        self._judging = judging
+        self._function: str | None = None
+        """The function of the event that is processed; None for a tick or deadline."""
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
         """Chooses the verdicts to explain, given the source of the message; None chooses all."""
@@ -102,6 +106,7 @@ class MonitorExecution:
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     outcome.dropped_by = monitor.name
                     break
+            self._function = step.event.function
             if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
                 outcome.dropped_by = step.monitor.name
                 break
@@ -113,7 +118,7 @@ class MonitorExecution:
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
         """Process a tick; the caller calls `collect`."""
-        self._sender = NOBODY
+        self._sender, self._function = NOBODY, None
         self._taking_back.clear()
         step.monitor.move_to_python()
         step.monitor.touch()
@@ -148,7 +153,7 @@ class MonitorExecution:
 
         Return the outcomes to report. A slice's verdict is explained only if `explains`.
         """
-        self._sender, self._bound = NOBODY, None
+        self._sender, self._bound, self._function = NOBODY, None, None
         monitor.move_to_python()
         monitor.touch()
         if running is None:
@@ -196,15 +201,15 @@ class MonitorExecution:
     def _catch_up(self, monitor: MonitorInstance, behind: Sequence[Slice], outcome: Outcome) -> None:
         """Process the overdue deadlines of slices before a message, after there were too many to process in time."""
         turn, go_on = self._turn, monitor.context.put_off()
-        kept = turn.log, turn.published, turn.looked, self._sender, self._bound
+        kept = turn.log, turn.published, turn.looked, self._sender, self._bound, self._function
         turn.log, turn.published, turn.looked = [], [], {}
         before = [*outcome.before]
-        self._sender, self._explains = NOBODY, len(behind) <= EXPLAINED
+        self._sender, self._function, self._explains = NOBODY, None, len(behind) <= EXPLAINED
         for slice_ in behind:
             while not slice_.gone and (deadline := slice_.deadline) is not None and deadline < outcome.time:
                 before += self._expire_in_slice(monitor, slice_)
         outcome.before, turn.now, self._explains = before, outcome.time, True
-        turn.log, turn.published, turn.looked, self._sender, self._bound = kept
+        turn.log, turn.published, turn.looked, self._sender, self._bound, self._function = kept
         go_on()
 
     def warn(self, monitor: MonitorInstance, text: str) -> None:
@@ -566,6 +571,11 @@ class MonitorExecution:
         self, error: Exception, monitor: MonitorInstance, otherwise: Position, outcome: Outcome
     ) -> None:
         fault: Fault = _fault_of(error, self._interpreter, monitor.name, otherwise)
+        # Bytes that are not a message are no observation: they reach nobody, as if they had not been sent.
+        outdates = self._function not in self._judging and not isinstance(
+            error, MalformedError | struct.error
+        )
+        fault = replace(fault, outdates=outdates)
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 

@@ -93,12 +93,16 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault, which stopped an action: position, reason, and the values of the variables involved."""
+    """A fault, which stopped an action: position, reason, and the values of the variables involved.
+
+    `outdates`: the monitor's state may be out of date now, because an event that it observes did not take effect.
+    """
 
     monitor: str
     position: Position
     text: str
     values: Mapping[str, object]
+    outdates: bool = False
 
 
 def named(verdict: Verdict) -> str:
@@ -130,6 +134,8 @@ class Outcome:
     the position of the statement, the action or the specification. `handling` has the verdicts whose handlers dropped
     the message (key `DROPPED`) or published messages (keys: their indices in `published`).
 
+    `began_holding` are the monitors that hold their topics from now on, because of a fault.
+
     `looked` are the conditions that were met during processing, by site, with the values that they compared. They are
     each `when` of an event that happened, and each `if` around a statement that dropped, changed or published a
     message.
@@ -157,6 +163,7 @@ class Outcome:
     dropped_at: Position | None = None
     handling: Mapping[int, Verdict] = MappingProxyType({})
     looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
+    began_holding: Sequence[str] = ()
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
 

@@ -17,7 +17,6 @@ from typing import Any
 
 import msgspec
 
-from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.monitor import CellNames, MonitorInstance
@@ -239,9 +238,6 @@ def _fits(known: ValueCodec, kind: Type, value: Any) -> bool:
     return isinstance(value, _HELD.get(type(kind), ()))
 
 
-# --- specifications that act and have a state ---
-
-
 def types_of(compiled: Compiled) -> dict[str, bytes]:
     """Return for each specification a digest of the message definitions that it uses."""
     definitions = compiled.messages.definitions
@@ -251,30 +247,3 @@ def types_of(compiled: Compiled) -> dict[str, bytes]:
         ).digest()
         for code in compiled.specifications
     }
-
-
-def guards(compiled: Compiled) -> frozenset[str]:
-    """Return the specifications that can drop, change or publish a message, depending on a state.
-
-    If its state is lost, such a specification holds its topics.
-    """
-    starts = {name for code in compiled.specifications for name in code.start}
-    acting: set[str] = set()
-    used: set[str] = set()
-    for name, function in compiled.functions.items():
-        for node in nodes.walk(function) if name not in starts else ():
-            if isinstance(node, nodes.Drop | nodes.Publish) or (
-                isinstance(node, nodes.WriteBack) and node.writes
-            ):
-                acting.add(function.context)
-            elif isinstance(node, nodes.Assign) or (
-                isinstance(node, nodes.Read)
-                and isinstance(node.type, value_types.VectorType | value_types.RecordType)
-            ):  # the content of a vector or message may change in place
-                used.add(node.name)
-    return frozenset(
-        code.name
-        for code in compiled.specifications
-        if code.context in acting
-        and (code.properties or code.slicing is not None or not used.isdisjoint(code.variables.values()))
-    )

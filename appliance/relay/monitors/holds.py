@@ -1,9 +1,9 @@
-"""Decide which monitors hold their topics after specifications were loaded, beyond those whose state was lost."""
+"""Monitors that hold their topics: which begin to when specifications are loaded, and what control is told."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from appliance.channel.messages import SpecificationsStated
+from appliance.channel.messages import SpecificationsStated, SpecificationsTaken
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
@@ -25,3 +25,14 @@ def hold_begun(monitors: "MonitorSet", message: SpecificationsStated, switches: 
             monitor.hold(f"its file has an error: {message.unbuilt[monitor.name]}")
         if monitor.why_held and not switches.get(monitor.name, True):
             monitor.resume()
+
+
+def taken(
+    message: SpecificationsStated, began: list[str], monitors: "MonitorSet | None"
+) -> SpecificationsTaken:
+    """Return the message to control about the monitors in force, and those that hold their topics."""
+    held = [] if monitors is None else [one for one in monitors.monitors if one.held]
+    because = {one.name: one.why_held for one in held if one.why_held}
+    return SpecificationsTaken(
+        message.revision, began, [one.name for one in held], message.statement, because
+    )

@@ -26,11 +26,10 @@ from appliance.channel.messages import (
     MonitorRow,
     SpecificationsRefused,
     SpecificationsStated,
-    SpecificationsTaken,
     StateWanted,
 )
 from appliance.relay.loop import EventLoop, LoopTimer
-from appliance.relay.monitors.holds import hold_begun
+from appliance.relay.monitors.holds import hold_begun, taken
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoint, Senders
 from appliance.relay.monitors.observations import SHOWN, Observations
@@ -106,7 +105,7 @@ class Interceptor:
         self.senders = Senders()
         self._publish = publish
         self._keeper: StateKeeper | None = None
-        self.observer = Observer(self.observations, self._published, self.senders)
+        self.observer = Observer(self.observations, self._published, self.senders, held=self._tell_held)
         self._shadow_observer = Observer(
             self.observations, lambda _topic, _data: None, self.senders, "shadow "
         )
@@ -181,20 +180,21 @@ class Interceptor:
 
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
         self.invalidate_prepared()
-        held: list[str] = []
-        because: dict[str, str] = {}
         if self.monitors is not None:
             both = (*self.monitors.monitors, *self.monitors.shadowed)
             switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
             switched = self.monitors.topics_of(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
-            held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
-            because = {one.name: one.why_held for one in self.monitors.monitors if one.why_held}
             self.keep_all()
         self.schedule()
         self.shadow.schedule()
         self._changed(anew)
-        self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement, because))
+        self._reporter.send(taken(message, began, self.monitors))
+
+    def _tell_held(self) -> None:
+        self.invalidate_prepared()
+        if self._stated is not None:
+            self._reporter.send(taken(self._stated, [], self.monitors))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.invalidate_prepared()

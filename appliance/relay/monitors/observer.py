@@ -53,7 +53,10 @@ class Observer:
         publish: Callable[[str, bytes], None],
         senders: Senders,
         prefix: str = "",
+        held: Callable[[], None] = lambda: None,
     ) -> None:
+        """`held()` is called when monitors have begun to hold their topics."""
+        self._held = held
         self.senders = senders
         self._explained = 0
         self._observations = observations
@@ -107,6 +110,8 @@ class Observer:
         """Report everything in an outcome except its result, and publish its messages."""
         for earlier in outcome.before:
             self.report(earlier, NOWHERE)
+        if outcome.began_holding:
+            self._held()
         if outcome.events:
             events = tuple(outcome.events)
             self._happened[events] = self._happened.get(events, 0) + 1

@@ -7,6 +7,7 @@ from appliance.channel.messages import Message, SpecificationsStated, Specificat
 from appliance.relay.loop import LoopTimer
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.loader import Loader
+from appliance.relay.monitors.observation_points import NOWHERE
 from rosmop.run.outcomes import Outcome
 from tests.support.stated import stated
 
@@ -73,6 +74,8 @@ class QuietMonitors:
         return answer
 
     def process(self, topic: str, data: bytes, time: int = 1) -> Outcome:
-        """Return the outcome of a message."""
+        """Return the outcome of a message, which is reported."""
         assert self.interceptor.monitors is not None
-        return self.interceptor.monitors.process(topic, data, time)
+        outcome = self.interceptor.monitors.process(topic, data, time)
+        self.interceptor.observer.report(outcome, NOWHERE)
+        return outcome

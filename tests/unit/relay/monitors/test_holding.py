@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.base import clock
+from appliance.channel.messages import SpecificationsTaken
 from rosmop.tests.acting import message
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.relay.monitors.quiet import QuietMonitors
@@ -38,3 +39,21 @@ def test_a_monitor_whose_file_has_an_error_holds_its_topics(
 def test_a_disabled_monitor_whose_file_has_an_error_holds_nothing(monitors: QuietMonitors) -> None:
     """It guarded nothing before."""
     assert not monitors.load(f"s() {{ {EVENT} }}", unbuilt={"s": ERROR}, enabled={"s": False}).held
+
+
+SENSOR = "event s(int n) /sensor std_msgs/Int32 '{data:n}' { near = 1 / n > 0; }"
+DRIVE = "event d() /cmd_vel geometry_msgs/Twist '{}' { if (near) { return; } }"
+
+
+def test_control_is_told_once_of_a_monitor_that_holds_after_a_fault(monitors: QuietMonitors) -> None:
+    """With the reason; then no further message of its topics reaches it."""
+    monitors.load(f"s() {{ bool near; {SENSOR} {DRIVE} }}")
+    told = len(monitors.reports.sent)
+    twist, zero = message("geometry_msgs/Twist"), message("std_msgs/Int32")
+    assert [monitors.process(topic, data).result for topic, data in (("/cmd_vel", twist), ("/sensor", zero))] == [
+        "passed", "dropped"
+    ]  # fmt: skip
+    assert [monitors.process("/cmd_vel", twist).result for _ in range(3)] == ["dropped"] * 3
+    [taken] = [one for one in monitors.reports.sent[told:] if isinstance(one, SpecificationsTaken)]
+    assert taken.held == ["s"]
+    assert taken.because["s"] == "an event that it depends on had a fault: 0.rv:1:76: division by zero"
