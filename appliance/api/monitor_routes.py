@@ -158,7 +158,9 @@ async def _load(call: OperationCall[admin.MonitorLoad]) -> Tagged[Replaced]:
     new = call.order
     return await _try(
         call,
-        admin.MonitorTry(new.files, new.definitions, new.signatures, new.expected, new.force, new.shadow),
+        admin.MonitorTry(
+            new.files, new.definitions, new.signatures, new.expected, new.force, new.shadow, new.hold
+        ),
     )
 
 
@@ -169,7 +171,9 @@ async def _replace(call: OperationCall[admin.MonitorReplace]) -> Tagged[Replaced
     signatures = {**new.signatures, file: new.signature}
     return await _try(
         call,
-        admin.MonitorTry({file: new.text}, new.definitions, signatures, new.expected, new.force, new.shadow),
+        admin.MonitorTry(
+            {file: new.text}, new.definitions, signatures, new.expected, new.force, new.shadow, new.hold
+        ),
     )
 
 

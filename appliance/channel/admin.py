@@ -56,7 +56,7 @@ MONITORS = Versioned(
 HOSTS = Versioned("table of hosts", "/v1/hosts", "The table of hosts is not the one that If-Match names.")
 
 _WITHIN = ("confirm_within",)
-_LOADED = (*_WITHIN, "force", "shadow")
+_LOADED = (*_WITHIN, "force", "shadow", "hold")
 _NO_REVISION = {404: "There is no such revision."}
 _NO_MONITOR = {404: "There is no such monitor, or revision."}
 _NO_RECORDING = {404: "There is no such recording, or the flight recorder is off."}
@@ -74,6 +74,9 @@ Confirm = Annotated[
     ),
 ]
 Force = Annotated[bool, parameter("load even if this cuts a topic whose publisher has another type")]
+Hold = Annotated[
+    bool, parameter("load even if monitors then hold topics with traffic until they are resumed")
+]
 Shadow = Annotated[bool, parameter("load the specifications in shadow mode")]
 OneMonitor = Annotated[
     str, parameter("name of the monitor", min_length=1, max_length=256, examples=["censor"])
@@ -252,6 +255,7 @@ class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="m
     signatures: dict[str, str] = {}
     force: Force = False
     shadow: Shadow = False
+    hold: Hold = False
 
 
 @rest("operator", of=MONITORS)
@@ -264,6 +268,7 @@ class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monito
     expected: str | None = None
     force: bool = False
     shadow: bool = False
+    hold: bool = False
 
 
 @rest(
@@ -286,6 +291,7 @@ class MonitorReplace(AdminRequest[monitor_answers.Replacement], frozen=True, tag
     signatures: dict[str, str] = {}
     force: Force = False
     shadow: Shadow = False
+    hold: Hold = False
 
 
 @rest(
@@ -300,6 +306,7 @@ class MonitorReload(AdminRequest[monitor_answers.Replacement], frozen=True, tag=
     confirm_within: Confirm = None
     force: Force = False
     shadow: Shadow = False
+    hold: Hold = False
 
 
 @rest(

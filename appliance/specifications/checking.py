@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
-from appliance.channel.messages import Contents, PartNames
+from appliance.channel.messages import Contents, PartNames, StateOwner
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -75,6 +75,12 @@ def contents(
         _bounded(data),
         _places(monitors),
         {one.name: unbuilt[one.code.file] for one in monitors.monitors if one.code.file in unbuilt},
+        {
+            one.name: StateOwner(
+                monitors.identity(one.code).hex(), monitors.holds_if_lost(one.code), str(one.code.position)
+            )
+            for one in monitors.monitors
+        },
     )
 
 

@@ -1,5 +1,8 @@
 """Compare specifications with the topics that are published now. No I/O.
 
+A monitor that begins again because its text has changed, or because it moves to another relay, may hold its topics: the
+robot then gets no command, not even a stop, until an operator resumes the monitor.
+
 If a specification has another type than the publisher, loading it would cut the topic, because the relay cannot read
 the messages. A topic that no node publishes may be misspelled. Both are checked before a change comes into force.
 """
@@ -71,6 +74,35 @@ def judge_topics(
     return found
 
 
+def judge_holds(
+    coming: CheckedSpecifications,
+    present: CheckedSpecifications,
+    published: Published,
+    *,
+    acting: Collection[str],
+    moved: Collection[str],
+    hold: bool,
+) -> TopicFindings:
+    """Find the monitors that will lose their state and hold topics with a publisher; with `hold`, these are warnings.
+
+    Only monitors that are `acting` now and later hold topics. The files `moved` go to another relay.
+    """
+    found = TopicFindings([], [])
+    for name in (one for one in acting if one in present.states and coming.states[one].holds):
+        owner = coming.states[name]
+        changed = owner.identity != present.states[name].identity
+        topics = sorted(coming.topics[name] & published.keys())
+        if topics and (changed or coming.monitors[name] in moved):
+            why = "its text, or a definition, changes" if changed else "it moves to another relay"
+            text = f"{name} loses its state, because {why}, and then holds {', '.join(topics)}: it drops every message"
+            (found.warnings if hold else found.conflicts).append(
+                f"{owner.position}: {'warning' if hold else 'error'}: {text}; {_RESUME if hold else _HOLD} {name}"
+            )
+    return found
+
+
+_RESUME = "when it is safe: rosrv monitor resume"
+_HOLD = "stop the robot, and use --hold (REST: hold=1); then rosrv monitor resume"
 _FORCE = "give the topic the publisher's type, or use --force (REST: force=1) if the publisher is wrong"
 _CUT = f"its messages would no longer be relayed; {_FORCE}"
 _MIXED = f"subscribers would get messages of two types; {_FORCE}"

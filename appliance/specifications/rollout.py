@@ -217,6 +217,10 @@ class Rollout:
         self._restate()
         raise SpecificationsRefusedError(["topics that must move changed during the rollout; try again"])
 
+    def moved_files(self, coming: CheckedSpecifications) -> frozenset[str]:
+        """Return the files that would move to another relay, with the loss of their monitors' state."""
+        return self.allocation.plan(coming, self.relays.live_resources()).moved_files
+
     async def all_taken(self) -> None:
         """Wait until the relays that gave something up have taken or refused (`refused`) the new specifications."""
         answers, self._answers = self._answers, {}

@@ -23,7 +23,7 @@ import datetime
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 import structlog
@@ -37,7 +37,7 @@ from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.live_topics import Published, judge_topics
+from appliance.specifications.live_topics import Published, judge_holds, judge_topics
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.rollout import SHADOW, Parts, Relays, Revision, Rollout, Switch
 from appliance.specifications.specification_files import (
@@ -97,6 +97,17 @@ class MonitorsChangedError(Exception):
             " list them first"
         )
         self.tag = tag
+
+
+class _Consent(NamedTuple):
+    """Whether a change may cut topics whose publishers have another type (`force`), and `hold` topics with traffic."""
+
+    force: bool = False
+    hold: bool = False
+
+
+_ALL = _Consent(force=True, hold=True)
+"""Of a rollback, which must never fail."""
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):
@@ -246,7 +257,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if self.in_force.who != DISK and sources == self.sources and not shadow:
                 return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
             note, within = request.note or "loaded", request.confirm_within
-            return await self._change(sources, who, who, note, within, shadow=shadow, forced=request.force)
+            how = _Consent(request.force, request.hold)
+            return await self._change(sources, who, who, note, within, shadow=shadow, consent=how)
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return the effects that a load would have. Raises the errors of `load`, and `DryRunUnderWayError`."""
@@ -264,7 +276,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         finally:
             self._attempting.discard(who)
         shadow = self._in_shadow(checked, request.files if request.shadow else ())
-        warnings = self._judged(checked, shadow, forced=request.force)
+        warnings = self._judged(checked, shadow, _Consent(request.force, request.hold))
         files = following.difference(present)
         return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
@@ -280,6 +292,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             {**request.signatures, file: request.signature},
             request.force,
             request.shadow,
+            request.hold,
         )
         return await self.load(load, who)
 
@@ -299,8 +312,9 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             added, changed, _removed = sources.difference(self.sources)
             shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
             within, note = request.confirm_within, reloaded_by(who)
+            how = _Consent(request.force, request.hold)
             return await self._change(
-                sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
+                sources, keeper, who, note, within, kept=kept, shadow=shadow, consent=how
             )
 
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
@@ -308,7 +322,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self._changing(None):
             if self.in_force.who != DISK and sources == self.sources:
                 return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
-            return await self._change(sources, who, who, note)
+            return await self._change(sources, who, who, note, consent=_Consent(hold=True))
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, given by their names or the names of their monitors.
@@ -332,7 +346,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 text = f"this would also remove {', '.join(left)} from the same file: name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
-            return await self._change(sources, who, who, note, request.confirm_within)
+            return await self._change(sources, who, who, note, request.confirm_within, consent=_Consent())
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replacement:
         """Bring a kept revision into force again (None: the previous revision; 0: no specifications).
@@ -342,7 +356,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
             note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
-            return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
+            return await self._change(sources_of(row), who, who, note, switches=switches, consent=_ALL)
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
@@ -393,7 +407,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 raise SpecificationsRefusedError([text])
             if not request.shadow:
                 others = set(self.switches.shadowed()) - set(request.names)
-                self._judged(self.checked, others, forced=request.force, promoted=request.names)
+                self._judged(self.checked, others, _Consent(request.force), promoted=request.names)
             names = await self._switch(request.names, SHADOW if request.shadow else True, who)
             return self._switched(names, self.rollout.began(names))
 
@@ -559,12 +573,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         kept: Sequence[str] = (),
         switches: Mapping[str, Switch] = {},
         shadow: Collection[str] = (),
-        forced: bool = False,
+        consent: _Consent,
     ) -> Replacement:
         """Compile sources and put them into force; `kept` are files that are not in the folder.
 
-        `switches` are for monitors that are not in force yet; monitors in the files `shadow` start in shadow mode. With
-        `forced`, topics whose publishers have another type are cut.
+        `switches` are for monitors that are not in force yet; monitors in the files `shadow` start in shadow mode.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
         self.switches.said = {
@@ -576,7 +589,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             put = {name: SHADOW for name, file in checked.monitors.items() if file in shadow}
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
             self.switches.said |= put
-            warnings = self._judged(checked, self._in_shadow(checked), forced=forced)
+            warnings = self._judged(checked, self._in_shadow(checked), consent)
             require_whole(self.switches.states_of(checked) | in_force, checked)
             moved = await self.rollout.take(self._revision(before + 1, sources, checked))
         except WithdrawnError:
@@ -622,17 +635,29 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self,
         coming: CheckedSpecifications,
         shadow: Collection[str],
+        consent: _Consent,
         *,
-        forced: bool,
         promoted: Collection[str] = (),
     ) -> list[str]:
-        """Return warnings about topics. Raises `SpecificationsRefusedError` if a topic would be cut."""
-        found = judge_topics(
-            coming, self.checked, self._live(), shadow=shadow, forced=forced, promoted=promoted
+        """Return warnings about topics. Raises `SpecificationsRefusedError` if a topic would be cut, or held."""
+        present, live, states = self.checked, self._live(), self.switches.states_of(coming)
+        cut = judge_topics(coming, present, live, shadow=shadow, forced=consent.force, promoted=promoted)
+        acting = {
+            name
+            for name in coming.monitors
+            if self.switches.enabled(name) and states[name] and name not in shadow
+        }
+        held = judge_holds(
+            coming,
+            present,
+            live,
+            acting=acting - self.rollout.held,
+            moved=self.rollout.moved_files(coming),
+            hold=consent.hold,
         )
-        if found.conflicts:
-            raise SpecificationsRefusedError([*found.conflicts, *found.warnings])
-        return found.warnings
+        if cut.conflicts or held.conflicts:
+            raise SpecificationsRefusedError([*cut.conflicts, *held.conflicts, *cut.warnings, *held.warnings])
+        return cut.warnings + held.warnings
 
     def _replaced(
         self,

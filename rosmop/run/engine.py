@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from rosmop.form.compiled import Compiled, EventCode
+from rosmop.form.compiled import Compiled, EventCode, SpecificationCode
 from rosmop.form.connected_groups import channel_of
 from rosmop.form.findings import Diagnostic
 from rosmop.form.specification_groups import groups
@@ -494,8 +494,16 @@ class MonitorSet:
         The monitor holds its topics if it is declared `hold`, or if its actions depend on a state and it is not
         declared `begin`.
         """
-        if monitor.code.hold or (monitor.name in self._guards.names and not monitor.code.begins):
+        if self.holds_if_lost(monitor.code):
             monitor.hold(why)
+
+    def holds_if_lost(self, code: SpecificationCode) -> bool:
+        """Whether a specification holds its topics if its state is lost."""
+        return code.hold or (code.name in self._guards.names and not code.begins)
+
+    def identity(self, code: SpecificationCode) -> bytes:
+        """Return what a specification's state belongs to: its text, and the definitions of its message types."""
+        return code.identity + self._types[code.name]
 
     def _start(
         self, monitors: Sequence[MonitorInstance], time_ns: int, expected: frozenset[str] | None

@@ -93,3 +93,17 @@ def test_a_monitor_in_shadow_mode_holds_nothing() -> None:
     assert outcome.faults and not outcome.began_holding
     passing = load(guard(STATE, SCAN, DRIVE), on_fault="pass")
     assert passing.process("/scan", HUGE, 2).faults and drives(passing)
+
+
+def test_a_timer_goes_on_while_its_monitor_holds() -> None:
+    """The deadman drops commands, but still publishes the stop."""
+    monitors = load("""deadman() { ros::Time last; geometry_msgs::Twist zero;
+        event command() /cmd_vel geometry_msgs/Twist '{}' { last = ros::Time::now(); }
+        event silent() every 100ms {
+            if ((ros::Time::now() - last).toSec() > 0.3) { PUBLISH(/cmd_vel, geometry_msgs/Twist, zero); } } }""")
+    monitors.hold_lost(monitors.monitor("deadman"), "its state is lost")
+    sent = []
+    for time in range(1, 9):
+        assert not drives(monitors)
+        sent += [one.topic for outcome in monitors.advance(time * 10**8) for one in outcome.published]
+    assert sent == ["/cmd_vel"] * 5

@@ -5,6 +5,17 @@ import msgspec
 from appliance.channel.messages.message import Message
 
 
+class StateOwner(msgspec.Struct, frozen=True):
+    """What a monitor's state belongs to, as a digest; whether the monitor holds its topics if the state is lost.
+
+    `position` is the monitor's, as text.
+    """
+
+    identity: str
+    holds: bool
+    position: str
+
+
 class Contents(msgspec.Struct, frozen=True):
     """The contents of valid specifications: the monitors (name to file), and the topics that they use.
 
@@ -31,6 +42,7 @@ class Contents(msgspec.Struct, frozen=True):
     compiled: bytes = b""
     places: dict[str, str] = {}
     unbuilt: dict[str, str] = {}
+    states: dict[str, StateOwner] = {}
 
 
 class ContentsWanted(Message):

@@ -28,6 +28,10 @@ _Shadow = Annotated[
     bool,
     typer.Option("--shadow", help="Shadow mode: only record what the monitors would have done"),
 ]
+_Hold = Annotated[
+    bool,
+    typer.Option("--hold", help="Load even if monitors then hold topics with traffic until they are resumed"),
+]
 _Force = Annotated[
     bool, typer.Option("--force", help="Load even if this cuts a topic whose publisher has another type")
 ]
@@ -139,12 +143,14 @@ def load(
     confirm_within: ConfirmWithin = None,
     shadow: _Shadow = False,
     force: _Force = False,
+    hold: _Hold = False,
 ) -> None:
     """Load specifications while the robot runs; files of the same name are replaced.
 
     They are compiled and compared with the robot's topics first. After an error nothing changes and the exit status is
-    1. With --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the
-    files and from --msg.
+    1. A monitor whose text changes loses its state; if it then holds topics with traffic, the load needs --hold. With
+    --shadow, monitors only record what they would have done. Message definitions come from `msg/` beside the files and
+    from --msg.
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """
@@ -165,6 +171,7 @@ def load(
         signatures=sent.signatures,
         force=force,
         shadow=shadow,
+        hold=hold,
     )
     say_replaced(appliance.answer_or_exit(order))
     _say_idle(appliance, sent.files)
@@ -190,13 +197,14 @@ def reload(
     *,
     shadow: _Shadow = False,
     force: _Force = False,
+    hold: _Hold = False,
 ) -> None:
     """Load the folder of specifications again. Specifications that are not in it stay loaded and are listed.
 
     Example: rosrv monitor reload
     """
     within = seconds_within(confirm_within, "monitor")
-    order = admin.MonitorReload(prune=prune, confirm_within=within, force=force, shadow=shadow)
+    order = admin.MonitorReload(prune=prune, confirm_within=within, force=force, shadow=shadow, hold=hold)
     body = appliance.answer_or_exit(order)
     say_replaced(body)
     if body.kept:
@@ -283,5 +291,6 @@ def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
 
 def _say_held(rows: Collection[MonitorState]) -> None:
     """List the monitors that hold their topics, with the reason and the command that releases them."""
-    for row in (row for row in rows if row.why_held):
-        say(f"{row.name} holds its topics: {row.why_held}; rosrv monitor resume {row.name}", "yellow")
+    for row in (row for row in rows if row.held):
+        why = row.why_held or "its relay process was restarted"
+        say(f"{row.name} holds its topics: {why}; when it is safe: rosrv monitor resume {row.name}", "red")

@@ -44,7 +44,7 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/monitors/reload", None),
     ("POST", "/v1/monitors/reload?prune=1", None),
     ("POST", "/v1/monitors?confirm_within=9", {"files": FILES}),
-    ("POST", "/v1/monitors?shadow=1&force=1", {"files": FILES}),
+    ("POST", "/v1/monitors?shadow=1&force=1&hold=1", {"files": FILES}),
     ("PUT", "/v1/monitors/safeZone?shadow=1&force=true", "text"),
     ("POST", "/v1/monitors/reload?shadow=1&force=0", None),
     ("PATCH", "/v1/monitors/safeZone", {"enabled": False, "for_seconds": 600}),

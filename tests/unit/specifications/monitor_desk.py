@@ -51,7 +51,10 @@ A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
 B = "hold b() { event said() /other std_msgs/String '{}' { } }"
 C = "c() { event said() /third std_msgs/String '{}' { } }"
 USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+S = "s() { int n; event said() /cmd std_msgs/String '{}' { n++; if (n > 9) { return; } } }"
 TEXTS = {
+    "s": S,
+    "s2": S.replace("9", "8"),
     "a": A,
     "a2": A.replace("{", "{ int n;", 1),
     "b": B,
@@ -202,7 +205,7 @@ _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
     "promote": ("shadow", admin.MonitorShadow, {"shadow": False}),
     "resume": ("resume", admin.MonitorResume, {}),
 }
-_FLAGS = {"shadow", "force", "prune"}
+_FLAGS = {"shadow", "force", "prune", "hold"}
 
 
 def _file(word: str) -> tuple[str, str]:

@@ -1,12 +1,13 @@
 """The effects of specifications on topics that are published now."""
 
 from collections.abc import Collection
+from typing import Any
 
 import msgspec
 import pytest
 
 from appliance.specifications.checking import check
-from appliance.specifications.live_topics import LiveType, judge_topics
+from appliance.specifications.live_topics import LiveType, judge_holds, judge_topics
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -84,3 +85,65 @@ def test_another_definition_of_a_topic_in_force_is_judged_again() -> None:
     before = msgspec.structs.replace(CODE, texts={"std_msgs/String": "string data\nstring more\n"})
     assert judge_topics(CODE, CODE, live, shadow=(), forced=False).conflicts == []
     assert len(judge_topics(CODE, before, live, shadow=(), forced=False).conflicts) == 1
+
+
+DEADMAN = """\
+deadman() {
+    bool stopped;
+    event drive() /cmd_vel geometry_msgs/Twist '{}' { if (stopped) { return; } }
+    event silent() every 300ms { stopped = true; }
+}
+"""
+DRIVING = {"/cmd_vel": {"/teleop": LiveType("geometry_msgs/Twist")}}
+CHANGED = DEADMAN.replace("300ms", "500ms")
+
+
+def held(
+    text: str, live: dict[str, dict[str, LiveType]] = DRIVING, before: str = DEADMAN, **how: Any
+) -> tuple[list[str], list[str]]:
+    """Return the findings on a text that replaces another."""
+    present, coming = (check(Sources({"d.rv": one}), ()) for one in (before, text))
+    given = {"acting": ["deadman"], "moved": (), "hold": False} | how
+    found = judge_holds(coming, present, live, **given)
+    return found.conflicts, found.warnings
+
+
+def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
+    """The robot would get no command, not even a stop, so the operator decides before, not after."""
+    what = (
+        "deadman loses its state, because its text, or a definition, changes, and then holds /cmd_vel:"
+        " it drops every message"
+    )
+    assert held(CHANGED) == (
+        [
+            f"d.rv:1:1: error: {what}; stop the robot, and use --hold (REST: hold=1); then rosrv monitor resume deadman"
+        ],
+        [],
+    )
+    assert held(CHANGED, hold=True) == (
+        [],
+        [f"d.rv:1:1: warning: {what}; when it is safe: rosrv monitor resume deadman"],
+    )
+
+
+def test_a_move_to_another_relay_that_holds_a_topic_needs_consent() -> None:
+    """The state stays in the relay that the monitor leaves."""
+    [conflict], _ = held(DEADMAN, moved=["d.rv"])
+    assert "because it moves to another relay" in conflict
+
+
+@pytest.mark.parametrize(
+    ("text", "how"),
+    [
+        (DEADMAN, {}),
+        (f"// {DEADMAN}".replace("// ", "// a comment\n"), {}),
+        (f"begin {CHANGED}", {}),
+        (CHANGED, {"live": {}}),
+        (CHANGED, {"acting": []}),
+        (CHANGED.replace("return", "stopped = true"), {}),
+        (CHANGED, {"before": DEADMAN.replace("deadman", "other")}),
+    ],
+)
+def test_a_change_that_holds_nothing_needs_no_consent(text: str, how: dict[str, Any]) -> None:
+    """The text is the same, or the monitor is new, or begins again, or acts by no state, or no node publishes."""
+    assert held(text, **how) == ([], [])

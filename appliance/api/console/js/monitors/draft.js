@@ -12,10 +12,10 @@ export function useSpecification(first) {
     setText(next);
     setState((state) => ({ ...state, report: null }));
   };
-  /** @param {Record<string, string>} files @param {{dry: boolean, note?: string, match?: string, definitions?: Record<string, string>, signatures?: Record<string, string>}} how */
-  const send = async (files, { dry, note = "", match, definitions = {}, signatures = {} }) => {
+  /** @param {Record<string, string>} files @param {{dry: boolean, note?: string, match?: string, definitions?: Record<string, string>, signatures?: Record<string, string>, hold?: boolean}} how */
+  const send = async (files, { dry, note = "", match, definitions = {}, signatures = {}, hold = false }) => {
     try {
-      const { body } = await ask("POST", "/v1/monitors", { query: { dry_run: dry ? 1 : null }, json: { files, definitions, note, signatures }, match });
+      const { body } = await ask("POST", "/v1/monitors", { query: { dry_run: dry ? 1 : null, hold: hold ? 1 : null }, json: { files, definitions, note, signatures }, match });
       setState({ findings: body.warnings, report: body, error: null });
       return body;
     } catch (error) {

@@ -4,7 +4,7 @@ import { html, useState } from "../html.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Editor } from "../parts/editor.js";
-import { Field } from "../parts/field.js";
+import { Check, Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
 import { Signature } from "../parts/signature.js";
 import { done, failed } from "../parts/toast.js";
@@ -28,11 +28,12 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
   const [note, setNote] = useState("");
   const [definitions, setDefinitions] = useState(/** @type {Record<string, string>} */ ({}));
   const [signatures, setSignatures] = useState(/** @type {Record<string, string>} */ ({})); // by file name, without folders
+  const [hold, setHold] = useState(false);
   const [line, setLine] = useState(/** @type {any} */ (null));
   const draft = useSpecification(EXAMPLE);
   const send = (/** @type {boolean} */ dry) => {
     const names = [name, ...Object.keys(definitions)].map((one) => [one, signatures[one.split("/").at(-1) ?? ""] ?? ""]);
-    return draft.send({ [name]: draft.text }, { dry, note, definitions, signatures: Object.fromEntries(names), match: dry ? undefined : etag });
+    return draft.send({ [name]: draft.text }, { dry, note, hold, definitions, signatures: Object.fromEntries(names), match: dry ? undefined : etag });
   };
   const load = async () => {
     const body = await send(false);
@@ -65,6 +66,7 @@ export function LoadSpecification({ etag, files, signed, close, loaded }) {
       <div class="field"><label for="spec-files">Take it from files</label><input id="spec-files" class="input" type="file" multiple accept=".rv,.msg,.srv,.sig" onChange=${choose} /><span class="hint">.rv, and the .msg or .srv that ROS does not ship${signed && ", each with its .sig"}</span></div></div>
     <${Signature} asked=${signed} value=${signatures[name] ?? ""} set=${(/** @type {string} */ next) => setSignatures({ ...signatures, [name]: next })} />
     ${Object.keys(definitions).length > 0 && html`<div class="form-grid">${Object.keys(definitions).map((one, index) => html`<${Field} key=${index} label="Definition, as package/Type.msg" mono value=${one} set=${(/** @type {string} */ next) => rename(one, next)} hint=${html`${definitions[one].length} characters; ends up as <${Given} value=${one} />`} />`)}</div>`}
+    <${Check} label="Load even if monitors then hold topics with traffic, until they are resumed" on=${hold} set=${setHold} />
     <${Outcome} ...${draft} pick=${(/** @type {any} */ one) => setLine({ number: one.line, column: one.column, count: (line?.count ?? 0) + 1 })} />
     <${Editor} label="Specification" language="rv" value=${draft.text} change=${draft.write} findings=${draft.findings.filter((one) => one.file === name)} line=${line} dry=${() => send(true)} height="38vh" /></${Dialog}>`;
 }

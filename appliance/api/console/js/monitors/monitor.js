@@ -8,10 +8,10 @@ import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Editor } from "../parts/editor.js";
-import { Field } from "../parts/field.js";
+import { Check, Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
-import { Empty, Failure, Loading } from "../parts/notice.js";
+import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Signature } from "../parts/signature.js";
 import { useResource } from "../parts/resource.js";
@@ -36,7 +36,7 @@ export function MonitorPage({ name, row, monitors }) {
       <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.shadow || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
         <${Button} role="admin" tone="danger" onClick=${() => setRemoving(true)}>Remove</${Button}></div>`}</div>`;
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. Its actions are still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
-  const held = row.why_held && html`<p role="status">It holds its topics: ${row.why_held}. When it is safe, resume it (<code>rosrv monitor resume ${name}</code>).</p>`;
+  const held = row.held && html`<${Notice} tone="deny" role="alert" title="It holds its topics, and drops every message there">${row.why_held || "its relay process was restarted"}. When it is safe, resume it: <code>rosrv monitor resume ${name}</code></${Notice}>`;
   return html`${head}${held}
     <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${value.revision} monitor=${value} monitors=${monitors} />`}</div>
       <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${History} path=${path} row=${row} /></div></div>
@@ -57,13 +57,14 @@ function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, m
   const [note, setNote] = useState("");
   const [signature, setSignature] = useState("");
   const [asking, setAsking] = useState(false);
+  const [hold, setHold] = useState(false);
   const [line, setLine] = useState(/** @type {any} */ (null));
   const changed = draft.text !== monitor.text;
   const files = { [monitor.file]: draft.text };
   const signatures = { [monitor.file]: signature };
   const dry = () => draft.send(files, { dry: true, signatures });
   const load = async () => {
-    const body = await draft.send(files, { dry: false, note, signatures, match: monitors.etag });
+    const body = await draft.send(files, { dry: false, note, signatures, hold, match: monitors.etag });
     setAsking(false);
     if (body) {
       done(`Revision ${body.revision} of the specifications is in force`, body.changed.join(", "));
@@ -77,6 +78,7 @@ function Specification(/** @type {{monitor: any, monitors: any}} */ { monitor, m
     <${Editor} label=${`Specification ${monitor.file}`} language="rv" value=${draft.text} change=${draft.write} findings=${findings} line=${line} dry=${() => may("operator") && dry()} height="46vh" />
     ${asking && html`<${Dialog} title=${`Replace ${monitor.file}?`} close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Not yet</button><${Button} role="admin" tone="primary" onClick=${load}>Replace</${Button}>`}>
       <p>The specification is compiled and replaced between two messages. Monitors of this file start in their initial state; others keep theirs.</p><${Field} label="Comment" value=${note} set=${setNote} placeholder="Reason or ticket number" maxlength="200" />
+      <${Check} label="Load even if monitors then hold topics with traffic, until they are resumed" on=${hold} set=${setHold} />
       <${Signature} asked=${monitors.body.site_keys.length > 0} value=${signature} set=${setSignature} /></${Dialog}>`}</section>`;
 }
 
