@@ -123,7 +123,10 @@ def test_a_changed_stop_holds_until_it_is_resumed(
         press(stopped, ros)
         spec = stopped.directory / "stop.rv"
         spec.write_text(STOP.replace("pressed", "is_pressed"))
-        said = stopped.rosrv("monitor", "load", str(spec))
+        refused = stopped.rosrv("monitor", "load", str(spec), check=False)
+        assert (refused.returncode, monitor(stopped)["held"]) == (1, False)
+        assert "and then holds /chatter" in refused.stderr
+        said = stopped.rosrv("monitor", "load", "--hold", str(spec))
         assert "rosrv monitor resume stop" in said.stdout + said.stderr
         assert "has changed" in monitor(stopped)["why_held"]
         assert stopped.recorded(event="topics held")[-1]["detail"]["monitor"] == "stop"
