@@ -29,8 +29,8 @@ from roswire.message_text import (
 MAX_DEPTH = 64
 """The maximum number of levels of nested messages."""
 
-_FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*)\.(msg|srv)\Z")
-_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
+_FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*+)\.(msg|srv)\Z")
+_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
 _RULE = "=" * 80
 
 _Answer = TypeVar("_Answer")

@@ -43,10 +43,10 @@ _INTEGERS = {
     if len(code) == 1 and code in "bBhHiIqQ"
 }
 _CONSTANT_TYPES = frozenset({*_INTEGERS, "bool", "float32", "float64", "string"})
-_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)?)(\[([0-9]{0,10})\])?\Z")
-_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
+_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*+(?:/[A-Za-z][A-Za-z0-9_]*+)?)(\[([0-9]{0,10}+)\])?\Z")
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*+\Z")
 _MAX_NUMBER_LENGTH = 400  # the maximum number of characters of a numeric constant
-_SEPARATOR = re.compile(r"={40,}[ \t\r]*\Z")
+_SEPARATOR = re.compile(r"={40,}+[ \t\r]*+\Z")
 
 
 @dataclass(frozen=True, slots=True)

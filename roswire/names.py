@@ -22,15 +22,16 @@ MAX_NAME_LENGTH = 1024
 The longest names on robots have far less than a quarter of this number.
 """
 
-_NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
-_CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
-_TOOL = re.compile(r"(?:/[A-Za-z0-9_-]+)+\Z")
-_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
+_NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
+_CANONICAL = re.compile(
+    r"(?:/[A-Za-z0-9_]++){1,512}\Z"
+)  # a name of MAX_NAME_LENGTH has at most 512 segments
+_TOOL = re.compile(r"(?:/[A-Za-z0-9_-]++){1,512}\Z")
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
 # Parameters come from YAML files, where `/arm/joint-1.left/gains` and `/analyzers/Base Driver` are common.
-_PARAMETER = re.compile(
-    r"(?:~|[A-Za-z0-9_/])(?:[A-Za-z0-9_/.:@#%+,=()\[\]<>&$!;'-]|(?<=[^/~ ]) (?=[^/ ]))*\Z"
-)
-_SLASHES = re.compile("/{2,}")
+_IN_KEYS = r"[A-Za-z0-9_/.:@#%+,=()\[\]<>&$!;'-]"
+_PARAMETER = re.compile(rf"[A-Za-z0-9_/~]{_IN_KEYS}*+(?:(?<![/~]) (?!/){_IN_KEYS}++){{0,512}}\Z")
+_SLASHES = re.compile("/{2,}+")
 
 
 def resolve(name: str, caller_id: str) -> str:
@@ -63,7 +64,7 @@ def resolve_parameter(name: str, caller_id: str) -> str:
 
 def check_caller_id(caller_id: str) -> str:
     """Return `caller_id` unchanged; raises `InvalidNameError` unless it is a canonical global name."""
-    if _CANONICAL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
+    if len(caller_id) > MAX_NAME_LENGTH or _CANONICAL.match(caller_id) is None:
         raise InvalidNameError(
             f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
             f"with letters, digits and '_', no '//', no '/' at the end, at most {MAX_NAME_LENGTH} characters"
@@ -73,7 +74,7 @@ def check_caller_id(caller_id: str) -> str:
 
 def check_tool_id(caller_id: str) -> str:
     """Check the id of a caller that need not be a node, such as `/rosparam-4711`."""
-    if _TOOL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
+    if len(caller_id) > MAX_NAME_LENGTH or _TOOL.match(caller_id) is None:
         return check_caller_id(caller_id)
     return caller_id
 

@@ -16,10 +16,10 @@ MAX_URI_LENGTH = 1024
 """The maximum number of characters in one URI."""
 
 _URI = re.compile(
-    r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://"
+    r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*+)://"
     r"(?P<host>\[[0-9A-Fa-f:.]{2,45}\]|[0-9A-Fa-f:.]{2,45}(?=:[0-9]{1,5}(?:/|\Z))|[A-Za-z0-9_.-]{1,253})"
     r"(?P<port>:[0-9]{1,5})?"
-    r"(?P<path>/[A-Za-z0-9_.~!$&'()*+,;=:@%/-]*)?\Z"
+    r"(?P<path>/[A-Za-z0-9_.~!$&'()*+,;=:@%/-]*+)?\Z"
 )
 
 

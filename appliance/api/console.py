@@ -31,8 +31,8 @@ from appliance.configuration.settings import Settings
 VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
 _PREFIX = "/console/static/"
 _PAGE, _SCRIPT, _STYLE = "index.html", "js/main.js", "css/main.css"
-_ADDRESS = re.compile(rf"{_PREFIX}([\w./-]+)")
-_GZIP = re.compile(r"\bgzip\b(?!\s*;\s*q=0(?:\.0*)?\s*(?:,|$))", re.IGNORECASE)
+_ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
+_GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
 _LEVEL = 9  # of gzip; the files are compressed once
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
 _HEADERS = {

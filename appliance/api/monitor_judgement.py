@@ -16,7 +16,7 @@ from appliance.channel.answers.monitor_answers import Monitors
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
 
-_PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
+_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
 
 
 def findings_of(texts: list[str]) -> list[Finding]:

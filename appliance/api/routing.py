@@ -7,7 +7,6 @@ declares a body as `Annotated[Kind, body(Kind)]`. If its answer is not a struct,
 import enum
 import functools
 import json
-import re
 import typing
 from collections.abc import Awaitable, Callable
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -25,7 +24,6 @@ Responses = dict[int | str, dict[str, Any]]
 ETAG = {"ETag": {"description": "the ETag for If-Match of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
 _MOST_ERRORS = 50
-_PLACE = re.compile(r"(?s)(.*) - at `(?:key` in `)?\$(.*)`")
 
 
 class Tagged(NamedTuple, Generic[A]):
@@ -156,9 +154,11 @@ def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
 
 def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
     """Return the error of one part of a body of this kind, with the part's place."""
-    found = _PLACE.fullmatch(str(error))
-    text, place = (str(error), "") if found is None else found.groups()
-    return BadInput(where + place, body_refusal(text, _choices(kind)))
+    text, at, place = str(error).rpartition(" - at `")
+    if not at:
+        text, place = place, ""
+    where += place.removeprefix("key` in `").removeprefix("$").removesuffix("`")
+    return BadInput(where, body_refusal(text, _choices(kind)))
 
 
 def _choices(kind: Any) -> tuple[str, ...]:

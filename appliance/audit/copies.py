@@ -27,8 +27,8 @@ from appliance.signing.signed_statements import Checkpoint, parse_checkpoint
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
 _LONGEST_LINE = 65_536
-_ELEMENT = re.compile(rf"\[{re.escape(SYSLOG_ELEMENT)}((?: [a-z]+=\"[0-9a-f]*\")+)\]")
-_PARAMETER = re.compile(r' ([a-z]+)="([0-9a-f]*)"')
+_ELEMENT = re.compile(rf"\[{re.escape(SYSLOG_ELEMENT)}((?: [a-z]++=\"[0-9a-f]*+\")+)\]")
+_PARAMETER = re.compile(r' ([a-z]++)="([0-9a-f]*+)"')
 
 
 class CopiesUnreadableError(Exception):

@@ -24,7 +24,7 @@ from appliance.base.varying_numbers import without_numbers
 FOLDED = frozenset({"denials folded", "repetitions folded"})
 _ABOUT_THE_LOG = frozenset({"records removed", "records lost", "forwarding gap"})
 """Events whose `detail.count` is a number of records, not of repetitions."""
-_MORE = re.compile(r"(in shadow mode(?:, not done)?: )?\d+ more in the same second(?:: )?")
+_MORE = re.compile(r"(in shadow mode(?:, not done)?: )?\d{1,18}+ more in the same second(?:: )?")
 _BETWEEN = 8
 
 

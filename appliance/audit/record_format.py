@@ -26,7 +26,7 @@ _OF_THE_RECORD = (
 
 _CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
 """The fields of `detail` in a monitor's record that contain parts of messages: bytes, fields, compared values."""
-_BOUND = re.compile(r"(property \d+ of \S+ \(\w+\)|: \d+ \w+) with \w+ = .*", re.DOTALL)
+_BOUND = re.compile(r"(property \d++ of \S++ \(\w++\)|: \d++ \w++) with \w++ = ")
 
 
 class LogEntry(NamedTuple):

@@ -9,7 +9,7 @@ import sys
 from mmap import mmap
 from pathlib import Path
 
-_UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
+_UNFINISHED = re.compile(r".{1,255}\.[0-9a-f]{8}\.new(-journal)?")
 """Match the names that `name_to_make` returns, and the journals of databases with such names."""
 
 

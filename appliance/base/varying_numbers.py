@@ -7,14 +7,13 @@ Kept are digits that name something: in a word or ROS name (`joint_1`, `/arm/2`)
 import functools
 import re
 
-_HEX = r"[\da-fA-F]"
-_PART = rf"{_HEX}{{1,4}}+"
-_IPV6 = rf"(?<![\w:.])(?:(?:{_PART}:){{1,7}}+:(?:{_HEX}|:)*+|::(?:{_HEX}|:)++|(?:{_PART}:){{7}}{_PART})"
+_PART = r"[\da-fA-F]{1,4}+"
+_IPV6 = rf"(?<![\w:.])(?:(?:{_PART}:){{1,7}}:[\da-fA-F:]*+|::[\da-fA-F:]++|(?:{_PART}:){{7}}{_PART})"
 _NUMBER = re.compile(
-    rf"(?P<kept>\.\w++:\d++(?::\d++)*+|{_IPV6})"
-    r"|(?<![\w/.])[-+]?(?:nan\b|inf\b|\d++(?:\.\d++)?+(?:[eE][-+]?\d++)?+(?!\.\d))"
+    rf"(?P<kept>\.\w++:\d++(?::\d++)*|{_IPV6})"
+    r"|(?<![\w/.])[-+]?(?:nan\b|inf\b|(?>\d++(?:\.\d++)?(?:[eE][-+]?\d++)?)(?!\.\d))"
 )
-# Possessive, so the time is linear in the length of the text, parts of which may come from peers.
+# Possessive or atomic, so the time is linear in the length of the text, parts of which may come from peers.
 
 
 @functools.lru_cache(4)  # a line of output is compared with the previous one

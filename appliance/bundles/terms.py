@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 import msgspec
 
 _WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
-_PATH = re.compile(r"([a-z0-9][a-z0-9-]{0,62})/([a-z0-9][a-z0-9-]{0,62})/([1-9][0-9]{0,8})\.tar")
+_PATH = re.compile(r"([a-z0-9][a-z0-9-]{0,62}+)/([a-z0-9][a-z0-9-]{0,62}+)/([1-9][0-9]{0,8}+)\.tar")
 ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 _MOST_RINGS = 20
 _MOST_ROBOTS = 1000

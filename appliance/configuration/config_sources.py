@@ -37,7 +37,7 @@ _DEFAULT_STATE = Settings.state
 _PREFIX = "ROSRV_"
 _NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
 # Variables that Kubernetes and container links set for a service named `rosrv`.
-_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
+_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|NAME|ENV_.*+)")
 _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
     ("ipsec", "ca_passphrase_file"),

@@ -18,7 +18,7 @@ JOIN_PATH = "/v1/join"
 
 _Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9._-]{0,62}\Z")]
 _Url = Annotated[str, msgspec.Meta(pattern=r"^https://[0-9a-fA-F.:\[\]]{3,60}\Z")]
-_Group = Annotated[str, msgspec.Meta(pattern=r"^([a-z0-9][a-z0-9-]{0,62}/[a-z0-9][a-z0-9-]{0,62})?\Z")]
+_Group = Annotated[str, msgspec.Meta(pattern=r"^([a-z0-9][a-z0-9-]{0,62}+/[a-z0-9][a-z0-9-]{0,62}+)?\Z")]
 _Pem = Annotated[str, msgspec.Meta(max_length=16_384)]
 _Token = Annotated[str, msgspec.Meta(pattern=r"^rosrv-join_[A-Za-z0-9_-]{43}\Z")]
 

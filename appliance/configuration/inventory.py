@@ -22,7 +22,7 @@ RUNS = (
     "libstrongswan-standard-plugins", "libcharon-extra-plugins", "strongswan-swanctl", "libseccomp2",
 )  # fmt: skip
 _STANDS_ON = {*RUNS, "python3", "libc6", "rosrv"}
-_LICENCE = re.compile(r"^License:[ \t]*(\S[^\n]*)$", re.MULTILINE)
+_LICENCE = re.compile(r"^License:[ \t]*+(\S[^\n]*+)$", re.MULTILINE)
 _COMMON = re.compile(r"/usr/share/common-licenses/([A-Za-z0-9.-]*[A-Za-z0-9])")
 
 

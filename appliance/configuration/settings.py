@@ -25,7 +25,7 @@ from pydantic import (
 
 from appliance.signing.site_keys import checked_key
 
-_NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}){1,5}")
+_NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}+){1,5}")
 _FLEET_WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
 _HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 

@@ -10,9 +10,9 @@ import re
 import subprocess
 
 _SECONDS = 10.0
-_STATE = re.compile(r"^src (\S+) dst (\S+)\s*\n\s+proto esp spi (0x[0-9a-f]+)", re.MULTILINE)
-_ENCAPSULATED = re.compile(r"^\s+encap type espinudp sport (\d+) dport (\d+)", re.MULTILINE)
-_POLICY = re.compile(r"^src (\S+) dst (\S+).*\n\s+dir (in|out|fwd)\b", re.MULTILINE)
+_STATE = re.compile(r"^src (\S++) dst (\S++)[ \t]*+\n\s++proto esp spi (0x[0-9a-f]++)", re.MULTILINE)
+_ENCAPSULATED = re.compile(r"^\s++encap type espinudp sport (\d++) dport (\d++)", re.MULTILINE)
+_POLICY = re.compile(r"^src (\S++) dst (\S++).*+\n\s++dir (in|out|fwd)\b", re.MULTILINE)
 _PORT = "4500"
 
 

@@ -8,14 +8,14 @@ replays, and packets with an address that the tunnel does not permit.
 import re
 from dataclasses import dataclass, field
 
-_LINE = re.compile(r"(\d\d)\[[A-Z]{3}\] (.*)")
-_ARRIVED = re.compile(r"received packet: from (\S+)\[\d+\] to ")
+_LINE = re.compile(r"(\d\d)\[[A-Z]{3}\] (.*+)")
+_ARRIVED = re.compile(r"received packet: from ([^\s\[]++)\[\d++\] to ")
 _REFUSED = re.compile(
-    r"generating IKE_\S+ response \d+ \[ (?:.* )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
+    r"generating IKE_\S++ response \d++ \[ (?:.{0,2000} )?N\((AUTH_FAILED|NO_PROP|FAIL_CP_REQ|TS_UNACCEPT)\)"
 )
-_SENT_AGAIN = re.compile(r"  src (\S+), dst \S+, SPI [0-9a-f]{8}")
+_SENT_AGAIN = re.compile(r"  src ([^\s,]++), dst [^\s,]++, SPI [0-9a-f]{8}")
 _UNDER_ANOTHERS = re.compile(
-    r"discarding inbound IP packet ([0-9a-fA-F.:]+)(?:\[\d+\])? == \S+ .*due to policy"
+    r"discarding inbound IP packet ([0-9a-fA-F.:]++)(?:\[\d++\])? == \S++ .{0,2000}due to policy"
 )
 _REASONS = (
     "revoked",

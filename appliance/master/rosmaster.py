@@ -237,7 +237,7 @@ def own_parameters() -> Tree:
     except OSError as error:
         _log.warning("the version of ROS is not known: /rosversion is not set", error=str(error))
         return tree
-    version = re.search(r"<version>\s*([^<\s]+)", text)
+    version = re.search(r"<version>\s{0,9}+([^<\s]{1,40}+)", text)
     if version is not None:
         tree["rosversion"] = version[1] + "\n"
     return tree

@@ -69,7 +69,7 @@ def require_network_admin(what: str) -> None:
 
 def _has_capabilities(wanted: int) -> bool:
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    found = re.search(r"^CapEff:\s*([0-9a-f]+)", status, re.MULTILINE)
+    found = re.search(r"^CapEff:\t([0-9a-f]{1,32}+)", status, re.MULTILINE)
     return found is not None and int(found[1], 16) & wanted == wanted
 
 

@@ -13,7 +13,7 @@ from appliance.policy.policy_findings import Findings, quoted
 
 ROBOT = "robot"
 _HOST = "host:"
-_GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*", re.ASCII)
+_GROUP_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*+", re.ASCII)
 _HOST_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,252}", re.ASCII)
 _SHOWN_LIMIT = 80
 

@@ -14,7 +14,7 @@ from appliance.policy.policy_findings import Findings, quoted
 MAXIMUM_CHARACTERS = 2 * 1024 * 1024
 """The most characters of a policy. A policy with 10,000 rules has about 600,000."""
 
-_WORD = re.compile(r"[^\s,]+", re.ASCII)
+_WORD = re.compile(r"[^\s,]++", re.ASCII)
 _COMMENT = re.compile(r"[#;]")
 _FOREIGN = re.compile(r"[^\t\x20-\x7e]")
 

@@ -25,7 +25,7 @@ from appliance.policy.sections import DECIDERS, PARAMETERS
 from roswire.names import is_global_name
 
 # The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
-_ANONYMOUS = re.compile(r"_[0-9]+_[0-9]{10,}$|_[0-9]{15,}$")
+_ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
 _SHOWN_NODES = 3
 
 

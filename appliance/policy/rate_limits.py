@@ -63,7 +63,7 @@ _PARTS = frozenset(part.value for part in LimitScope)
 _BYTES = {"B/s": 1.0, "kB/s": 1e3, "MB/s": 1e6, "GB/s": 1e9}
 _UNITS = {"Hz": 1.0, **_BYTES}
 _FOLDED = {unit.casefold(): unit for unit in _UNITS}
-_NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?)([A-Za-z/]*)", re.ASCII)
+_NUMBER = re.compile(r"([0-9]++(?:\.[0-9]++)?)([A-Za-z/]*+)", re.ASCII)
 _LEAST, _MOST = 1e-3, 1e12
 _LINES = 1000
 

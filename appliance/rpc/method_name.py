@@ -3,7 +3,7 @@
 import re
 
 _BEGINNING = 4096  # the number of bytes that are searched
-_METHOD = re.compile(rb"<methodName>\s*([^<>&\s]{1,128})\s*</methodName>")
+_METHOD = re.compile(rb"<methodName>\s*+([^<>&\s]{1,128}+)\s*+</methodName>")
 
 
 def method_named(body: bytes) -> str:

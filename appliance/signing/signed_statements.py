@@ -35,8 +35,8 @@ class Checkpoint(NamedTuple):
 
 
 _CHECKPOINT = re.compile(
-    rb"rosrv audit checkpoint [12]\nlog ([0-9a-f]{32})\nnumber (\d{1,18})\nsequence (\d{1,18})\n"
-    rb"hash ([0-9a-f]{64})\ntime (\d{1,19})\nprevious ([0-9a-f]{64})\n(?:removed (\d{1,18})\n)?"
+    rb"rosrv audit checkpoint [12]\nlog ([0-9a-f]{32})\nnumber (\d{1,18}+)\nsequence (\d{1,18}+)\n"
+    rb"hash ([0-9a-f]{64})\ntime (\d{1,19}+)\nprevious ([0-9a-f]{64})\n(?:removed (\d{1,18}+)\n)?"
 )
 
 
@@ -79,7 +79,7 @@ class Removal(NamedTuple):
         ).encode()
 
 
-_LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31} (?:days|bytes))\n\Z")
+_LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31}+ (?:days|bytes))\n\Z")
 
 
 def limit_of_removal(text: bytes) -> str:

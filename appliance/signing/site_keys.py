@@ -27,7 +27,7 @@ _ED25519 = b"ssh-ed25519"
 _MAGIC = b"SSHSIG"
 _HASHES = (b"sha512", b"sha256")  # the hashes that SSHSIG allows
 _ARMOUR = re.compile(
-    r"\s*-----BEGIN SSH SIGNATURE-----\n([A-Za-z0-9+/=\n]{1,4000})\n-----END SSH SIGNATURE-----\s*"
+    r"\s*+-----BEGIN SSH SIGNATURE-----\n([A-Za-z0-9+/=\n]{1,4000})\n-----END SSH SIGNATURE-----\s*+"
 )
 _LONGEST = 8192  # characters of a signature file
 _HOW = "sign it (rosrv sign FILE --key KEY) and leave FILE.sig beside it, or send that along"

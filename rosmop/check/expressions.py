@@ -29,7 +29,7 @@ from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
-_NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]+|[0-9.]+(?:[eE][+-]?[0-9]+)?)([uUlLfF]*)\Z")
+_NUMBER = re.compile(r"(0[xX][0-9A-Fa-f]++|[0-9.]++(?:[eE][+-]?[0-9]++)?)([uUlLfF]*+)\Z")
 _DECIMAL = re.compile(r"[1-9][0-9]{0,30}")
 _MAX_DIGITS = 400
 

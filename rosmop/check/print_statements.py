@@ -14,7 +14,7 @@ from rosmop.form.findings import Position, SpecificationError
 from rosmop.text import tree
 from rosmop.types import value_types
 
-_CONVERSION = re.compile(rb"%([-+ #0]*)(\*|[0-9]*)(?:\.(\*|[0-9]*))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)
+_CONVERSION = re.compile(rb"%([-+ #0]*+)(\*|[0-9]*+)(?:\.(\*|[0-9]*+))?(hh|h|ll|l|z|j|t|L|q)?(.?)", re.DOTALL)
 _MAX_WIDTH = 1000
 _LONG = 1024  # bytes; shorter text without strings is not charged in advance
 _SIGNED, _UNSIGNED, _FLOATING = b"di", b"uoxX", b"fFeEgGaA"

@@ -13,8 +13,8 @@ from rosmop.logics.property_lint import analyse
 from rosmop.text import tree
 from rosmop.types.messages import shown
 
-_DEFAULT = re.compile(r"[\[,]\s*default\s+[A-Za-z_]")
-_WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
+_DEFAULT = re.compile(r"[\[,]\s*+default\s++[A-Za-z_]")
+_WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
 class _HasProperty(Protocol):

@@ -8,7 +8,7 @@ from decimal import ROUND_CEILING, Decimal
 from rosmop.text.complaints import FORBIDDEN, RESERVED
 
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-_PRINTABLE = re.compile(r"[ -~]*\Z")
+_PRINTABLE = re.compile(r"[ -~]*+\Z")
 CPP = {
     "float32": "float", "float64": "double", "byte": "int8_t", "char": "uint8_t", "string": "std::string",
     "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
@@ -66,7 +66,7 @@ def formatted(text: str) -> str:
 
 def identifier(text: str) -> str:
     """Return an identifier made of any text."""
-    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "root"
+    name = re.sub(r"[^A-Za-z0-9]++", "_", text).strip("_") or "root"
     return f"n{name}" if name[0].isdigit() else name
 
 

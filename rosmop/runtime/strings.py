@@ -11,13 +11,13 @@ NOT_FOUND = (1 << 64) - 1
 
 _LONG = 64  # bytes; shorter strings are not charged
 _INTEGERS = {
-    2: re.compile(rb"\s*([+-]?[01]+)"),
-    8: re.compile(rb"\s*([+-]?[0-7]+)"),
-    10: re.compile(rb"\s*([+-]?[0-9]+)"),
-    16: re.compile(rb"\s*([+-]?)(?:0[xX](?=[0-9a-fA-F]))?([0-9a-fA-F]+)"),
+    2: re.compile(rb"\s*+([+-]?[01]++)"),
+    8: re.compile(rb"\s*+([+-]?[0-7]++)"),
+    10: re.compile(rb"\s*+([+-]?[0-9]++)"),
+    16: re.compile(rb"\s*+([+-]?)(?:0[xX](?=[0-9a-fA-F]))?([0-9a-fA-F]++)"),
 }
 _FLOATING = re.compile(
-    rb"\s*([+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf(?:inity)?|nan))", re.IGNORECASE
+    rb"\s*+([+-]?(?:(?:[0-9]++\.?[0-9]*+|\.[0-9]++)(?:[eE][+-]?[0-9]++)?|inf(?:inity)?|nan))", re.IGNORECASE
 )
 
 
@@ -225,7 +225,7 @@ def parse_floating(text: bytes, bits: int, site: int) -> float:
 
 def lenient_integer(text: bytes) -> int:
     """Return `atoi(text)`: 0 for text that is not a number."""
-    found = re.match(rb"\s*[+-]?[0-9]{1,18}", text[:1000])
+    found = re.match(rb"\s*+[+-]?[0-9]{1,18}+", text[:1000])
     return int(found[0]) if found else 0
 
 

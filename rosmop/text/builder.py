@@ -24,7 +24,7 @@ _ESCAPE = re.compile(r"\\(x[0-9A-Fa-f]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
 _SIMPLE = {"n": 10, "t": 9, "r": 13, "a": 7, "b": 8, "f": 12, "v": 11, "\\": 92, "'": 39, '"': 34, "?": 63}
 _UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "m": 60 * 10**9, "min": 60 * 10**9,
              "h": 3600 * 10**9}  # fmt: skip
-_DURATION = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]*)\Z")
+_DURATION = re.compile(r"(\d++(?:\.\d*+)?|\.\d++)\s*+([A-Za-z]*+)\Z")
 MIN_PERIOD_NS = 10**6
 MAX_PERIOD_NS = 10**18
 """About 31 years."""

@@ -17,7 +17,7 @@ from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 _LONGEST = 32 << 10  # the maximum number of bytes for one pattern
 _MOST_ALONE = 256  # the maximum number of parts left to `xmlrpc_reader`, which take twice as long
 _SMALLEST = len("<value></value>")
-# If two stars can match the same byte, one is possessive (`*+`), so time is linear in the document.
+# Every repeat of a set is possessive (`*+`), so time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
 _TEXT = rb"[ -%'-;=?-~]*+"
 _INTEGER = rb"-?[0-9]{1,9}"
@@ -54,7 +54,7 @@ def _list_in(group: bytes) -> bytes:
 
 _LIST = _list_in(b"(")
 _CALL = _spaced(
-    _DECLARED, b"<methodCall>", rb"<methodName>([A-Za-z.]+)</methodName>", b"<params>",
+    _DECLARED, b"<methodCall>", rb"<methodName>([A-Za-z.]++)</methodName>", b"<params>",
     b"((?:<param>" + _SPACE + _ONE + _SPACE + b"</param>" + _SPACE + b")*)</params>", b"</methodCall>", rb"\Z",
 )  # fmt: skip
 _CALLS = _spaced(
@@ -65,7 +65,9 @@ _CALLS = _spaced(
     b"<param>",
     _ARRAY,
 )
-_NAME = _SPACE.join([b"<member>", b"<name>methodName</name>", b"<value><string>([A-Za-z]+)</string></value>"])
+_NAME = _SPACE.join(
+    [b"<member>", b"<name>methodName</name>", b"<value><string>([A-Za-z]++)</string></value>"]
+)
 _CALL_IN = _spaced(
     b"<value><struct>", _NAME, b"</member>", b"<member>", b"<name>params</name>", _LIST, b"</member>",
     b"</struct></value>",

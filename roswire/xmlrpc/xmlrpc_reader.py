@@ -25,13 +25,14 @@ from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 
 _HEAD = re.compile(
     rb"(?:\xef\xbb\xbf)?"
-    rb"(?:<\?xml[ \t\r\n]+version[ \t\r\n]*=[ \t\r\n]*['\"]1\.0['\"]"
-    rb"(?:[ \t\r\n]+encoding[ \t\r\n]*=[ \t\r\n]*['\"]([A-Za-z0-9._-]{1,40})['\"])?"
-    rb"(?:[ \t\r\n]+standalone[ \t\r\n]*=[ \t\r\n]*['\"](?:yes|no)['\"])?[ \t\r\n]*\?>)?"
-    rb"[ \t\r\n]*<([A-Za-z]{1,40})"
+    rb"(?:<\?xml[ \t\r\n]++version[ \t\r\n]*+=[ \t\r\n]*+['\"]1\.0['\"]"
+    rb"(?:[ \t\r\n]++encoding[ \t\r\n]*+=[ \t\r\n]*+['\"]([A-Za-z0-9._-]{1,40}+)['\"])?"
+    rb"(?:[ \t\r\n]++standalone[ \t\r\n]*+=[ \t\r\n]*+['\"](?:yes|no)['\"])?[ \t\r\n]*+\?>)?"
+    rb"[ \t\r\n]*+<([A-Za-z]{1,40}+)"
     # rosjava (Apache XML-RPC) always declares its extensions
-    rb"(?:[ \t\r\n]+xmlns:ex=['\"]http://ws\.apache\.org/xmlrpc/namespaces/extensions['\"])?[ \t\r\n]*>"
+    rb"(?:[ \t\r\n]++xmlns:ex=['\"]http://ws\.apache\.org/xmlrpc/namespaces/extensions['\"])?[ \t\r\n]*+>"
 )
+_LONGEST_HEAD = 4096
 _ENCODINGS = frozenset({b"utf-8", b"us-ascii", b"iso-8859-1"})
 _SPACE = " \t\r\n"
 _LINE_FEED = ["\n"]
@@ -65,16 +66,15 @@ _INCOMPLETE = frozenset(
     {"methodCall", "methodResponse", "param", "fault", "array", "member", "member, named"}
 )
 
-_INTEGER = re.compile(r"[ \t\r\n]*([+-]?[0-9]{1,20})[ \t\r\n]*\Z")
+_INTEGER = re.compile(r"[ \t\r\n]*+([+-]?[0-9]{1,20}+)[ \t\r\n]*+\Z")
 _DOUBLE = re.compile(
-    # Only one part can match a digit. With two such parts, every split of the digits would be tried, in quadratic time.
-    r"[ \t\r\n]*([+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf|infinity|nan))[ \t\r\n]*\Z",
+    r"[ \t\r\n]*+([+-]?(?:(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?|inf|infinity|nan))[ \t\r\n]*+\Z",
     re.IGNORECASE | re.ASCII,
 )
 _DATE_TIME = re.compile(
-    r"[ \t\r\n]*([0-9]{4})([0-9]{2})([0-9]{2})T([0-9]{2}):([0-9]{2}):([0-9]{2})[ \t\r\n]*\Z"
+    r"[ \t\r\n]*+([0-9]{4})([0-9]{2})([0-9]{2})T([0-9]{2}):([0-9]{2}):([0-9]{2})[ \t\r\n]*+\Z"
 )
-_BASE64 = re.compile(r"[A-Za-z0-9+/]*={0,2}\Z")
+_LONGEST_SCALAR = 4096  # characters of a number, boolean or time: any double in full, with space around it
 _PIECE = 64 << 10  # the number of bytes given to expat at once
 _NO_SPACE = str.maketrans("", "", _SPACE)
 
@@ -197,6 +197,15 @@ class XmlRpcDocument:
             )
         return string
 
+    def _scalar(self) -> str:
+        """Return the text of a short scalar. A longer one would hold the interpreter while it is matched."""
+        text = self._string()
+        if len(text) > _LONGEST_SCALAR:
+            raise self._error(
+                f"<{self._state}> with {len(text)} characters; at most {_LONGEST_SCALAR} are allowed"
+            )
+        return text
+
     def _method_name(self) -> None:
         self.method = self._string()
 
@@ -207,7 +216,7 @@ class XmlRpcDocument:
         self._keys.append(key)
 
     def _integer(self) -> int:
-        text = self._string()
+        text = self._scalar()
         found = _INTEGER.match(text)
         if found is None:
             raise self._error(f"integer {text[:40]!a}")
@@ -217,20 +226,20 @@ class XmlRpcDocument:
         return number
 
     def _boolean(self) -> bool:
-        text = self._string().strip(_SPACE)
+        text = self._scalar().strip(_SPACE)
         if text not in ("0", "1"):
             raise self._error(f"boolean {text[:40]!a}: it is 0 or 1")
         return text == "1"
 
     def _double(self) -> float:
-        text = self._string()
+        text = self._scalar()
         found = _DOUBLE.match(text)
         if found is None:
             raise self._error(f"double {text[:40]!a}")
         return float(found[1])
 
     def _date_time(self) -> datetime:
-        text = self._string()
+        text = self._scalar()
         found = _DATE_TIME.match(text)
         try:
             if found is not None:
@@ -242,12 +251,13 @@ class XmlRpcDocument:
 
     def _base64(self) -> bytes:
         text = self._string().translate(_NO_SPACE)
-        if len(text) % 4 or _BASE64.match(text) is None:
-            raise self._error(f"base64 {text[:40]!a}")
-        return binascii.a2b_base64(text)
+        try:
+            return binascii.a2b_base64(text, strict_mode=True)
+        except ValueError:
+            raise self._error(f"base64 {text[:40]!a}") from None
 
     def _nil(self) -> None:
-        if self._string().strip(_SPACE):
+        if self._scalar().strip(_SPACE):
             raise self._error("text in <nil/>")
 
     def _place(self) -> str:
@@ -290,7 +300,7 @@ _READ: Mapping[str, Callable[[XmlRpcDocument], Value]] = {
 def _check_head(body: bytes, limits: XmlRpcLimits, root: str) -> None:
     if len(body) > limits.body:
         raise LimitExceededError(f"body of {len(body)} bytes; at most {limits.body} are allowed")
-    head = _HEAD.match(body)
+    head = _HEAD.match(body, 0, _LONGEST_HEAD)
     if head is None:
         raise ProtocolError(
             "not XML-RPC at byte 0: a document starts with an XML declaration (version 1.0) or its root "
