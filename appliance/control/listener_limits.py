@@ -1,7 +1,8 @@
 """Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints.
 
-An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. The beginning of
-its body is read first, to record the name of the call. While the ROS master is not hidden, every host is refused.
+An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. If a section of
+the policy is audit-only, only a blocked host is. The beginning of the body is read first, to record the name of the
+call. While the ROS master is not hidden, every host is refused.
 """
 
 import socket
@@ -116,7 +117,7 @@ class ListenerLimits:
             return lambda _beginning: fault
         policy = self._policy()
         # The rosout aggregator calls from this machine. The policy need not name this machine.
-        if peer.here or policy.knows(peer.host):
+        if peer.here or policy.serves(peer.host):
             return None
         denial = policy.blocked(peer.host)
         reason = f"no rule of the policy names {peer.text}" if denial is None else denial.reason

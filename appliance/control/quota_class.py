@@ -19,13 +19,11 @@ class HostQuotaClass:
         self._registrations = registrations
 
     def __call__(self, host: Address) -> QuotaClass:
-        """Return the present quota class of a host."""
-        if self._registrations(host):
-            return QuotaClass.REGISTERED
+        """Return the present quota class of a host. In audit-only mode, also an unknown host can have registrations."""
         # The policy need not name loopback, from which the appliance's own nodes call.
-        if host.is_loopback or self._policy().knows(host):
-            return QuotaClass.NAMED
-        return QuotaClass.UNKNOWN
+        if not (host.is_loopback or self._policy().knows(host)):
+            return QuotaClass.UNKNOWN
+        return QuotaClass.REGISTERED if self._registrations(host) else QuotaClass.NAMED
 
     def of_text(self, host: str) -> QuotaClass:
         """Return the quota class of a host in an audit record. A text that is not an address counts as named."""

@@ -171,13 +171,18 @@ class Policy:
         return NO_LIMIT if part is None else self.limit(part, request.resource, request.host)
 
     def knows(self, address: Address) -> bool:
-        """Whether any rule includes this address. Requests from other addresses need not even be read.
+        """Whether any rule includes this address and the host is not blocked. Other hosts are unknown hosts.
 
-        If a section is in audit-only mode, every address is known, because its requests pass. A blocked host is not.
+        In audit-only mode without a rule that names a host, every host is known, because a robot is being learned.
         """
         if self.blocked(address) is not None:
             return False
-        return self._any_audit_only or not self.named.isdisjoint(self.hosts.atoms_of(address))
+        learned = self._any_audit_only and not self.named
+        return learned or not self.named.isdisjoint(self.hosts.atoms_of(address))
+
+    def serves(self, address: Address) -> bool:
+        """Whether requests of this address are read: it is known, or a section in audit-only mode lets them pass."""
+        return self.knows(address) or (self._any_audit_only and self.blocked(address) is None)
 
     def blocked(self, address: Address) -> Decision | None:
         """Return the denial of every request of a host that an operator blocks; None for any other host."""

@@ -383,9 +383,10 @@ AUDIT_READ_KINDS = QuotaRow(
 )
 AUDIT_BYTES = QuotaRow(
     thing="bytes of audit records that a host owes; its debt falls by 64 KiB a second",
-    bounds=Bounds(whole=1 << 40, host=16 << 20, unknown=0, kept=1 << 39),
+    bounds=Bounds(whole=1 << 40, host=16 << 20, unknown=16 << 20, kept=1 << 39),
     at_limit="the host's calls wait; a multicall's excess parts are rejected with the reason",
-    between="records of unknown hosts, whose calls are denied, are folded",
+    between="records of unknown hosts whose calls are denied are folded; in audit-only mode, where their calls pass,"
+    " all unknown hosts owe as one",
     alarm="`limit exceeded`",
     shown_by=(
         "unit/audit/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",

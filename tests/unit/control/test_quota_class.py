@@ -12,7 +12,7 @@ NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2"
 
 
 def test_the_class_follows_reloads_and_registrations() -> None:
-    """A rule that names the host, and then a registration, raise its class; without both it is unknown again."""
+    """A rule that names the host, and then a registration, raise its class; without the rule it is unknown again."""
     policies = [
         compile_policy("[Nodes]\n/a = 10.0.0.1\n", file="a.ini"),
         compile_policy("[Nodes]\n/a = 10.0.0.2\n", file="b.ini"),
@@ -21,10 +21,11 @@ def test_the_class_follows_reloads_and_registrations() -> None:
     quota_class = HostQuotaClass(lambda: policies[0], lambda host: registered.get(host, 0))
     assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.NAMED, QuotaClass.UNKNOWN)
     registered[OTHER] = 1
-    assert quota_class(OTHER) is QuotaClass.REGISTERED
-    registered.clear()
+    assert quota_class(OTHER) is QuotaClass.UNKNOWN  # in audit-only mode any host can register
     policies.reverse()
-    assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.NAMED)
+    assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.REGISTERED)
+    registered.clear()
+    assert quota_class(OTHER) is QuotaClass.NAMED
     assert quota_class(ipaddress.ip_address("127.0.0.1")) is QuotaClass.NAMED
 
 

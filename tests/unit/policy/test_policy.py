@@ -200,7 +200,22 @@ def test_unknown_address_is_known_as_such() -> None:
     assert not policy.knows(ipaddress.ip_address("10.8.8.8"))
     assert not policy.knows(ipaddress.ip_address("10.0.0.99"))
     assert compiled("[Clients]\ndefault = *\n").knows(ipaddress.ip_address("10.8.8.8"))
-    assert compiled("[Options]\naudit-only = all\n").knows(ipaddress.ip_address("10.8.8.8"))
+
+
+def test_audit_only_serves_every_host_and_still_knows_the_named_ones() -> None:
+    """Requests of other hosts pass, within the quotas of unknown hosts; a policy that names no host knows them all."""
+    unnamed, named = ipaddress.ip_address("10.8.8.8"), ipaddress.ip_address("10.0.0.5")
+    policy = compiled("[Nodes]\n/a = 10.0.0.5\n[Options]\naudit-only = Nodes\n")
+    assert [(policy.serves(host), policy.knows(host)) for host in (named, unnamed)] == [
+        (True, True),
+        (True, False),
+    ]
+    assert policy.counted_as(unnamed) == ""
+    empty = compiled("[Options]\naudit-only = all\n")
+    assert (empty.serves(unnamed), empty.knows(unnamed)) == (True, True)
+    blocked = replace(policy, blocks={unnamed: "blocked"})
+    assert not blocked.serves(unnamed)
+    assert not compiled("[Nodes]\n/a = 10.0.0.5\n").serves(unnamed)
 
 
 def test_memory_does_not_grow_with_requests() -> None:
