@@ -55,10 +55,9 @@ class ListenerLimits:
             ),
             connection_class=partial(connection_class_of, policy, quota_class),
         )
-        self.turns = Turns(
-            RVMASTER_REQUESTS.bounds, quota_class, lambda host: policy().alike(host), trail.pause
-        )
-        self.time = ProcessorTime(partial(class_of, policy, quota_class))
+        alike = partial(class_of, policy, quota_class)
+        self.turns = Turns(RVMASTER_REQUESTS.bounds, quota_class, alike, trail.pause, own_slots=True)
+        self.time = ProcessorTime(alike)
         self.first = NamedFirst(policy)
         self.own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
@@ -168,7 +167,7 @@ _UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
 
 
 def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> str:
-    """Return the class that is charged for a host's processor time.
+    """Return the class that is charged for a host's processor time, and that shares turns.
 
     The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
     `*` names share one class, or a second one if they have a registration.

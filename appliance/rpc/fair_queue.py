@@ -4,7 +4,8 @@ The slots for requests are a pool of `appliance/quotas`. A request without a fre
 host with the longest wait since its last turn; the number and duration of requests do not matter.
 
 Hosts that the policy names as one network are a *group*. A group shares one turn and at most half of the slots, so
-additional addresses in its network are useless.
+additional addresses in its network are useless. With `own_slots`, each group also has one slot of its own, unless its
+host is unknown. So a host that begins does not wait for long requests of guests that fill the slots.
 """
 
 import asyncio
@@ -36,12 +37,17 @@ class Turns:
         quota_class: Callable[[Address], QuotaClass],
         alike: Callable[[Address], Hashable] = itself,
         pause: Callable[[str], float] = lambda _host: 0.0,
+        *,
+        own_slots: bool = False,
     ) -> None:
         self.slots: Pool[Address] = Pool("requests being served", bounds, quota_class)
+        self._quota_class = quota_class
         self._alike = alike
         self.pause = pause
+        self._own_slots = own_slots
+        self._own: dict[Hashable, Address] = {}  # the host that has the own slot of its group
         self._together = max(bounds.host, bounds.whole // 2)
-        self._taken: dict[Hashable, int] = {}  # slots by group
+        self._taken: dict[Hashable, int] = {}  # slots by group, without its own
         self._taken_as: dict[Address, Hashable] = {}
         self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
@@ -83,7 +89,7 @@ class Turns:
     def _next(self) -> tuple[Hashable, Address] | None:
         """Take a slot for the next host, and return the host with its group. Return None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
-            if self._taken.get(kind, 0) < self._together:
+            if self._taken.get(kind, 0) < self._together or (self._own_slots and kind not in self._own):
                 for host in hosts:
                     if self._take(host, kind):
                         return kind, host
@@ -91,20 +97,25 @@ class Turns:
 
     def _take(self, host: Address, kind: Hashable) -> bool:
         kind = self._taken_as.get(host, kind)  # the group that the host's other slots are counted for
-        taken = self._taken.get(kind, 0)
-        if taken >= self._together or self.slots.take(host):
+        if self._own_slots and kind not in self._own and self._quota_class(host) is not QuotaClass.UNKNOWN:
+            self._own[kind] = host
+        elif self._taken.get(kind, 0) >= self._together or self.slots.take(host):
             return False
-        self._taken[kind] = taken + 1
+        else:
+            self._taken[kind] = self._taken.get(kind, 0) + 1
         self._taken_as[host] = kind
         return True
 
     def _give_back(self, host: Address) -> None:
-        self.slots.give_back(host)
         kind = self._taken_as[host]
-        self._taken[kind] -= 1
-        if not self._taken[kind]:
-            del self._taken[kind]
         if not self.slots.held(host):
+            del self._own[kind]
+        else:
+            self.slots.give_back(host)
+            self._taken[kind] -= 1
+            if not self._taken[kind]:
+                del self._taken[kind]
+        if not self.slots.held(host) and self._own.get(kind) != host:
             del self._taken_as[host]
 
     def _give_up(self, kind: Hashable, host: Address, turn: asyncio.Future[None]) -> None:

@@ -111,6 +111,49 @@ async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
     await asyncio.gather(*stuck, return_exceptions=True)
 
 
+async def test_a_host_that_begins_waits_for_no_guest() -> None:
+    """Guests with long requests fill the slots; each other host that the policy names is still served, one by one."""
+    guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(1, 5)]
+    turns = Turns(Bounds(8, 4, 2, 4), lambda host: QuotaClass(host not in guests[3:]), own_slots=True)
+    stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests for _ in range(16)]
+    await asyncio.sleep(0)
+    assert turns.slots.total == 4, "the slots of hosts without a registration are full"
+    assert sum(task.done() for task in stuck) == 4 + 3, (
+        "and three guests have one of their own, the unknown one has not"
+    )
+    newcomers = [HOST, OTHER]
+    for _ in range(3):
+        async with asyncio.timeout(WAIT):
+            for host in newcomers:
+                await turns.enter(host)
+        second = asyncio.create_task(turns.enter(HOST))
+        await asyncio.sleep(0)
+        assert not second.done(), "its second request waits like those of all others"
+        turns.leave(HOST)
+        await asyncio.sleep(0)
+        assert second.done(), "until its own slot is free again"
+        for host in newcomers:
+            turns.leave(host)
+    for task in stuck:
+        task.cancel()
+    await asyncio.gather(*stuck, return_exceptions=True)
+    assert not turns.waiting
+
+
+async def test_own_slots_balance() -> None:
+    """Whatever requests of two hosts of one group enter and leave, no slot is lost and none is added."""
+    turns = Turns(Bounds(4, 2, 0, 0), lambda _host: QuotaClass.NAMED, lambda _host: "group", own_slots=True)
+    for first, second in ((HOST, OTHER), (OTHER, HOST)):
+        for order in ((0, 1, 2), (1, 0, 2), (2, 1, 0), (2, 0, 1)):
+            inside = [first, second, first]
+            for host in inside:
+                await turns.enter(host)
+            assert turns.slots.total == 2
+            for one in order:
+                turns.leave(inside[one])
+            assert (turns.slots.total, dict(turns.waiting)) == (0, {})
+
+
 async def test_many_addresses_of_one_network_take_turns_as_one() -> None:
     """A hundred guests with a hundred requests each have half of the slots, and every second turn."""
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(100)]
