@@ -2,7 +2,7 @@
 
 Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a number.
 A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this process,
-which runs only those tests, until one fails. With `--all`, tests that are not of the gate count, too.
+which runs only those tests, until one fails. With `--all`, it also runs the tests that are left out of the gate.
 """
 
 import argparse
@@ -94,7 +94,7 @@ class _Switches(ast.NodeTransformer):
         return self._or(node, wrong, f"{node.value!r} -> {wrong.value!r}")
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
-        return node  # texts are no decisions
+        return node  # a text decides nothing
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST:
         text = ast.unparse(node)

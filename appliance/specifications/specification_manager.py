@@ -107,7 +107,7 @@ class _Consent(NamedTuple):
 
 
 _ALL = _Consent(force=True, hold=True)
-"""Of a rollback, which must never fail."""
+"""The consent for a rollback, which must never fail."""
 
 
 class SpecificationManager(Revisions[MonitorRevisionRow]):

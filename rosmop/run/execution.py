@@ -571,7 +571,7 @@ class MonitorExecution:
         self, error: Exception, monitor: MonitorInstance, otherwise: Position, outcome: Outcome
     ) -> None:
         fault: Fault = _fault_of(error, self._interpreter, monitor.name, otherwise)
-        # Bytes that are not a message are no observation: they reach nobody, as if they had not been sent.
+        # Bytes that are not a message observe nothing: they are dropped, as if they had not been sent.
         outdates = self._function not in self._judging and not isinstance(
             error, MalformedError | struct.error
         )

@@ -76,7 +76,7 @@ class Watch:
 
     def _clock(self, name: str, read: Callable[..., Any]) -> Callable[..., Any]:
         def reading(*arguments: Any) -> Any:
-            if self._watched and next(callers(2), "").startswith(_OURS):
+            if self._watched and next(callers(1), "").startswith(_OURS):
                 self._refuse(f"reads time.{name}")
             return read(*arguments)
 

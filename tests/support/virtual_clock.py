@@ -54,3 +54,10 @@ class ShiftedClock:
         present = clock.source()
         self.now_ns, self.since_boot_ns = present.now_ns, present.since_boot_ns
         self.wall_ns = lambda: present.wall_ns() + round(ahead * _SECOND)
+
+
+def let_time_pass(seconds: float) -> None:
+    """Advance the virtual clock of the present context."""
+    present = clock.source()
+    assert isinstance(present, VirtualClock)
+    present.advance(seconds)

@@ -6,9 +6,9 @@ from appliance.channel.messages.message import Message
 
 
 class StateOwner(msgspec.Struct, frozen=True):
-    """What a monitor's state belongs to, as a digest; whether the monitor holds its topics if the state is lost.
+    """A monitor, by the digest that its state has, and whether it holds its topics if the state is lost.
 
-    `position` is the monitor's, as text.
+    `position` is where the file declares it, as text.
     """
 
     identity: str

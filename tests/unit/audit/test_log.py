@@ -256,6 +256,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         yield place
 
 
+@pytest.mark.nightly
 def test_full_disk(disk: Path) -> None:
     """With a full disk the log reports the failure, keeps its queue, and writes the queue once there is space."""
     path = disk / "audit.db"
@@ -286,6 +287,7 @@ def test_full_disk(disk: Path) -> None:
     assert verify(path).ok
 
 
+@pytest.mark.nightly
 def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
     """Standard error names the failure with file and reason, and later the recovery."""
     filler = disk / "filler"
@@ -308,6 +310,7 @@ def test_failure_and_recovery_are_printed_once(disk: Path) -> None:
     assert "full" in said[0]["reason"]
 
 
+@pytest.mark.nightly
 def test_the_queue_is_bounded_and_losses_are_counted(disk: Path, time: VirtualClock) -> None:
     """Records that do not fit in the queue while the disk is full are counted, and the count is recorded."""
     path = disk / "audit.db"

@@ -40,8 +40,7 @@ def test_a_wrong_automaton_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_no_relay_gets_a_wrong_module(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process that compiles refuses the specification."""
-    compiled = encoded(compiled_from({"guard.rv": GUARD}, standard_definitions()))
-    assert parts(compiled, [PartNames(("guard",))])
     monkeypatch.setattr(batch_codegen.TopicCodegen, "_handle", lambda *_: b"")
+    compiled = encoded(compiled_from({"guard.rv": GUARD}, standard_definitions()))
     with pytest.raises(SpecificationsRefusedError, match="this is a defect of the monitor compiler"):
         parts(compiled, [PartNames(("guard",))])

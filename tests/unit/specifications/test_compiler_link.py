@@ -17,7 +17,7 @@ from appliance.specifications.specification_files import Sources, Specifications
 SOURCES = Sources({"a.rv": "text"})
 FOUND = messages.Contents({"a": "a.rv"})
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 
 class Scene:

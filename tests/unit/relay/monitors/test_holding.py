@@ -45,7 +45,7 @@ SENSOR = "event s(int n) /sensor std_msgs/Int32 '{data:n}' { near = 1 / n > 0; }
 DRIVE = "event d() /cmd_vel geometry_msgs/Twist '{}' { if (near) { return; } }"
 
 
-def test_control_is_told_once_of_a_monitor_that_holds_after_a_fault(monitors: QuietMonitors) -> None:
+def test_a_monitor_that_holds_after_a_fault_is_reported_once(monitors: QuietMonitors) -> None:
     """With the reason; then no further message of its topics reaches it."""
     monitors.load(f"s() {{ bool near; {SENSOR} {DRIVE} }}")
     told = len(monitors.reports.sent)

@@ -1,6 +1,5 @@
 """The state of monitors outlives the relay: after a kill at any batch, the next process continues it."""
 
-import time
 from dataclasses import replace
 from random import Random
 
@@ -8,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from appliance.base import clock
 from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.state_keeper import StateKeeper, received_states
 from rosmop.check.sources import compiled_from
@@ -19,10 +19,11 @@ from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from roswire.standard import standard_definitions
 from tests.support.examples import examples
+from tests.support.virtual_clock import let_time_pass
 
 FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck), deadline=None)
 SIZE = 1 << 20
-GIVEN = StateGiven(True, "boot", time.time_ns() - time.monotonic_ns())
+GIVEN = StateGiven(True, "boot", 1_789_999_000_000_000_000)
 
 STOP = """{modifier} stop() {{
     bool pressed = false; {more}
@@ -107,7 +108,7 @@ def drives(monitors: MonitorSet) -> str:
 OTHERS = {
     "a power cut": StateGiven(True, "another boot", GIVEN.offset),
     "the clock was set": StateGiven(True, "boot", GIVEN.offset + 3_000_000_000),
-    "the clock was set back": StateGiven(True, "next", GIVEN.offset, "boot", time.time_ns() + 10**15),
+    "the clock was set back": StateGiven(True, "next", GIVEN.offset, "boot", GIVEN.offset + 10**18),
 }
 
 
@@ -131,7 +132,7 @@ def test_an_orderly_end_outlives_the_machine() -> None:
     first = stop()
     press(first, begun(first, memory))
     second = stop()
-    begun(second, memory, StateGiven(True, "next", GIVEN.offset, "boot", time.time_ns()))
+    begun(second, memory, StateGiven(True, "next", GIVEN.offset, "boot", GIVEN.offset + clock.now_ns()))
     assert second.began == ()
     assert drives(second) == "dropped"
     assert not second.monitor("stop").held
@@ -189,6 +190,7 @@ def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
     older, newer = bytearray(SIZE), bytearray(SIZE)
     first = stop()
     begun(first, older)
+    let_time_pass(1)
     press(second := stop(), begun(second, newer, OTHERS["a power cut"]))
     for memories in ([older, newer], [newer, older]):
         keeper = StateKeeper(GIVEN, bytearray(SIZE), memories)
@@ -280,7 +282,7 @@ def test_the_other_appliance_goes_on_with_the_state_that_was_left() -> None:
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)
     second = stop()
-    received = received_states([b"", keeper.content()], time.time_ns())
+    received = received_states([b"", keeper.content()], GIVEN.offset + clock.now_ns())
     second.recover(received.groups, received.lost, 0)
     assert second.began == ()
     assert drives(second) == "dropped"
@@ -293,7 +295,7 @@ def test_a_state_that_was_left_wrongly_is_lost(wrong: str) -> None:
     first = stop()
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)
-    content, now = keeper.content(), time.time_ns()
+    content, now = keeper.content(), GIVEN.offset + clock.now_ns()
     second = stop()
     received = received_states(
         [content[: len(content) // 2]] if wrong == "damaged" else [content],
