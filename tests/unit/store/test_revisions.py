@@ -1,11 +1,11 @@
 """Which kept revision a rollback takes, and what a time limit leaves in the store."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from appliance.base import clock
 from appliance.store import revisions
 from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
@@ -90,12 +90,12 @@ async def test_the_error_names_the_missing_and_the_stored_revisions(
 @pytest.mark.nightly
 async def test_two_unconfirmed_changes_roll_back_to_the_last_confirmed_one(keeper: Keeper) -> None:
     """The limit starts again with the second change; a change without a limit ends it."""
-    begun = time.time()
+    begun = clock.wall()
     for number, within in ((8, 300.0), (9, 600.0)):
         keeper.change(row(number), within)
         back_to, deadline, length = keeper.limit()
         assert (back_to, float(length)) == ("7", within)
-        assert begun + within <= float(deadline) <= time.time() + within
+        assert begun + within <= float(deadline) <= clock.wall() + within
         assert keeper.confirm_by == float(deadline)
     keeper.change(row(10))
     assert (keeper.limit(), keeper.confirm_by, keeper.going_back) == ([], None, None)
