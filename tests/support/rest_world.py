@@ -149,14 +149,18 @@ class RestWorld:
         ]  # fmt: skip
 
     def asked(
-        self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None
-    ) -> httpx.Response:
-        """Return the answer to a request by a role (None: without a token), after its record was made."""
+        self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None,
+        *, kind: str = "text/plain",
+    ) -> httpx.Response:  # fmt: skip
+        """Return the answer to a request by a role (None: without a token), after its record was made.
+
+        A body that is a text or bytes has the content type `kind`; any other is sent as JSON.
+        """
         headers = {} if role is None else {"Authorization": f"Bearer {self.tokens.texts[role]}"}
         headers |= {} if tag is None else {"If-Match": tag}
         given: dict[str, Any] = {"json": body}
-        if isinstance(body, str):
-            headers["Content-Type"] = "text/plain"
+        if isinstance(body, str | bytes):
+            headers["Content-Type"] = kind
             given = {"content": body}
         self._ends[0].messages.clear()
         self.trail.records.clear()

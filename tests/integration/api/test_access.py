@@ -46,16 +46,6 @@ def test_a_revoked_token_ends_at_once(running: Appliance, rest: Rest) -> None:
     assert "no token 'leaver'" in again.stderr
 
 
-def test_an_expired_token_ends(running: Appliance, rest: Rest) -> None:
-    """An expired token is 401, and the answer says so."""
-    client = rest.with_token(new_token(running, "short", "viewer", "0.2m"))
-    events = client.events("/v1/audit/stream?event=nothing")
-    assert list(events)[-1]["event"] == "end"  # waits until the token ends
-    answer = client.get("/v1/status")
-    assert answer.status == 401
-    assert "expired" in answer.json["detail"]
-
-
 def test_a_body_too_large_is_refused_unread(rest: Rest) -> None:
     """A length beyond the limit is answered before the body is sent; chunked bodies are limited as well."""
     connection = rest.connect()

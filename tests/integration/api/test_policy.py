@@ -3,7 +3,6 @@
 import json
 import re
 import threading
-import time
 import xmlrpc.client
 from collections.abc import Iterator
 from pathlib import Path
@@ -218,22 +217,6 @@ def test_check_asks_the_appliance_for_enrolled_hosts(appliance: Appliance, tmp_p
     assert (stopped.returncode, "checked without it" in stopped.stderr) == (0, True)
 
 
-def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None:
-    """Every change with the ETag of an older revision is refused (412)."""
-    rest = appliance.rest()
-    changes = [
-        ("/v1/policy", {"text": OPEN_POLICY}), ("/v1/policy/rollback", {}), ("/v1/policy/reload", None),
-        ("/v1/policy/confirm", None),
-    ]  # fmt: skip
-    first = in_force(rest)
-    assert rest.get("/v1/policy").etag == tag(first)
-    assert rest.post("/v1/policy", WITHOUT_PUBLISHERS, match=tag(first)).etag == tag(first + 1)
-    for path, body in changes:
-        assert rest.post(path, body, match=tag(first)).status == 412, path
-    assert in_force(rest) == first + 1
-    assert rest.post("/v1/policy/rollback", {}, match=tag(first + 1)).status == 200
-
-
 def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
     """A text that fails FILE.tests.yaml is refused with the position of the case, also as a dry run."""
     cases = cases_of(appliance)
@@ -247,43 +230,6 @@ def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
         assert (finding["file"], finding["line"]) == (str(cases), 4)
         assert "expected allow" in finding["text"]
     assert rest.post("/v1/policy", OPEN_POLICY, match=present).status == 200
-
-
-def test_an_unconfirmed_change_is_rolled_back(appliance: Appliance) -> None:
-    """A change with confirm_within is rolled back unless it is confirmed in time."""
-    rest = appliance.rest()
-    first = in_force(rest)
-    events = rest.events("/v1/audit/stream?event=policy%20*")
-    next(events)
-    asked = time.time()
-    brief = rest.post("/v1/policy?confirm_within=1", WITHOUT_PUBLISHERS, match=tag(first))
-    assert asked + 1 <= brief.json["confirm_by"] <= time.time() + 1
-    back = next(one for one in events if "rolled back" in one.get("data", ""))
-    assert json.loads(back["data"])["detail"]["who"] == "not confirmed in time"
-    assert register(appliance.master_uri, "/cmd_vel")[0] == 1
-    kept = rest.post("/v1/policy?confirm_within=3600", WITHOUT_PUBLISHERS, match=tag(first + 2))
-    assert rest.get("/v1/policy").json["confirm_by"] == kept.json["confirm_by"]
-    confirmed = rest.post("/v1/policy/confirm", match=tag(first + 3))
-    assert confirmed.json == {"confirmed": True, "revision": first + 3}
-    assert rest.get("/v1/policy").json["confirm_by"] is None
-
-
-def test_revisions_are_kept_and_restored(appliance: Appliance) -> None:
-    """All revisions are listed with author and text; a rollback makes a new revision of an old text."""
-    rest = appliance.rest()
-    rest.post("/v1/policy/reload", match="*")
-    first = in_force(rest)
-    rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "trial"}, match=tag(first))
-    back = rest.post("/v1/policy/rollback", {"revision": first}, match=tag(first + 1))
-    assert back.json["revision"] == first + 2
-    rows = rest.get("/v1/policy/revisions").json["revisions"]
-    assert [(one["revision"], one["who"], one["in_force"]) for one in rows[:3]] == [
-        (first + 2, "first", True), (first + 1, "first", False), (first, "disk", False),
-    ]  # fmt: skip
-    assert rows[1]["note"] == "trial"
-    assert rest.get(f"/v1/policy/revisions/{first + 1}").json["text"] == WITHOUT_PUBLISHERS
-    assert rest.get("/v1/policy/revisions/7777").status == 404
-    assert rest.post("/v1/policy/rollback", {"revision": 7777}, match=tag(first + 2)).status == 422
 
 
 @pytest.mark.real
@@ -333,28 +279,6 @@ def test_explain_returns_the_same_as_the_command(running: Appliance, rest: Rest)
         "host=robot&category=publish&resource=/a",
     ):
         assert rest.get(f"/v1/policy/explain?{bad}").status == 422
-
-
-@pytest.mark.parametrize(
-    ("body", "kind", "status"),
-    [
-        (b"[Nodes]\n", "application/x-www-form-urlencoded", 415),
-        (b"[Nodes]\n", "", 415),
-        (b'{"text": \n oops}', "application/json", 422),
-        (b'{"txt": "[Nodes]"}', "application/json", 422),
-        (b"[" * 100_000, "application/json", 422),
-        (b"\xff\xfe", "text/plain", 422),
-        (b"", "text/plain", 422),
-    ],
-)
-def test_an_invalid_body_is_reported(rest: Rest, body: bytes, kind: str, status: int) -> None:
-    """Every invalid body (such as a wrong type, broken JSON, an unknown field, an empty text) has its own error."""
-    headers = {"If-Match": "*"} | ({"Content-Type": kind} if kind else {})
-    answer = rest.request("POST", "/v1/policy", body, headers)
-    assert answer.status == status
-    assert answer.json["detail"]
-    if b"oops" in body:
-        assert (answer.json["line"], answer.json["column"]) == (2, 2)
 
 
 def reported(rest: Rest) -> dict[str, Any] | None:

@@ -287,6 +287,94 @@ def test_a_rejection_by_control_is_a_problem(
     assert (record["decision"], record["status"]) == ("deny", status)
 
 
+BODIES = [one for one in REQUESTS if one[2] is not None]
+
+
+@pytest.mark.parametrize("sent", BODIES, ids=[f"{one[0]} {one[1]} {n}" for n, one in enumerate(BODIES)])
+def test_an_invalid_body_changes_nothing(sent: tuple[str, str, Any]) -> None:
+    """A wrong type of content, broken JSON, text that is not UTF-8 and an unknown field have an explanation each."""
+    method, target, body = sent
+    role = "investigator" if target == "/v1/recordings/memory" else "admin"
+    text = target.partition("?")[0] == "/v1/policy" or (method, target[:13]) == ("PUT", "/v1/monitors/")
+    other = (415, "wrong-type") if text else (422, "bad-input")
+    more = json.dumps({**(body if isinstance(body, dict) else {"text": body}), "unknown": 1}).encode()
+    wrong: list[tuple[bytes, str, tuple[int, str]]] = [
+        (b"x", "application/x-www-form-urlencoded", other),
+        (b"x", "", other),
+        (b'{"text": \n oops}', "application/json", (422, "not-json")),
+        (b"[" * 100_000, "application/json", (422, "not-json")),
+        (b'{"note": "\xff"}', "application/json", (422, "bad-input")),
+        (more, "application/json", (422, "bad-input")),
+    ]
+    wrong += [(content, "text/plain", (422, "bad-input")) for content in (b"", b"\xff")] * text
+    for content, kind, problem in wrong:
+        answer = world().asked(method, target, content, role, "*", kind=kind)
+        assert answer.status_code == problem[0], (content[:50], kind, answer.text)
+        require_problem(answer, *problem)
+        assert not world().made
+        if b"oops" in content:
+            assert (answer.json()["line"], answer.json()["column"]) == (2, 2)
+
+
+WRONG: dict[str, list[Any]] = {
+    "POST /v1/hosts": [
+        {"name": "laptop"} | wrong
+        for wrong in (
+            {"name": "../a"}, {"endpoint": "a b"}, {"how": "post"}, {"days": 0}, {"open": ["ssh"]}, {"ports": "70000"},
+        )
+    ],
+    "PATCH /v1/monitors/a": [
+        {}, {"held": True}, {"enabled": True, "held": False}, {"enabled": "yes"}, {"shadow": 1},
+        {"shadow": False, "enabled": True},
+    ],
+    "POST /v1/monitors": [
+        {"files": {}}, {"files": {"../a.rv": ""}}, {"files": {"a.txt": ""}}, {"files": {".rv": ""}},
+        {"files": FILES, "note": "x" * 201}, {"files": FILES, "definitions": {"../T.msg": ""}},
+        {"files": {"a.rv": 7}},
+    ],
+    "POST /v1/policy?confirm_within=0": ["x"],
+    "POST /v1/policy?confirm_within=nan": ["x"],
+    "POST /v1/policy/rollback": [{"revision": 0}],
+    "PUT /v1/hosts/a/ports": [{"state": "ajar"}],
+    "POST /v1/blocks": [{"address": "10.0.0.7", "for_seconds": -1}],
+    "DELETE /v1/recordings/x": [None],
+    "DELETE /v1/monitors": [None],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("method", "target", "body"), [(*call.split(), body) for call, bodies in WRONG.items() for body in bodies]
+)
+def test_a_field_out_of_bounds_changes_nothing(method: str, target: str, body: Any) -> None:
+    """Control does not get the order."""
+    answer = world().asked(method, target, body, tag="*")
+    assert answer.status_code in (404, 422), answer.text
+    assert answer.json()["detail"]
+    assert not world().made
+
+
+@pytest.mark.parametrize("path", ["/v1/monitors", "/v1/policy", "/v1/policy/explain", "/v1/policy/rollback"])
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"[" * 500_000, b'{"a":' * 100_000, b'{"files":{' + b'"x":{' * 50_000,
+        b'{"text":' + b"9" * 300_000 + b"}",
+        b"1e" + b"9" * 100_000, b'{"a":1,' * 90_000, b'"\\ud800"', b"\xef\xbb\xbf{}",
+        b'{"files":{' + b",".join(b'"f%d.rv":""' % one for one in range(50_000)) + b"}}",
+    ],
+    ids=[
+        "deep", "deep objects", "deep files", "long number", "huge exponent", "no end", "surrogate", "bom",
+        "many files",
+    ],
+)  # fmt: skip
+def test_hostile_json_is_rejected(path: str, body: bytes) -> None:
+    """Deep, long, endless and invalid JSON is a problem, and no order."""
+    answer = world().asked("POST", path, body, "admin", "*", kind="application/json")
+    assert answer.status_code in (413, 415, 422), answer.text[:300]
+    assert answer.headers["content-type"] == "application/problem+json"
+    assert not world().made
+
+
 def require_problem(answer: httpx.Response, status: int, kind: str) -> None:
     """Fail unless an answer is a problem document (RFC 9457) of this kind with an explanation."""
     assert answer.headers["content-type"] == "application/problem+json"

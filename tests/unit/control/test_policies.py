@@ -369,3 +369,34 @@ async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> Non
         assert again.confirm_by == first.confirm_by
         assert policies.in_force.who == "adam"
         assert (await policies.load(PolicyLoad(OPEN), "adam")).revision == 3
+
+
+async def test_a_change_for_an_earlier_revision_is_refused(tmp_path: Path) -> None:
+    """Two engineers cannot overwrite each other's changes, whichever way they change the policy."""
+    with Appliance(tmp_path).started() as policies:
+        seen = policies.revision
+        await policies.load(PolicyLoad(OTHER, expected=seen), "alice")
+        for change in (
+            policies.load(PolicyLoad(OPEN, expected=seen), "bob"),
+            policies.roll_back(PolicyRollback(expected=seen), "bob"),
+            policies.reload(PolicyReload(expected=seen), "bob"),
+            policies.confirm(PolicyConfirm(expected=seen), "bob"),
+        ):
+            with pytest.raises(RevisionChangedError):
+                await change
+        assert (policies.revision, policies.current.text) == (seen + 1, OTHER)
+
+
+async def test_revisions_have_their_authors_and_notes(tmp_path: Path) -> None:
+    """A rollback makes a new revision of an old text; a revision that is not kept is an error."""
+    with Appliance(tmp_path).started() as policies:
+        await policies.load(PolicyLoad(OTHER, note="trial"), "alice")
+        await policies.roll_back(PolicyRollback(1), "bob")
+        rows = (await policies.revisions(PolicyRevisions())).revisions
+        assert [(row.revision, row.who, row.in_force) for row in rows] == [
+            (3, "bob", True), (2, "alice", False), (1, "disk", False),
+        ]  # fmt: skip
+        assert rows[1].note == "trial"
+        assert (await policies.text(PolicyWanted(2))).text == OTHER
+        with pytest.raises(PolicyRefusedError):
+            await policies.roll_back(PolicyRollback(7777), "bob")
