@@ -25,7 +25,7 @@ from appliance.channel.answers.host_answers import Endpoint, KitParts
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.channel.messages.api import ApiLink, RequestMade, TokenKept
+from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.administration import Administration
 from appliance.control.request_methods import request_methods
@@ -167,15 +167,19 @@ class RestWorld:
         self.part.carried_out.clear()
         return self.play(lambda: sent(self.gate, method, target, headers=headers, **given))
 
-    def bypassing(self, request: AdminRequest[Any], role: str) -> None:
-        """Send control an order with a token, as a compromised api would, without the client's HTTP request."""
+    def bypassing(
+        self, request: AdminRequest[Any], role: str, asked: ClientRequest | None = None
+    ) -> dict[str, Any]:
+        """Send control an order with a token, as a compromised api would; return its only record."""
         self.trail.records.clear()
         self.part.carried_out.clear()
 
         async def play() -> None:
-            self._ends[1].send(RequestMade(10_000, request, self.tokens.texts[role]))
+            self._ends[1].send(RequestMade(10_000, request, self.tokens.texts[role], asked))
 
         self.play(play)
+        [record] = self.trail.records
+        return record
 
     def play(self, what: Callable[[], Awaitable[T]]) -> T:
         """Run something, and what follows from it."""

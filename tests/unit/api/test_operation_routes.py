@@ -232,21 +232,26 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
 
 @pytest.mark.parametrize("request_type", sorted(CHANGES, key=str), ids=lambda one: one.__name__)
 def test_control_itself_denies_what_the_api_should_have_denied(request_type: type[AdminRequest[Any]]) -> None:
-    """An order of a compromised api, without a client's request, is refused and recorded with a token of any role."""
+    """An order without its request, or with a request for another order, is refused and recorded for any role."""
     made = next(
         made.request
         for made in (ordered(method, target, body) for method, target, body in REQUESTS)
         if type(made.request) is request_type
     )
-    for role in ROLES:
-        world().bypassing(made, role)
-        assert not world().part.carried_out
-        [record] = world().trail.records
-        assert (record["event"], record["decision"], record["who"]) == (
-            "order refused",
-            "deny",
-            f"a-{role}",
-        ), role
+    another = (
+        ("POST", "/v1/policy/confirm", None)
+        if "Policy" not in request_type.__name__
+        else ("POST", "/v1/recordings", {})
+    )
+    for asked in (None, ordered(*another).asked):
+        for role in ROLES:
+            record = world().bypassing(made, role, asked)
+            assert (record["event"], record["decision"], record["who"]) == (
+                "order refused",
+                "deny",
+                f"a-{role}",
+            )
+            assert not world().part.carried_out
 
 
 REJECTIONS = (
