@@ -146,7 +146,7 @@ class _Summary:
     def of(self, monitors: MonitorSet, reader: Reader, notes: list[str]) -> Replayed:
         counts = {"passed": 0, "changed": 0, "dropped": 0}
         for step in replay(monitors, reader, None, self._job.topics, self._job.span):
-            if step.topic is not None:
+            if step.index is not None:
                 counts[step.outcome.result] += 1
             for found in _found(step.outcome):
                 self._add(step, found)

@@ -41,16 +41,19 @@ def _without_code(file: tree.SpecificationFile) -> tree.SpecificationFile:
 
 def _idle(specification: tree.Specification) -> tree.Specification:
     events = tuple(
-        replace(
-            event,
-            modifiers=(),
-            parameters=(),
-            trigger=replace(event.trigger, pattern=(), when=None),
-            action=replace(event.action, statements=()),
-        )
-        for event in specification.events
+        replace(event, action=replace(event.action, statements=())) for event in specification.events
+    )
+    observing = tuple(
+        replace(event, modifiers=(), parameters=(), trigger=replace(event.trigger, pattern=(), when=None))
+        for event in events
         if isinstance(event.trigger, tree.MessageTrigger)
     )
     return replace(
-        specification, parameters=(), declarations=(), functions=(), inits=(), events=events, properties=()
+        specification,
+        parameters=(),
+        declarations=(),
+        functions=(),
+        inits=(),
+        events=observing or events,
+        properties=(),
     )

@@ -17,6 +17,7 @@ from rosmop.check.function_bodies import (
     declare_functions,
     declare_variables,
 )
+from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
@@ -85,6 +86,7 @@ def _compile_all(
         if code is not None:
             compiled.append(code)
     _check_types(shared, compiled)
+    shared.findings += bypassing(compiled, shared.publications, shared.functions)
     return compiled
 
 

@@ -22,11 +22,15 @@ _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not 
 
 @dataclass(frozen=True)
 class ReplayStep:
-    """The outcome of one message or, without a topic, of a tick or deadline."""
+    """The outcome of one message or, without a topic, of a tick or deadline.
+
+    A message without an index was published by the monitor `publisher`, and has gone through the monitors behind it.
+    """
 
     outcome: Outcome
     index: int | None = None
     topic: str | None = None
+    publisher: str = ""
 
 
 # Topic, type, definition, md5sum, caller, latching
@@ -61,11 +65,13 @@ class OutputBag:
 
     def publish(self, outcome: Outcome) -> None:
         """Write the messages that monitors published."""
-        for message in outcome.published:
+        for message in outcome.sent():
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
             header = (message.topic, f"{package}/msg/{kind}", text, digest, _OWN, None)
             self._write(header, outcome.time, message.data)
+        for judged in outcome.judged.values():
+            self.publish(judged)
 
     def _write(self, header: _Header, time_ns: int, data: bytes) -> None:
         if header not in self._connections:
@@ -120,12 +126,20 @@ def replay(
         for earlier in outcome.before:
             if output is not None:
                 output.publish(earlier)
-            yield ReplayStep(earlier)
+            yield from _steps(ReplayStep(earlier))
         if output is not None:
             if outcome.result != "dropped":
                 output.relay(connection, time_ns, bytes(outcome.buffer))
             output.publish(outcome)
-        yield ReplayStep(outcome, index, connection.topic)
+        yield from _steps(ReplayStep(outcome, index, connection.topic))
+
+
+def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
+    """Yield a step, and the steps of messages that monitors published in it."""
+    yield step
+    for number, judged in step.outcome.judged.items():
+        message = step.outcome.published[number]
+        yield from _steps(ReplayStep(judged, None, message.topic, message.monitor))
 
 
 class _ExplainOnce:

@@ -18,6 +18,7 @@ Theory of operation:
 
 import sys
 import weakref
+from bisect import bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -189,6 +190,9 @@ class MonitorSet:
         self._beginnings: dict[str, bytes] = {}
         """The known initial states of the monitors that guard topics, as returned by `shape`."""
         self.steps: dict[str, tuple[Step, ...]] = {}
+        self._place_of = {name: place for place, name in enumerate(self.names)}
+        self._places: dict[str, list[int]] = {}
+        """The places of the specifications of `steps`, in the order of all specifications."""
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
@@ -518,6 +522,8 @@ class MonitorSet:
             for timer in monitor.timers:
                 timer.due = None if awaited else time_ns + timer.period
         self._broken = any(monitor.broken for monitor in self._monitors)
+        if outcome.published:
+            self._judge_published(outcome)
         self._agenda.schedule()
         return outcome
 
@@ -631,9 +637,11 @@ class MonitorSet:
         if self._agenda.has_come(time_ns):
             outcome.before = self.advance(time_ns)
         if steps:
+            ticked = len(outcome.before)
             self._execution.message(steps, buffer, outcome, sender)
-            if outcome.faults:
-                self._after_faults(outcome)
+            for deadline in outcome.before[ticked:]:
+                self._follow_up(deadline)
+            self._follow_up(outcome)
             self._agenda.schedule()
         return outcome
 
@@ -682,9 +690,32 @@ class MonitorSet:
         """Process the ticks up to this time and the deadlines before it, in the order of their times."""
         outcomes = self._agenda.advance(time_ns)
         for outcome in outcomes:
-            if outcome.faults:
-                self._after_faults(outcome)
+            self._follow_up(outcome)
         return outcomes
+
+    def _follow_up(self, outcome: Outcome) -> None:
+        if outcome.faults:
+            self._after_faults(outcome)
+        if outcome.published:
+            self._judge_published(outcome)
+
+    def _judge_published(self, outcome: Outcome) -> None:
+        """Give published messages to the monitors behind their publisher, whose own go to those behind them.
+
+        As each message goes only to monitors further behind, there is no loop.
+        """
+        judged: dict[int, Outcome] = {}
+        for number, message in enumerate(outcome.published):
+            places = self._places.get(message.topic, ())
+            behind = self.steps.get(message.topic, ())[
+                bisect_right(places, self._place_of[message.monitor]) :
+            ]
+            if behind:
+                judged[number] = one = Outcome(bytearray(message.data), outcome.time)
+                self._execution.message(behind, one.buffer, one, NOBODY, published=True)
+                self._follow_up(one)
+        if judged:
+            outcome.judged = judged
 
     def _after_faults(self, outcome: Outcome) -> None:
         """Handle monitors that cannot judge, because an event that keeps a state up to date has faulted.
@@ -738,8 +769,13 @@ class MonitorSet:
         steps: dict[str, list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
         standing |= {shadow.names[0]: self._taps(shadow) for shadow in self.shadows}
-        for step in (step for name in self.names for step in standing.get(name, ())):
+        places: dict[str, list[int]] = {}
+        for place, step in (
+            (place, step) for place, name in enumerate(self.names) for step in standing.get(name, ())
+        ):
             steps.setdefault(step.event.channel or "", []).append(step)
+            places.setdefault(step.event.channel or "", []).append(place)
+        self._places = places
         for found in steps.values():
             acting = [step for step in found if not isinstance(step, _Tap)]
             for place, step in enumerate(acting):

@@ -88,12 +88,24 @@ class MonitorExecution:
         self.collect(outcome)
         return outcome
 
-    def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: MessageSender) -> None:
-        """Process a message received at the time of the outcome; `steps` is not empty."""
+    def message(
+        self,
+        steps: Sequence[Step],
+        buffer: Buffer,
+        outcome: Outcome,
+        sender: MessageSender,
+        *,
+        published: bool = False,
+    ) -> None:
+        """Process a message received at the time of the outcome; `steps` is not empty.
+
+        A message that a monitor has `published` has what is left of the time of the message that caused it.
+        """
         steps[0].monitor.move_to_python()
         steps[0].monitor.touch()
         self._turn.now = outcome.time
-        self._turn.begin()
+        if not published:
+            self._turn.begin()
         self._sender = sender
         self._taking_back.clear()
         self._trailed.clear()

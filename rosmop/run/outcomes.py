@@ -136,6 +136,9 @@ class Outcome:
 
     `began_holding` are the monitors that hold their topics from now on, because of a fault.
 
+    `judged` has the outcomes of the published messages that have gone through the monitors behind their publisher, by
+    their indices in `published`.
+
     `looked` are the conditions that were met during processing, by site, with the values that they compared. They are
     each `when` of an event that happened, and each `if` around a statement that dropped, changed or published a
     message.
@@ -164,6 +167,7 @@ class Outcome:
     handling: Mapping[int, Verdict] = MappingProxyType({})
     looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
     began_holding: Sequence[str] = ()
+    judged: Mapping[int, "Outcome"] = MappingProxyType({})
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
 
@@ -176,6 +180,15 @@ class Outcome:
         if not buffer.readonly:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
+
+    def sent(self) -> Iterator[Published]:
+        """Yield the published messages as they go out: without those that were dropped, and as they were changed."""
+        for number, message in enumerate(self.published):
+            judged = self.judged.get(number)
+            if judged is None:
+                yield message
+            elif judged.result != "dropped":
+                yield message._replace(data=bytes(judged.buffer))
 
     @property
     def conditions(self) -> dict[str, dict[str, object]]:

@@ -20,11 +20,13 @@ def say_finding(finding: Diagnostic, *, as_json: bool) -> None:
     say_json({**asdict(finding.position), "severity": finding.severity, "text": finding.text})
 
 
-def record(outcome: Outcome, index: int | None = None, topic: str | None = None) -> dict[str, object]:
-    """Return the JSON record of a message, or of a tick or deadline."""
-    head: dict[str, object] = (
-        {"index": index, "topic": topic} if topic is not None else {"timer": outcome.timer}
-    )
+def record(
+    outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
+) -> dict[str, object]:
+    """Return the JSON record of a message (of the recording, or of a monitor), or of a tick or deadline."""
+    head: dict[str, object] = {"timer": outcome.timer}
+    if topic is not None:
+        head = {"publisher": publisher, "topic": topic} if publisher else {"index": index, "topic": topic}
     head["time"] = outcome.time / BILLION
     head["outcome"] = outcome.result
     return head | {
@@ -63,10 +65,13 @@ def _fault(fault: Fault) -> dict[str, object]:
     return {**asdict(fault.position), "text": fault.text, "values": dict(fault.values)}
 
 
-def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) -> Iterator[str]:
+def lines(
+    outcome: Outcome, index: int | None = None, topic: str | None = None, publisher: str = ""
+) -> Iterator[str]:
     """Yield the lines for a person. A message without an outcome to report has no lines."""
     seconds = f"{outcome.time / BILLION:.3f}"
-    head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} #{index} {topic}"
+    number = f"published by {publisher}:" if publisher else f"#{index}"
+    head = f"{seconds} {outcome.timer}" if topic is None else f"{seconds} {number} {topic}"
     if topic is not None and outcome.result != "passed":
         yield f"{head}: {outcome.result}" + (f" ({outcome.reason})" if outcome.reason else "")
     for verdict in outcome.verdicts:

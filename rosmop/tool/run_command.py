@@ -110,14 +110,14 @@ def _report(monitors: MonitorSet, reader: Reader, recording: OutputBag | None, *
     with progress("replaying", lambda: reader.message_count, shares_screen=True) as advance:
         for number, replayed in enumerate(replay(monitors, reader, recording)):
             outcome = replayed.outcome
-            if replayed.topic is not None:
+            if replayed.index is not None:
                 counts[outcome.result] += 1
             verdicts += len(outcome.verdicts)
             faults += len(outcome.faults)
             if as_json:
-                say_json(record(outcome, replayed.index, replayed.topic))
+                say_json(record(outcome, replayed.index, replayed.topic, replayed.publisher))
             else:
-                for line in lines(outcome, replayed.index, replayed.topic):
+                for line in lines(outcome, replayed.index, replayed.topic, replayed.publisher):
                     say(line)
             if not number % _PROGRESS_EVERY:
                 advance(sum(counts.values()))

@@ -133,7 +133,20 @@ class Observer:
                 after=published.data[:SHOWN],
                 size=len(published.data),
             )
-            self._publish(published.topic, published.data)
+            self._send(outcome, number, point)
+
+    def _send(self, outcome: Outcome, number: int, point: ObservationPoint) -> None:
+        """Publish a message, unless a monitor behind its publisher has dropped it; report what those monitors did."""
+        published, judged = outcome.published[number], outcome.judged.get(number)
+        if judged is not None:
+            there = _of_publication(point, published.topic)
+            self.report(judged, there)
+            if judged.result == "dropped":
+                self.dropped(judged, there, memoryview(published.data))
+                return
+            if judged.result == "changed":
+                self.changed(judged, there, published.data[:SHOWN], len(published.data))
+        self._publish(published.topic, published.data if judged is None else bytes(judged.buffer))
 
     def report_line(
         self,

@@ -103,7 +103,7 @@ def held(
 ) -> tuple[list[str], list[str]]:
     """Return the findings on a text that replaces another."""
     present, coming = (check(Sources({"d.rv": one}), ()) for one in (before, text))
-    given = {"acting": ["deadman"], "moved": (), "hold": False} | how
+    given: dict[str, Any] = {"acting": ["deadman"], "moved": (), "hold": False} | how
     found = judge_holds(coming, present, live, **given)
     return found.conflicts, found.warnings
 

@@ -1,0 +1,42 @@
+"""Warn of monitors that act on a topic, but do not see what another monitor publishes there.
+
+A published message goes through the monitors that come later than its publisher in the order of all specifications.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from rosmop.form import nodes
+from rosmop.form.compiled import Publication, SpecificationCode
+from rosmop.form.findings import Diagnostic
+
+
+def bypassing(
+    specifications: Sequence[SpecificationCode],
+    publications: Sequence[Publication],
+    functions: Mapping[str, nodes.Function],
+) -> Iterator[Diagnostic]:
+    """Yield a warning for each publication that bypasses an earlier specification that acts on its topic."""
+    places = {one.name: place for place, one in enumerate(specifications)}
+    seen: set[tuple[str, str, str]] = set()
+    for publication in publications:
+        for earlier in specifications[: places.get(publication.specification, 0)]:
+            pair = publication.specification, earlier.name, publication.topic
+            if pair in seen or not _acts_on(earlier, publication.topic, functions):
+                continue
+            seen.add(pair)
+            name, topic = publication.specification, publication.topic
+            text = (
+                f"{name} publishes {topic}, but {earlier.name}, which drops or changes messages there, comes before"
+                f" {name} and does not see them: move {name} into a file whose name comes before {earlier.file}"
+            )
+            yield Diagnostic(publication.position, "warning", text)
+
+
+def _acts_on(code: SpecificationCode, topic: str, functions: Mapping[str, nodes.Function]) -> bool:
+    events = [event.function for event in code.events if event.topic == topic and event.part is None]
+    handlers = [name for each in code.properties for name in each.handlers.values()] if events else []
+    return any(
+        isinstance(node, nodes.Drop) or (isinstance(node, nodes.WriteBack) and node.writes)
+        for name in (*events, *handlers)
+        for node in nodes.walk(functions[name])
+    )

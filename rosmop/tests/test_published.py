@@ -1,0 +1,88 @@
+"""What a monitor publishes goes through the monitors behind it, and never in a circle."""
+
+import pytest
+
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome
+from rosmop.tests.acting import fields, load, message
+
+MUX = """mux() { event in(geometry_msgs::Twist t) /joy geometry_msgs/TwistStamped '{twist:t}' {
+    PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
+CAP = (
+    "cap() { event c(double v) /cmd_vel geometry_msgs/Twist '{linear.x:v}' { if (v > 0.22) { v = 0.22; } } }"
+)
+COUNT = """count() { int n; event c() /cmd_vel geometry_msgs/Twist '{}' { n++; }
+    ere: c c @match { DROP; __RESET; } }"""
+FAST = message("geometry_msgs/TwistStamped", twist__linear__x=9.0)
+
+
+def speeds(outcome: Outcome) -> list[float]:
+    """Return the published speeds as subscribers get them."""
+    return [fields("geometry_msgs/Twist", one.data).linear.x for one in outcome.sent()]
+
+
+def test_a_cap_limits_what_a_mux_publishes() -> None:
+    """Behind the mux it changes the message; before the mux it never sees it."""
+    assert speeds(load(MUX, y=CAP).process("/joy", FAST, 1)) == [0.22]
+    assert speeds(load(CAP, y=MUX).process("/joy", FAST, 1)) == [9.0]
+
+
+def test_published_messages_step_properties_and_are_dropped() -> None:
+    """The handler of a property behind the publisher drops its second message."""
+    monitors = load(MUX, y=COUNT)
+    outcomes = [monitors.process("/joy", FAST, time) for time in (1, 2, 3)]
+    assert [speeds(one) for one in outcomes] == [[9.0], [], [9.0]]
+    assert [one.verdicts[0].category for one in outcomes[1].judged.values()] == ["match"]
+    assert monitors.value("count", "n") == 3
+
+
+def test_what_timers_and_init_publish_is_judged() -> None:
+    """Each place that can publish is followed by the monitors behind it."""
+    tick = """p() { geometry_msgs::Twist t;
+        event e() every 1s { t.linear.x = 9; PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
+    [outcome] = load(tick, y=CAP).advance(10**9)
+    assert speeds(outcome) == [0.22]
+
+
+CHAIN = [
+    f"s{n}() {{ event e(int x) /n std_msgs/Int32 '{{data:x}}' {{ std_msgs::Int32 m; m.data = x + 1;"
+    f" PUBLISH(/n, std_msgs/Int32, m); }} }}"
+    for n in range(6)
+]
+
+
+def test_a_circle_ends_with_the_order() -> None:
+    """Monitors that all listen to their own topic publish a finite tree: each message goes only further back."""
+    monitors = load(CHAIN[0], **dict(zip("yzuvw", CHAIN[1:], strict=True)))  # type: ignore[arg-type]
+
+    def count(outcome: Outcome) -> int:
+        return len(outcome.published) + sum(map(count, outcome.judged.values()))
+
+    assert count(monitors.process("/n", message("std_msgs/Int32", data=1), 1)) == 2 ** len(CHAIN) - 1
+
+
+def test_a_monitor_that_holds_drops_what_others_publish() -> None:
+    """It cannot judge the message."""
+    monitors = load(MUX, y=COUNT)
+    monitors.monitor("count").hold("its state is lost")
+    outcome = monitors.process("/joy", FAST, 1)
+    assert (outcome.result, speeds(outcome)) == ("passed", [])
+
+
+@pytest.mark.parametrize("name", ["cap", "mux"])
+def test_a_disabled_monitor_judges_nothing(name: str) -> None:
+    """Neither as the publisher nor behind it."""
+    monitors: MonitorSet = load(MUX, y=CAP)
+    monitors.switch({name: False}, 0)
+    assert speeds(monitors.process("/joy", FAST, 1)) == ([9.0] if name == "cap" else [])
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "warned"),
+    [(CAP, MUX, True), (MUX, CAP, False), (COUNT, MUX, True), (MUX.replace("mux", "m"), MUX, False)],
+)
+def test_a_pair_in_the_wrong_order_is_a_warning(first: str, second: str, warned: bool) -> None:
+    """Only the order of the files decides who sees a published message, so `check` and `load` name the pair."""
+    warnings = [str(one) for one in load(first, y=second).warnings if "does not see them" in one.text]
+    assert bool(warnings) is warned
+    assert not warned or warnings[0].startswith("y.rv:2:5: warning: mux publishes /cmd_vel, but ")

@@ -1,0 +1,43 @@
+"""The relay sends what the monitors behind a publishing monitor let through, and reports what they did."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import MonitorsReported
+from rosmop.tests.acting import fields, message
+from tests.support.virtual_clock import VirtualClock
+from tests.unit.relay.monitors.quiet import QuietMonitors
+
+MUX = """mux() { event in(geometry_msgs::Twist t) /joy geometry_msgs/TwistStamped '{twist:t}' {
+    PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
+CAP = """cap() { event c(double v) /cmd_vel geometry_msgs/Twist '{linear.x:v}' {
+    if (v > 5) { return; } if (v > 0.22) { v = 0.22; } } }"""
+
+
+@pytest.fixture
+def monitors() -> Iterator[QuietMonitors]:
+    """Yield the monitors of a relay, with a clock that stands still."""
+    with clock.using(VirtualClock()):
+        yield QuietMonitors()
+
+
+def test_a_published_command_is_capped_dropped_and_recorded(monitors: QuietMonitors) -> None:
+    """Nothing faster than the cap leaves, and the records name the monitor that changed or dropped it."""
+    monitors.load(MUX, CAP)
+    for speed in (9.0, 0.5, 0.1):
+        monitors.process("/joy", message("geometry_msgs/TwistStamped", twist__linear__x=speed))
+    sent = [
+        fields("geometry_msgs/Twist", data).linear.x
+        for topic, data in monitors.published
+        if topic == "/cmd_vel"
+    ]
+    assert sent == [0.22, 0.1]
+    monitors.interceptor.observations.flush()
+    events = [
+        one for said in monitors.reports.sent if isinstance(said, MonitorsReported) for one in said.events
+    ]
+    assert [(one.kind, one.monitor, one.resource) for one in events] == [
+        ("publish", "mux", "/cmd_vel"), ("drop", "cap", "/cmd_vel"), ("change", "cap", "/cmd_vel")
+    ]  # fmt: skip
