@@ -59,7 +59,7 @@ class Stage:
 # A worker has no network but a loopback of its own, so tests that fetch packages run without workers, as do those that
 # start many processes themselves.
 STAGES = (
-    Stage("computing", ("tests/unit", "rosmop/tests", "tests/proofs"), "logical"),
+    Stage("computing", ("tests/unit", "tests/world", "rosmop/tests", "tests/proofs"), "logical"),
     Stage("nodes", ("tests/integration",), "auto"),
     Stage(
         "machine",

@@ -15,6 +15,10 @@ PUBLISHED = {
     "_create_unverified_context": "of ssl: a browser's user who clicks the warning away",
     "_connection_header": "of rospy: how a node learns who sent a message",
     "_marshaled_dispatch": "of xmlrpc.server: what its own request handler calls",
+    "_run": "of asyncio.Handle: what an event loop calls",
+    "_context": "of asyncio.Handle: the context of its callback, by which a loop finds its owner",
+    "_scheduled": "of asyncio.TimerHandle: what an event loop sets",
+    "_log_destroy_pending": "of asyncio.Task: not set for a task that another keeps",
 }
 
 

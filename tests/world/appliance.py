@@ -1,0 +1,235 @@
+"""A simulated appliance: the product's control process, and models of its supervisor and of its relay.
+
+The supervisor keeps the listening sockets, starts ended processes again, and connects control with the relay. The
+relay decides with the product's own grant table. Its connections are rows, which carry messages at any time.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from appliance.channel import messages
+from appliance.configuration.settings import Audit, LivenessSection, Settings
+from appliance.control.assembly import Parts
+from appliance.control.process import _run as run_control
+from appliance.relay.connections.admission import missing
+from appliance.relay.grant_table import GrantTable
+from tests.world.loop import BrokenPromiseError, Machine, Process
+from tests.world.network import LinkEnd
+from tests.world.ros import RosMaster
+from tests.world.seams import Socket
+
+if TYPE_CHECKING:
+    from tests.world.world import World
+
+MASTER_PORT = 11311
+ROSMASTER_PORT = 11312
+_RESTART_SECONDS = (0.2, 0.5, 1.5)
+
+
+class Connection(NamedTuple):
+    """A connection at the relay: `kind` is "topic" or "service"."""
+
+    key: str
+    kind: str
+    resource: str
+    host: str
+    caller_id: str
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """Return the header by which the peer asked for it."""
+        return {self.kind: self.resource, "callerid": self.caller_id, "md5sum": "*"}
+
+
+class Relay:
+    """One life of the relay: the product's grant table, the ports of nodes, and the connections."""
+
+    def __init__(self, world: "World", process: Process, link: LinkEnd) -> None:
+        self.process = process
+        self.table = GrantTable()
+        self.keys: dict[int, str] = {}  # by port
+        self.connections: dict[Connection, int] = {}
+        self._granted: dict[tuple[str, str, str, str], None] = {}  # all grants that this relay ever had
+        self._world = world
+        self._opened = 0
+        self.link = link
+        self.attach(link)
+
+    def attach(self, link: LinkEnd) -> None:
+        """Use the link to a new control."""
+        self.link = link
+        self.process.run(link.attach, None, self._received, lambda: None)
+
+    def _received(self, message: Any, descriptors: tuple[Any, ...]) -> None:
+        table = self.table
+        match message:
+            case messages.OrdersAsked():
+                self.link.send(messages.OrdersCarriedOut())
+            case messages.SpecificationsStated():
+                taken = messages.SpecificationsTaken(message.revision, [], [], message.statement)
+                self.link.send(taken)
+            case messages.StateBegan(epoch):
+                table.begin(epoch)
+            case messages.StateEnded(epoch):
+                table.end(epoch)
+            case messages.NodePlaced():
+                self.keys[descriptors[0].address[1]] = message.key
+                table.state(message)
+            case messages.GrantInstalled() | messages.ClientGranted():
+                self._world.granted(message)
+                table.state(message)
+                if isinstance(message, messages.GrantInstalled):
+                    self._granted[message.key, message.topic, message.host, message.caller_id] = None
+            case messages.PublicationPlaced() | messages.ServicePlaced():
+                table.state(message)
+            case (
+                messages.NodeWithdrawn()
+                | messages.PublicationWithdrawn()
+                | messages.ServiceWithdrawn()
+                | messages.GrantRevoked()
+                | messages.ClientRevoked()
+            ):
+                table.withdraw(message)
+        for connection in [one for one in self.connections if self.refusal(one)]:
+            self.disconnect(connection, "revoked")
+        self._world.check()
+
+    def refusal(self, connection: Connection) -> str:
+        """Return why a peer is not served; empty if it is."""
+        return missing(self.table, connection.key, connection.host, connection.fields)
+
+    def connect(self, port: int, kind: str, resource: str, host: str, caller_id: str) -> Connection | None:
+        """Serve a peer at a port, if it may have what it asks for."""
+        connection = Connection(self.keys.get(port, ""), kind, resource, host, caller_id)
+        if connection not in self.connections and not self.refusal(connection):
+            self._opened += 1
+            self.connections[connection] = self._opened
+            self.link.send(
+                messages.ConnectionOpened(self._opened, connection.key, resource, kind, host, caller_id)
+            )
+        return connection if connection in self.connections else None
+
+    def disconnect(self, connection: Connection, reason: str) -> None:
+        """End a connection, if it exists."""
+        number = self.connections.pop(connection, None)
+        if number is not None:
+            self.link.send(messages.ConnectionClosed(number, reason))
+
+    def grants(self) -> Iterator[messages.GrantInstalled]:
+        """Return the grants for topics in the table."""
+        for key, topic, host, name in self._granted:
+            grant = self.table.grant(key, topic, host, name)
+            if grant is not None:
+                yield grant
+
+
+@dataclass(eq=False)
+class Appliance:
+    """A machine with the processes of an appliance."""
+
+    world: "World"
+    machine: Machine
+    state: Path
+    durability: Literal["strict", "batched"]
+    sockets: dict[str, Socket] = field(default_factory=dict)
+    control: Process | None = None
+    relay: Relay = field(init=False)
+    rosmaster: RosMaster = field(init=False)
+    ready: bool = False
+    lives: int = 0
+
+    def __post_init__(self) -> None:
+        self.address = self.machine.name
+        self.supervisor = self.world.process("supervisor", self.machine)
+        self.admin = Socket("admin", 0)
+        self.policy = self.state / "policy.ini"
+        (self.state / "control").mkdir(parents=True)
+        self._announced = False
+        self._lifeline: LinkEnd | None = None
+        self.parts: Parts | None = None  # of the present control
+        self.settings = Settings(
+            policy=self.policy,
+            state=self.state,
+            listen=f"{self.address}:{MASTER_PORT}",
+            rosmaster_port=ROSMASTER_PORT,
+            isolation="none",
+            api="off",
+            hosts=self.state / "hosts.yaml",
+            relays=1,
+            audit=Audit(durability=self.durability),
+            liveness=LivenessSection(silent=20.0),
+        )
+        self.start_rosmaster()
+        self.start_relay()
+
+    def restart_rosmaster(self) -> None:
+        """Start a new `rosmaster` without state, in place of the present one."""
+        self.rosmaster.process.kill()
+        self.start_rosmaster()
+
+    def start_rosmaster(self) -> None:
+        """Start `rosmaster`."""
+        self.rosmaster = RosMaster(self.world, self.world.process("rosmaster", self.machine), ROSMASTER_PORT)
+        if self._lifeline is not None:
+            self._lifeline.send(messages.ProcessesChanged([]))
+
+    def restart_relay(self) -> None:
+        """Start a new relay without state, in place of the present one."""
+        self.relay.process.kill()
+        self.start_relay()
+
+    def start_relay(self) -> None:
+        """Start the relay."""
+        process = self.world.process("relay", self.machine)
+        end, _unused = LinkEnd.pair(process, self.supervisor)
+        self.relay = Relay(self.world, process, end)
+        if self.control is not None and self.control.alive:
+            self._link_relay()
+
+    def start_control(self) -> None:
+        """Start control with the kept sockets."""
+        self.lives += 1
+        self.control = self.world.process("control", self.machine)
+        mine, its = LinkEnd.pair(self.supervisor, self.control)
+        self._lifeline = mine
+        self.ready = False
+        mine.process.run(mine.attach, None, self._received, lambda: None)
+        for name, sock in {"admin": self.admin, **self.sockets}.items():
+            mine.send(messages.SocketRestored(name), (sock,))
+        mine.send(messages.SocketsRestored(len(self.sockets), self._announced))
+        config = self.state / "config.json"
+        self.control.assembled = self._assembled
+        task = self.control.start(run_control(self.settings, its, config))  # type: ignore[arg-type]
+        task.add_done_callback(self.world.done)
+        self._link_relay()
+
+    def _assembled(self, parts: Parts) -> None:
+        self.parts = parts
+
+    def _link_relay(self) -> None:
+        assert self.control is not None and self._lifeline is not None
+        relays, controls = LinkEnd.pair(self.relay.process, self.control)
+        self.relay.attach(relays)
+        self._lifeline.send(messages.LinkOpened("relay", 0), (controls,))
+
+    def kill_control(self) -> None:
+        """Kill control, and start it again after some time."""
+        if self.control is not None and self.control.alive:
+            self.control.kill()
+            self.ready = False
+            self.supervisor.call(self.world.random.choice(_RESTART_SECONDS), self.start_control)
+
+    def _received(self, message: Any, descriptors: tuple[Any, ...]) -> None:
+        match message:
+            case messages.SocketKept(name):
+                self.sockets[name] = descriptors[0]
+            case messages.SocketDropped(name):
+                self.sockets.pop(name, None)
+            case messages.Ready():
+                self.ready = self._announced = True
+                self.world.say(f"control of {self.address} is ready")
+                self.world.control_ready(self)
+            case messages.Failed(reason):
+                raise BrokenPromiseError(f"control does not start: {reason}")

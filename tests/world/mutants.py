@@ -1,0 +1,142 @@
+"""Faults of the product, which the world must find: the replaced attribute, and its replacement.
+
+python -m tests.world.mutants SEEDS [WORD]   print the first seed that finds each, or those with this word
+"""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from appliance.control import process as control_process
+from appliance.master.calls.call_execution import Execution
+from appliance.master.calls.gate import CallGate
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.effects import (
+    Effect,
+    PlaceGrant,
+    PlaceNode,
+    PlaceResource,
+    RevokeGrant,
+    SaveGrant,
+)
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
+from appliance.master.graph.revocation import Revocation
+from appliance.master.reconcile.enactor import Enactor, Enforcement
+from appliance.master.reconcile.reconciler import Reconciler
+from appliance.policy.model import Decision
+from appliance.relay.grant_table import GrantTable
+from appliance.store.changes import Value
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import Database
+from appliance.telemetry.audit_trail import AuditTrail
+from tests.world.world import run
+
+
+def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
+    return []
+
+
+async def _at_once(*_given: Any, **_named: Any) -> None:
+    """Wait for nothing."""
+
+
+def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
+    """Return an enactor that leaves out effects of a kind."""
+    whole = Enactor.carry_out
+    return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
+
+
+def _granted_nowhere(self: RelayControl, post: Any, incarnation: Incarnation) -> None:
+    for one in incarnation.registrations.values():
+        if one.kind is Kind.PUBLICATION:
+            self._place_one(post, incarnation, one.kind, one.resource, one.detail)
+
+
+_put = Database.put
+
+
+def _not_ahead(self: Database, table: str, *row: Value, **_ahead: bool) -> None:
+    _put(self, table, *row, ahead=False)
+
+
+def _allowed(_gate: CallGate, _attempt: Any, _tree: Any) -> Decision:
+    return Decision(True, None, "by a fault")
+
+
+def _unrecorded(_execution: Execution, _attempt: Any, decision: Decision) -> Any:
+    return None if decision.allowed else [0, decision.reason, 0]
+
+
+MUTANTS: dict[str, tuple[Any, str, Any]] = {
+    "a subscriber is not told of a new publisher": (RosGraph, "tell", _nothing),
+    "nodes are told each other's own URIs": (Incarnation, "uri_for", lambda node, _told, hidden: node.real_uri),
+    "a reload takes back no registration": (RosGraph, "revoked", _nothing),
+    "a reload takes back no grant": (Revocation, "_revoke", _nothing),
+    "what a policy took is not put back": (Revocation, "returned", _nothing),
+    "an earlier life keeps its name": (RosGraph, "_take_name", _nothing),
+    "a lost node keeps its publications": (Registry, "_unindex", _nothing),
+    "a new relay is not told of grants": (RelayControl, "_place", _granted_nowhere),
+    "a grant is not kept": (Enactor, "carry_out", _without(SaveGrant)),
+    "a registration is not kept": (Enactor, "carry_out", _without(SaveRegistration)),
+    "the relay is not told of a grant": (Enactor, "carry_out", _without(PlaceGrant)),
+    "the relay is not told what is revoked": (Enactor, "carry_out", _without(RevokeGrant)),
+    "the relay is not told who publishes": (Enactor, "carry_out", _without(PlaceResource)),
+    "a round leaves the ROS master as it is": (Reconciler, "_compare", _at_once),
+    "a node that comes back is placed nowhere": (Enactor, "carry_out", _without(PlaceNode)),
+    "every call is allowed": (CallGate, "decide", _allowed),
+    "a decision is not recorded": (Execution, "_recorded", _unrecorded),
+    "a strict answer does not wait for its record": (AuditTrail, "durable", _at_once),
+    "a reload is answered before the relay has carried it out": (Enforcement, "carried_out", _at_once),
+    "a call that began under the old policy is not decided again": (
+        Enforcement, "redecide_for", lambda *_given: None,
+    ),
+    "a reload revokes nothing": (Enforcement, "policy_changed", lambda *_given: 0),
+    "a policy is not stored": (StateStore, "save_revision", _nothing),
+    "a parameter is not stored": (StateStore, "note_parameter", _nothing),
+    "control restores no node": (control_process, "_restore", _at_once),
+    "a change is not written ahead": (
+        Database, "put", _not_ahead,
+    ),
+    "the relay keeps what was not stated again": (GrantTable, "end", _nothing),
+    "a revoked grant is kept in the store": (StateStore, "remove_permission", _nothing),
+}  # fmt: skip
+
+
+@contextlib.contextmanager
+def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
+    """Replace an existing attribute during the block."""
+    before = getattr(place, name)
+    setattr(place, name, other)
+    try:
+        yield
+    finally:
+        setattr(place, name, before)
+
+
+def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
+    """Return the first seed whose history breaks a promise with a faulty product, and the promise."""
+    with instead_of(*MUTANTS[mutant]):
+        for seed in seeds:
+            try:
+                run(seed)
+            except (AssertionError, KeyError) as error:
+                return seed, str(error)
+    return None
+
+
+def main(arguments: list[str]) -> None:
+    """Run the command line."""
+    number, *words = arguments
+    for mutant in MUTANTS:
+        if all(word in mutant for word in words):
+            found = first_broken(mutant, range(int(number)))
+            sys.stdout.write(
+                f"{mutant}: {'not found' if found is None else f'seed {found[0]}: {found[1][:120]}'}\n"
+            )
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,159 @@
+"""Where the product meets the world: what replaces sockets, threads, and random numbers.
+
+Everything else in a world is the product's own code. A descriptor is the object itself: a listening socket or an end of
+a link, which messages carry to other processes.
+"""
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Callable, Iterator
+from functools import partial
+from random import Random
+from types import SimpleNamespace
+from typing import Any
+
+from appliance.audit import log_database, log_writer
+from appliance.audit.log import AuditLog
+from appliance.base import clock
+from appliance.control import (
+    assembly,
+    foundation,
+    listener_limits,
+    open_audit,
+    passive,
+    supervisor_link,
+    supervisor_messages,
+)
+from appliance.control import process as control_process
+from appliance.master import rosmaster
+from appliance.master.endpoints import node_ports
+from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal
+from appliance.rpc.xmlrpc_client import XmlRpcClient
+from appliance.store import ahead, writer_thread
+from appliance.store.state_file import StateStore
+from tests.world import disk
+from tests.world.loop import present_process
+from tests.world.network import Network
+
+
+class Socket:
+    """A listening socket."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self.address = host, port
+
+    def getsockname(self) -> tuple[str, int]:
+        """Return the address and the port."""
+        return self.address
+
+    def dup(self) -> "Socket":
+        """Return the socket: the world counts no references."""
+        return self
+
+    detach = fileno = dup
+
+    def close(self) -> None:
+        """Do nothing: the supervisor keeps the socket open."""
+
+
+class _Server:
+    """`HttpServer`: the network passes each request on. Its limits are not part of the world."""
+
+    def __init__(self, network: Network, sock: Socket, handler: Handler, **limits: Any) -> None:
+        self._network = network
+        self._address = sock.address
+        self._handler = handler
+        self._refuse: Callable[[Peer], Refusal | None] = limits["refuse"]
+
+    async def start(self) -> None:
+        """Serve until the process or the server ends."""
+        self._network.serve(self._address, self._answer)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._network.stop(self._address)
+
+    async def _answer(self, peer: Peer, body: bytes) -> bytes:
+        refusal = self._refuse(peer)
+        if refusal is not None:
+            return refusal(body)
+        return await self._handler(HttpRequest(peer, "/", body, clock.now_ns()))
+
+
+class _AdminServer:
+    """The admin socket: operators' orders reach the machine's `administration`."""
+
+    def __init__(self, administration: Any) -> None:
+        self._administration = administration
+
+    async def start(self, sock: Any) -> "_AdminServer":
+        """Serve from now on."""
+        sock.administration = self._administration, present_process()
+        return self
+
+    def close(self) -> None:
+        """Do nothing: the next server of the socket takes its place."""
+
+
+def _assemble(base: Any) -> Any:
+    """Return the parts of control, and show them to the world."""
+    parts = assembly.assemble(base)
+    present_process().assembled(parts)
+    return parts
+
+
+async def _forever() -> None:
+    """Do nothing, in place of work that measures this process."""
+    await asyncio.get_running_loop().create_future()
+
+
+def _handle(descriptor: Any = None, *_given: Any, **named: Any) -> Any:
+    """Return a descriptor's object, in place of a socket or channel made from it."""
+    return named.get("fileno", descriptor)
+
+
+@contextlib.contextmanager
+def joined(network: Network, random: Random) -> Iterator[None]:
+    """Join the product to a world."""
+
+    async def exchange(client: Any, request: bytes, seconds: float) -> bytes:
+        body = request.partition(b"\r\n\r\n")[2]
+        source = present_process().machine.name
+        return await network.exchange((client.uri.host, client.uri.port), body, seconds, source)
+
+    def listen(host: str, port: int) -> Socket:
+        return Socket(host, port or network.free_port())
+
+    files, databases = disk.files()
+    sockets = SimpleNamespace(socket=_handle)
+    replaced: list[tuple[Any, str, Any]] = [
+        (secrets, "_sysrand", random),
+        (rosmaster, "uuid", SimpleNamespace(uuid1=lambda: "run")),
+        (foundation, "StateStore", partial(StateStore, kind=disk.WorldDatabase)),
+        (open_audit, "AuditLog", partial(AuditLog, drive=disk.EngineSteps)),
+        (ahead, "os", files),
+        (log_writer, "os", files),
+        (writer_thread, "sqlite3", databases),
+        (log_database, "sqlite3", databases),
+        (XmlRpcClient, "_exchange", exchange),
+        (listener_limits, "HttpServer", partial(_Server, network)),
+        (node_ports, "listen", listen),
+        (foundation, "listen", listen),
+        (control_process, "AdminServer", _AdminServer),
+        (passive, "AdminServer", _AdminServer),
+        (control_process, "assemble", _assemble),
+        (control_process, "return_spare_memory", _forever),
+        (supervisor_link, "socket", sockets),
+        (supervisor_link, "Channel", _handle),
+        (supervisor_messages, "socket", sockets),
+        (supervisor_messages, "Channel", _handle),
+    ]
+    before = [(place, name, getattr(place, name)) for place, name, _other in replaced]
+    try:
+        for place, name, other in replaced:
+            setattr(place, name, other)
+        yield
+    finally:
+        for place, name, value in before:
+            setattr(place, name, value)

@@ -1,0 +1,575 @@
+"""One history of a whole world in virtual time, made from a seed, and the promises that it must keep.
+
+1. No call and no message passes undecided: each grant at the relay, and each acknowledged registration, has its
+   allowed decision in the audit log. With `durability: strict`, the record is there before the grant.
+2. After the answer to a reload, the relay has no grant and carries nothing that the policy denies.
+3. Nodes learn no addresses but those of proxy endpoints and of the relay.
+4. No acknowledged change is lost: after a restart of control, the last acknowledged policy is in force, and
+   acknowledged parameters have their values.
+5. The chain of the audit log verifies at the end, over all lives of control.
+6. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are connected
+   to exactly the live publishers that the policy allows.
+"""
+
+import asyncio
+import contextlib
+import logging
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Callable, MutableMapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any, NoReturn
+
+import structlog
+
+from appliance.audit.verification import verify
+from appliance.channel import admin, messages
+from appliance.control.assembly import Parts
+from appliance.master.graph.registry import Kind
+from roswire.parameter_tree import standing_at
+from tests.world import seams
+from tests.world.appliance import MASTER_PORT, ROSMASTER_PORT, Appliance, Connection
+from tests.world.loop import BrokenPromiseError, Machine, Process, WorldLoop
+from tests.world.network import Network
+from tests.world.ros import Node, Subscription
+
+HOSTS = ("10.0.0.1", "10.0.0.2", "10.0.0.3")
+APPLIANCE = "10.0.0.100"
+NAMES = ("/one", "/two", "/three")
+TOPICS = ("/a", "/b")
+SERVICES = ("/s",)
+KEYS = ("/p", "/q/r")
+POLICY = (
+    "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}default=*\n[Services]\ndefault=*\n"
+    "[Parameters]\nread default=*\nwrite default=*\n[Commands]\ndefault=*\n"
+)
+
+
+class Policy:
+    """A policy, and as an oracle the hosts that it lets publish, subscribe and call; those not listed are allowed."""
+
+    def __init__(self, publish: dict[str, str] | None = None, use: dict[str, str] | None = None) -> None:
+        self.publish = {one: set(hosts.split()) for one, hosts in (publish or {}).items()}
+        self.use = {one: set(hosts.split()) for one, hosts in (use or {}).items()}
+        rules = (
+            "".join(f"{one} = {', '.join(sorted(hosts))}\n" for one, hosts in table.items() if one in TOPICS)
+            for table in (self.publish, self.use)
+        )
+        self.text = POLICY.format(*rules)
+
+    def may_publish(self, topic: str, host: str) -> bool:
+        """Whether a host may publish a topic."""
+        return host in self.publish.get(topic, HOSTS)
+
+    def may_use(self, resource: str, host: str) -> bool:
+        """Whether a host may subscribe to a topic."""
+        return host in self.use.get(resource, HOSTS)
+
+
+@dataclass
+class Setting:
+    """Overlapping calls that set a parameter: how many are under way, their values, whether one was answered."""
+
+    under_way: int = 0
+    values: set[int | None] = field(default_factory=set)
+    known: bool = False
+
+
+POLICIES = {
+    "open": Policy(),
+    "/a is published by 1": Policy({"/a": HOSTS[0]}),
+    "/a is subscribed to by 2 and 3": Policy(use={"/a": f"{HOSTS[1]} {HOSTS[2]}"}),
+    "/b is nobody's": Policy({"/b": ""}, {"/b": ""}),
+}
+_SETTLES = 150.0  # seconds
+_PAUSES = (0.0, 0.001, 0.05, 0.5, 3.0, 30.0)
+_AGAIN_SECONDS = 0.5
+_ORDER_SECONDS = (0.0, 0.001, 0.01)
+
+
+class World:
+    """The whole state of one history."""
+
+    def __init__(self, seed: int, folder: Path, say: Callable[[str], object]) -> None:
+        self.random = Random(seed)  # noqa: S311  histories, no secrets
+        self.loop = WorldLoop(self.random)
+        self.loop.set_exception_handler(self._fault)
+        self.network = Network(self.loop)
+        self._say = say
+        self.errors: list[Exception] = []
+        self.processes: list[Process] = []
+        self._numbers = 100
+        self._ports = 40_000
+        self.machines = {name: self._machine(name) for name in (*HOSTS, APPLIANCE)}
+        self.master_uri = f"http://{APPLIANCE}:{MASTER_PORT}/"
+        self.nodes: list[Node] = []
+        self.possible = {"open"}  # policies that may be in force
+        self.ordering = 0  # orders under way
+        self.parameters: dict[str, set[int | None]] = {key: {None} for key in KEYS}
+        self._setting = {key: Setting() for key in KEYS}
+        self.strict = self.random.random() < 0.5
+        self.appliance = Appliance(
+            self, self.machines[APPLIANCE], folder / "appliance", "strict" if self.strict else "batched"
+        )
+        self.appliance.policy.write_text(POLICIES["open"].text, encoding="utf-8")
+        self._granted: set[tuple[str, str, str]] = set()
+
+    # --- services for the models ---
+
+    def _machine(self, name: str) -> Machine:
+        return Machine(name, self.loop, self.random.uniform(0, 1000), 1 + self.random.uniform(-0.01, 0.01))
+
+    def process(self, name: str, machine: Machine) -> Process:
+        """Return a new process; its end breaks off its connections."""
+        process = Process(name, machine)
+        process.ends.append(lambda: self.network.broken(process))
+        self.processes.append(process)
+        return process
+
+    def number(self) -> int:
+        """Return a new number: of a process, or of a value."""
+        self._numbers += 1
+        return self._numbers
+
+    def say(self, line: str) -> None:
+        """Report an event."""
+        self._say(f"{self.loop.present:9.3f}  {line}")
+
+    def fail(self, text: str) -> None:
+        """Note a broken promise."""
+        self.say(f"BROKEN: {text}")
+        self.errors.append(BrokenPromiseError(text))
+
+    def logged(self, _logger: object, level: str, event: MutableMapping[str, Any]) -> NoReturn:
+        """Report a line of the product's log; a fault is a broken promise."""
+        text = ", ".join(f"{key}={value!r}" for key, value in event.items())
+        if level == "critical":
+            self.fail(f"fault: {text}")
+        elif level in ("error", "warning"):
+            self.say(f"    log: {text}")
+        raise structlog.DropEvent
+
+    def _fault(self, _loop: object, context: dict[str, Any]) -> None:
+        self.fail(f"unhandled: {context.get('message')}: {context.get('exception')!r}")
+
+    def done(self, task: asyncio.Task[Any]) -> None:
+        """Note the error that ended a task of the product."""
+        if not task.cancelled() and task.exception() is not None:
+            self.fail(f"control ended: {task.exception()!r}")
+
+    # --- what nodes do and see ---
+
+    def ends(self, node: Node) -> None:
+        """End a node and its connections."""
+        if node.alive:
+            self.say(f"{node} ends")
+            node.process.kill()
+            relay = self.appliance.relay
+            for connection in [one for one in relay.connections if self._is_of(one, node)]:
+                relay.disconnect(connection, "closed")
+
+    @staticmethod
+    def _is_of(connection: Connection, node: Node) -> bool:
+        return (connection.host, connection.caller_id) == (node.host, node.name)
+
+    def takes_name(self, node: Node) -> None:
+        """Mark the node that had this name as superseded. If it hangs it goes on; the next caller decides its state."""
+        for other in self.nodes:
+            if other.name == node.name and other is not node:
+                other.superseded = True
+
+    def acknowledged(self, node: Node, method: str, resource: str) -> None:
+        """Assert that an acknowledged registration has its decision in the log."""
+        self.decided(method, resource, node.host, node.name)
+
+    def granted(self, grant: messages.GrantInstalled | messages.ClientGranted) -> None:
+        """Assert that a grant that reaches the relay has its decision in the log."""
+        if isinstance(grant, messages.GrantInstalled):
+            self.decided("requestTopic", grant.topic, grant.host, grant.caller_id)
+        else:
+            self.decided("lookupService", grant.service, grant.host, grant.caller_id)
+
+    def decided(self, call: str, resource: str, host: str, name: str) -> None:
+        """Assert that the log has the decision that allowed a call; without `strict`, a crash may lose it."""
+        if self.strict and not self._recorded(
+            "event = 'decision' AND decision = 'allow' AND host = ? AND resource = ? AND caller_id = ?",
+            host, resource, name,
+        ):  # fmt: skip
+            self.fail(f"{call} {resource} by {name} of {host} passed without a decision in the log")
+
+    def _recorded(self, condition: str, *values: str) -> bool:
+        path = self.appliance.state / "control" / "audit.db"
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            query = f"SELECT count(*) FROM record WHERE {condition}"  # noqa: S608  fixed texts
+            return bool(connection.execute(query, values).fetchone()[0])
+
+    def sees(self, node: Node, uris: list[str]) -> None:
+        """Assert that nodes get ports of the appliance only: others would bypass it."""
+        for uri in uris:
+            if f"//{APPLIANCE}:" not in uri and uri != node.api:
+                self.fail(f"{node} was told {uri}, which bypasses the relay")
+
+    def connect(self, node: Node, topic: str, port: int) -> None:
+        """Connect a subscriber to a port of the relay."""
+        connection = self.appliance.relay.connect(port, "topic", topic, node.host, node.name)
+        if connection is not None:
+            self.carries(connection)
+
+    def disconnect(self, node: Node, topic: str, port: int) -> None:
+        """Close a connection of a subscriber."""
+        relay = self.appliance.relay
+        key = relay.keys.get(port, "")
+        relay.disconnect(Connection(key, "topic", topic, node.host, node.name), "closed")
+
+    def call_service(self, node: Node, service: str, port: int) -> None:
+        """Call a service once, over the relay."""
+        relay = self.appliance.relay
+        connection = relay.connect(port, "service", service, node.host, node.name)
+        if connection is not None:
+            self.carries(connection)
+            relay.disconnect(connection, "closed")
+
+    def parameter_set(self, key: str, *, known: bool) -> None:
+        """Remember the values that a parameter may have."""
+        setting = self._setting[key]
+        setting.under_way -= 1
+        setting.known |= known
+        if setting.known and not setting.under_way:
+            self.parameters[key] = setting.values
+
+    # --- promises ---
+
+    def carries(self, connection: Connection) -> None:
+        """Assert that a policy that may be in force lets a connection carry messages."""
+        if not any(POLICIES[one].may_use(connection.resource, connection.host) for one in self.possible):
+            self.fail(f"{connection} carries messages, which no policy allows")
+
+    def check(self) -> None:
+        """Assert that the relay has only what a policy allows that may be in force."""
+        relay = self.appliance.relay
+        for connection in relay.connections:
+            self.carries(connection)
+        for grant in relay.grants():
+            if not any(POLICIES[one].may_use(grant.topic, grant.host) for one in self.possible):
+                self.fail(f"the relay has {grant}, which no policy allows")
+
+    def control_ready(self, _appliance: Appliance) -> None:
+        """Learn which policy is in force, and assert that no acknowledged one was lost."""
+        self.loop.outside.start(self._learn())
+
+    async def _learn(self) -> None:
+        answer = await self.order(admin.PolicyWanted())
+        if answer is None or self.ordering:
+            return
+        found = {name for name, policy in POLICIES.items() if policy.text == answer.text}
+        if not found & self.possible:
+            self.fail(f"the policy {found} is in force, acknowledged was {self.possible}")
+        self.possible = found
+        self.check()
+
+    # --- operators ---
+
+    async def order(self, request: admin.AdminRequest[Any]) -> Any:
+        """Return the answer of control to an operator's order; None if control ended before, or could not do it."""
+        given = getattr(self.appliance.admin, "administration", None)
+        if given is None:
+            return None
+        administration, process = given
+        if not process.alive:
+            return None
+        future: asyncio.Future[Any] = self.loop.create_future()
+
+        async def carry_out() -> None:
+            answer = await administration.carry_out(request, who="operator")
+            self.loop.outside.call(self.random.choice(_ORDER_SECONDS), answered, answer)
+
+        def answered(answer: Any) -> None:
+            if not future.done():
+                future.set_result(answer)
+
+        process.ends.append(lambda: self.loop.outside.call(1.0, answered, None))
+        process.start(carry_out())
+        answer = await future
+        if answer is not None and not answer.ok:
+            self.fail(f"{request} is rejected: {answer.error}")
+        return None if answer is None else answer.body
+
+    async def reload(self) -> None:
+        """Put another policy in force, as an operator does."""
+        name = self.random.choice(list(POLICIES))
+        self.say(f"policy: {name}")
+        self.possible = self.possible | {name}
+        self.ordering += 1
+        if self.random.random() < 0.5:
+            self.appliance.policy.write_text(POLICIES[name].text, encoding="utf-8")
+            answer = await self.order(admin.PolicyReload())
+        else:
+            answer = await self.order(admin.PolicyLoad(POLICIES[name].text))
+        self.ordering -= 1
+        if answer is not None:
+            self.say(f"policy: {name} is in force, {answer.revoked} revoked")
+            self.possible = {name}
+            self.check()
+        while answer is None and len(self.possible) > 1:  # control was killed: it has the policy, or not
+            await asyncio.sleep(_AGAIN_SECONDS)
+            await self._learn()
+
+    # --- events ---
+
+    def _living(self) -> Node | None:
+        there = [one for one in self.nodes if one.alive]
+        return self.random.choice(there) if there else None
+
+    def starts(self) -> None:
+        """Start a node; with the name of another node it replaces that one."""
+        host = self.random.choice(HOSTS)
+        self._ports += 1
+        name = self.random.choice(NAMES)
+        node = Node(self, self.process(name, self.machines[host]), name, self._ports)
+        self.nodes.append(node)
+        node.process.start(node.connect())
+        for topic in TOPICS:
+            if self.random.random() < 0.5:
+                self.publishes(node, topic)
+            if self.random.random() < 0.5:
+                self.subscribes(node, topic)
+        for service in SERVICES:
+            if self.random.random() < 0.3:
+                node.services.add(service)
+                node.register("registerService", service)
+
+    def publishes(self, node: Node, topic: str) -> None:
+        """Make a node publish a topic."""
+        node.publishes.add(topic)
+        node.register("registerPublisher", topic)
+
+    def subscribes(self, node: Node, topic: str) -> None:
+        """Make a node subscribe to a topic."""
+        node.subscribes.setdefault(topic, Subscription())
+        node.register("registerSubscriber", topic)
+
+    def changes_its_mind(self) -> None:
+        """Make a node register or unregister something."""
+        node, topic = self._living(), self.random.choice(TOPICS)
+        if node is None or any(one[1] == topic for one in node.calling):
+            return
+        if self.random.random() < 0.5:
+            if topic in node.publishes:
+                node.publishes.discard(topic)
+                node.register("unregisterPublisher", topic)
+            else:
+                self.publishes(node, topic)
+        elif topic in node.subscribes:
+            for port in node.subscribes.pop(topic).ports.values():
+                self.disconnect(node, topic, port)
+            node.register("unregisterSubscriber", topic)
+        else:
+            self.subscribes(node, topic)
+
+    def uses_service(self) -> None:
+        """Make a node call a service."""
+        node = self._living()
+        if node is not None:
+            node.process.start(node.use_service(self.random.choice(SERVICES)))
+
+    def sets_parameter(self) -> None:
+        """Make a node set a parameter."""
+        node, key, value = self._living(), self.random.choice(KEYS), self.number()
+        if node is not None:
+            if not self._setting[key].under_way:
+                self._setting[key] = Setting()
+            setting = self._setting[key]
+            setting.under_way += 1
+            setting.values.add(value)
+            self.parameters[key] = self.parameters[key] | {value}
+            node.process.start(node.set_parameter(key, value))
+
+    def dies(self) -> None:
+        """Kill a node, without an unregistration."""
+        node = self._living()
+        if node is not None:
+            self.ends(node)
+
+    def hangs(self) -> None:
+        """Make a node hang, or continue."""
+        node = self._living()
+        if node is not None:
+            node.answers = not node.answers
+            self.say(f"{node} {'answers' if node.answers else 'hangs'}")
+
+    def is_cut_off(self) -> None:
+        """Cut a host off from the appliance, or connect it again."""
+        pair = frozenset((self.random.choice(HOSTS), APPLIANCE))
+        self.network.cut ^= {pair}
+        self.say(f"{sorted(pair)} {'are cut off' if pair in self.network.cut else 'reach each other'}")
+
+    def reloads(self) -> None:
+        """Start an operator's reload, unless one is under way."""
+        if not self.ordering:
+            self.loop.outside.start(self.reload())
+
+    def rosmaster_dies(self) -> None:
+        """Replace `rosmaster` by a new one without state."""
+        self.say("rosmaster starts again")
+        self.appliance.restart_rosmaster()
+
+    def rosmaster_breaks_off(self) -> None:
+        """Let calls to `rosmaster` fail now and then, before or after their effect."""
+        self.say("calls to rosmaster break off")
+        self.network.flaky = ("127.0.0.1", ROSMASTER_PORT)
+
+    def relay_dies(self) -> None:
+        """Replace the relay by a new one without state."""
+        self.say("the relay starts again")
+        self.appliance.restart_relay()
+
+    def control_dies(self) -> None:
+        """Kill control after some of its steps."""
+        steps = self.random.choice((1, 10, 100, 1000))
+        control = self.appliance.control
+        if control is not None:
+            control.doom = self.random.randint(1, steps), self._kill_control
+
+    def _kill_control(self) -> None:
+        self.say("control is killed")
+        self.appliance.kill_control()
+
+    # --- the history ---
+
+    async def run(self) -> None:
+        """Run the history to its end, and check the promises."""
+        self.appliance.start_control()
+        usual = (self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter)
+        faults: tuple[Callable[[], None], ...] = (
+            self.dies, self.hangs, self.is_cut_off, self.reloads, self.rosmaster_dies, self.rosmaster_breaks_off,
+            self.relay_dies, self.control_dies,
+        )  # fmt: skip
+        # Few kinds of faults in a history, but often: so they meet one another more often than if all were mixed.
+        faults = tuple(self.random.sample(faults, self.random.randint(1, 4)))
+        for _ in range(self.random.randrange(6, 24)):
+            self.random.choice(self.random.choice((usual, faults)))()
+            await self.passes(self.random.choice(_PAUSES))
+        self.say("no faults any more")
+        self.network.cut.clear()
+        self.network.flaky = None
+        for process in self.processes:
+            process.doom = None
+        for node in self.nodes:
+            node.answers = True
+        await self.passes(_SETTLES)
+        self.quiet()
+
+    async def passes(self, seconds: float) -> None:
+        """Let time pass, and check the promises in between."""
+        await asyncio.sleep(seconds)
+        if self.errors:
+            raise self.errors[0]
+
+    def quiet(self) -> None:
+        """Check what must hold once all is settled."""
+        parts = self.appliance.parts
+        if not self.appliance.ready or parts is None:
+            raise BrokenPromiseError("control is not ready")
+        self._check_master(parts)
+        self._check_connected(parts)
+        self._check_parameters(parts)
+
+    def _check_master(self, parts: Parts) -> None:
+        """Assert that `rosmaster` has exactly the registrations of live nodes."""
+        words = {Kind.PUBLICATION: "Publisher", Kind.SUBSCRIPTION: "Subscriber", Kind.SERVICE: "Service"}
+        faces, rosmaster = parts.endpoints.faces, self.appliance.rosmaster
+        wanted = {
+            (words[one.kind], one.resource, node.name, faces.inner_uri(node))
+            for node, one in parts.core.registry.in_order()
+            if one.kind in words
+        }
+        there = {
+            (kind, resource, name, uri)
+            for kind, table in rosmaster.tables.items()
+            for resource, holders in table.items()
+            for name, uri in holders.items()
+        }
+        if there != wanted:
+            raise BrokenPromiseError(f"rosmaster has {there - wanted} and lacks {wanted - there}")
+
+    def _check_connected(self, parts: Parts) -> None:
+        """Assert that live subscribers are connected to exactly the live publishers that the policy allows."""
+        holders = {
+            incarnation.key: node
+            for incarnation in parts.core.registry.live()
+            for node in self.nodes
+            if node.alive and (node.name, node.api) == (incarnation.name, incarnation.api_text)
+        }
+        ports = {node.relay_port: node.key for node in parts.core.registry.all()}
+        for node in holders.values():
+            if not node.superseded:  # else another node has its name
+                for topic, subscription in node.subscribes.items():
+                    self._check_heard(node, topic, subscription, holders, ports)
+
+    def _check_heard(
+        self,
+        node: Node,
+        topic: str,
+        subscription: Subscription,
+        holders: dict[str, Node],
+        ports: dict[int, str],
+    ) -> None:
+        [policy], relay = self.possible, self.appliance.relay
+        wanted = {
+            key
+            for key, one in holders.items()
+            if one is not node and topic in one.publishes
+            if POLICIES[policy].may_publish(topic, one.host) and POLICIES[policy].may_use(topic, node.host)
+        }
+        whose = ("topic", topic, node.host, node.name)
+        heard = {key for key, *rest in relay.connections if tuple(rest) == whose}
+        told = {ports.get(subscription.ports.get(uri, 0), uri) for uri in subscription.known}
+        open_to_doubt = {key for key, one in holders.items() if one.superseded}
+        wanted, heard, told = (keys - open_to_doubt for keys in (wanted, heard, told))
+        if heard != wanted or told != wanted:
+            raise BrokenPromiseError(f"{node} hears {heard} on {topic}, knows {told}, and may have {wanted}")
+
+    def _check_parameters(self, parts: Parts) -> None:
+        """Assert that each parameter has a value that was acknowledged last."""
+        rosmaster = self.appliance.rosmaster
+        for key, values in self.parameters.items():
+            value, _above = standing_at(parts.core.parameters.tree, key)
+            there, _above = standing_at(rosmaster.parameters, key)
+            if value not in values or there != value:
+                raise BrokenPromiseError(
+                    f"{key} is {value!r} ({there!r} at rosmaster), which is not one of {values}"
+                )
+
+    def check_chain(self) -> None:
+        """Assert that the audit log of all lives of control verifies."""
+        found = verify(self.appliance.state / "control" / "audit.db")
+        if found.findings:
+            raise BrokenPromiseError(f"the audit log does not verify: {found.findings}")
+
+
+def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
+    """Run one history. Raises `BrokenPromiseError`."""
+    shared = Path("/dev/shm")
+    folder = Path(tempfile.mkdtemp(prefix="world-", dir=shared if shared.is_dir() else None))
+    before = structlog.get_config()
+    world = World(seed, folder, say)
+    structlog.configure(
+        processors=[world.logged], wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG)
+    )
+    asyncio.set_event_loop(world.loop)
+    try:
+        with seams.joined(world.network, world.random):
+            world.loop.run_until_complete(world.loop.outside.start(world.run()))
+            for process in world.processes:
+                process.kill()
+        world.check_chain()
+        if world.errors:
+            raise world.errors[0]
+    finally:
+        structlog.configure(**before)
+        asyncio.set_event_loop(None)
+        world.loop.discard()
+        shutil.rmtree(folder)
