@@ -96,7 +96,7 @@ def bad_habits(prose: str) -> Iterator[tuple[int, str]]:
     if _ANY.search(prose):
         for habit in HABITS:
             for hit in re.finditer(habit.pattern, prose, re.MULTILINE):
-                yield prose.count("\n", 0, hit.start()) + 1, f"{hit[0].strip()!r}: write {habit.instead!r}"
+                yield prose.count("\n", 0, hit.end()) + 1, f"{hit[0].strip()!r}: write {habit.instead!r}"
 
 
 def said_in(source: str, nodes: Sequence[ast.AST]) -> str:

@@ -1,26 +1,18 @@
 """Tests of `appliance.api.access`."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from appliance.api.access import TokenAuthenticator
 from appliance.api.problems import ProblemError
+from appliance.base import clock
 from appliance.base.clock import using
 from appliance.channel.messages.api import TokenKept
 from appliance.store import access_tokens
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.inline_loop import run
 from tests.support.virtual_clock import VirtualClock
-
-NOW = 1_700_000_000.0
-
-
-@pytest.fixture(autouse=True)
-def _set_clock() -> Iterator[None]:
-    with using(VirtualClock(wall=NOW)):
-        yield
 
 
 def kept(row: TokenRow) -> TokenKept:
@@ -38,7 +30,7 @@ def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.
 
 def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
     """Name, role and expiry come back; the case of the scheme is ignored."""
-    row, text = make_token("alice", "operator", now=NOW, seconds=60)
+    row, text = make_token("alice", "operator", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     for scheme in ("Bearer", "bearer"):
@@ -52,7 +44,7 @@ def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
 
 def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> None:
     """A client tries again, instead of ending its session; a request without a token is rejected at once."""
-    row, text = make_token("alice", "viewer", now=NOW, seconds=60)
+    row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     assert recognise(door, f"Bearer {text}") == 503
     assert recognise(door, None) == 401
@@ -64,7 +56,7 @@ def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> No
 
 def test_an_expired_token_is_refused() -> None:
     """A token is refused after its expiry, even if it was recognised before."""
-    row, text = make_token("a", "viewer", now=NOW - 100, seconds=50)
+    row, text = make_token("a", "viewer", now=clock.wall() - 100, seconds=50)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     assert recognise(door, f"Bearer {text}") == 401
@@ -72,7 +64,7 @@ def test_an_expired_token_is_refused() -> None:
 
 def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second request with the same token skips scrypt."""
-    row, text = make_token("a", "viewer", now=NOW, seconds=60)
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     checks: list[str] = []
 
     def counted(secret: str, salt: bytes) -> bytes:
@@ -90,7 +82,7 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
 def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
     """After too many wrong secrets from one host, no more hashes are computed for it. Other hosts are unaffected."""
-    row, text = make_token("a", "viewer", now=NOW, seconds=60)
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     checks: list[str] = []
 
     def counted(secret: str, salt: bytes) -> bytes:
@@ -110,7 +102,7 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
     """A host that tries random tokens is slowed down; a valid token from the same address still works."""
-    row, text = make_token("a", "viewer", now=NOW, seconds=60)
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(5, lambda _token: None)
     door.state([kept(row)])
     statuses = [recognise(door, f"Bearer nonsense{number}") for number in range(8)]
@@ -120,8 +112,8 @@ def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
 
 def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wrong, unknown and expired tokens are not reported; a new list of tokens is followed by a new report."""
-    row, text = make_token("a", "viewer", now=NOW, seconds=600)
-    ended, late = make_token("b", "viewer", now=NOW - 100, seconds=50)
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=600)
+    ended, late = make_token("b", "viewer", now=clock.wall() - 100, seconds=50)
     used: list[str] = []
     door = TokenAuthenticator(10, used.append)
     door.state([kept(row), kept(ended)])
@@ -146,11 +138,11 @@ def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.Mo
 
 def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
     """A rotation brings the end of a token forward; a bearer that was recognised before does not outlive it."""
-    row, text = make_token("a", "viewer", now=NOW, seconds=60)
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
     bearer = recognise(door, f"Bearer {text}")
-    door.state([kept(row._replace(expires=NOW + 30))])
+    door.state([kept(row._replace(expires=clock.wall() + 30))])
     assert door.still_good(bearer)
-    door.state([kept(row._replace(expires=NOW - 1))])
+    door.state([kept(row._replace(expires=clock.wall() - 1))])
     assert not door.still_good(bearer)

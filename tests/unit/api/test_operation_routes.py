@@ -238,7 +238,7 @@ def test_control_itself_denies_what_the_api_should_have_denied(request_type: typ
         for made in (ordered(method, target, body) for method, target, body in REQUESTS)
         if type(made.request) is request_type
     )
-    another = (
+    another: tuple[str, str, Any] = (
         ("POST", "/v1/policy/confirm", None)
         if "Policy" not in request_type.__name__
         else ("POST", "/v1/recordings", {})

@@ -9,7 +9,6 @@ import msgspec
 import pytest
 
 from appliance.base import clock
-from appliance.base.clock import using
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
@@ -32,14 +31,11 @@ from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.heard import Heard
 from tests.support.memory_channel import memory_link
-from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
 
-NOW = 1_700_000_000.0
-
-VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=NOW, seconds=86_400)
-ADMIN, TOKEN = make_token("w", "admin", now=NOW, seconds=86_400)
+VIEWER, VIEWER_TOKEN = make_token("alice", "viewer", now=0.0, seconds=1e10)
+ADMIN, TOKEN = make_token("w", "admin", now=0.0, seconds=1e10)
 
 
 def kept(row: TokenRow) -> TokenKept:
@@ -123,8 +119,7 @@ def pins() -> list[str]:
 def world() -> Iterator[Everything]:
     """Return the parts around the link, whose channels are closed at the end."""
     world = Everything()
-    with using(VirtualClock(wall=NOW, now=NOW)):
-        yield world
+    yield world
     for end in world.ends:
         end.close()
 
