@@ -81,7 +81,6 @@ def _step(text: str) -> Step:
 
 
 def files_of(text: str) -> dict[str, str]:
-    """Return the files of a text."""
     first, *others = re.split(r"^--- (.*)\n", text, flags=re.MULTILINE)
     return {"x.rv": first, **dict(zip(others[::2], others[1::2], strict=True))}
 

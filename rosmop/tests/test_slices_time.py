@@ -49,7 +49,6 @@ def compiled(text: str) -> Compiled:
 
 
 def running(text: str, start: int, deadlines: int = sys.maxsize) -> MonitorSet:
-    """Return a started set."""
     monitors = MonitorSet.of(compiled(text), deadlines=deadlines)
     monitors.start(start)
     return monitors

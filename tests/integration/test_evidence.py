@@ -57,7 +57,6 @@ def proved(bundle: Path, key: Path) -> str:
 
 
 def records_of(bundle: Path) -> list[dict[str, Any]]:
-    """Return the records in the bundle."""
     with zipfile.ZipFile(bundle) as archive:
         return [json.loads(line) for line in archive.read("records.ndjson").splitlines()]
 

@@ -56,7 +56,6 @@ class SmallDisk:
         self.filler = appliance.state / "filler"
 
     def ask(self, request: admin.AdminRequest[Any]) -> admin.AdminAnswer[Any]:
-        """Return the answer to one request."""
         return AdminSocket(self.appliance.state).ask(request)
 
     def fill(self) -> None:

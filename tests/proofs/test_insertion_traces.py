@@ -57,7 +57,6 @@ def number(event: Event) -> int:
 
 @pytest.fixture(scope="module")
 def trace() -> Trace:
-    """Return the trace of one run."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-stamp-") as name:
         folder = Path(name)

@@ -111,7 +111,6 @@ class BundleSite:
             server.server_close()
 
     def connection(self, url: str, robot: str = ROBOT) -> CollectorConnection:
-        """Return a robot's connection."""
         certificate, key = self.authority.issue(robot)
         made = robot_connection(url, self.authority.ca, certificate, key)
         self.connections.append(made)

@@ -4,8 +4,6 @@ Around them are models of the relays, of `rosmaster`, of the deliveries to nodes
 their calls and give the answers that a test sets. Nothing is sent over a network.
 """
 
-# ruff: noqa: D102  the models have the methods of the classes that they replace
-
 import asyncio
 import functools
 import ipaddress

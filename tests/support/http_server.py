@@ -78,7 +78,6 @@ class Client:
         self.reader, self.writer = reader, writer
 
     async def send(self, data: bytes) -> None:
-        """Send bytes."""
         self.writer.write(data)
         await self.writer.drain()
 

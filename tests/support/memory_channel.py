@@ -17,7 +17,7 @@ class MemoryChannel(Channel):
     def __init__(self, union: Any) -> None:
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode = msgspec.msgpack.Decoder(union).decode
-        self._arrived: deque[bytes] = deque()
+        self.arrived: deque[bytes] = deque()
         self._received: Callable[[Any, tuple[int, ...]], None] | None = None
         self._ended: Callable[[], None] = lambda: None
         self._refused: Callable[[str], None] = lambda _reason: None
@@ -35,8 +35,8 @@ class MemoryChannel(Channel):
     def send_raw(self, body: bytes) -> None:
         """Send bytes that need not be a message of the link."""
         if not self.peer.closed:
-            self.peer._arrived.append(body)
-            self.peer._soon(self.peer._deliver)
+            self.peer.arrived.append(body)
+            self.peer.schedule(self.peer.deliver)
 
     def attach(
         self,
@@ -49,16 +49,16 @@ class MemoryChannel(Channel):
         self._received, self._ended = received, closed
         self._refused = refused if refused is not None else lambda _reason: closed()
         self._runs_in = loop
-        self._soon(self._end if self.peer.closed else self._deliver)
+        self.schedule(self.end if self.peer.closed else self.deliver)
 
-    def _soon(self, act: Callable[[], None]) -> None:
+    def schedule(self, act: Callable[[], None]) -> None:
         if self._runs_in is not None and not self._runs_in.is_closed():
             self._runs_in.call_soon(act)
 
-    def _deliver(self) -> None:
-        while self._arrived and self._received is not None and not self.closed:
+    def deliver(self) -> None:
+        while self.arrived and self._received is not None and not self.closed:
             try:
-                message = self._decode(self._arrived.popleft())
+                message = self._decode(self.arrived.popleft())
             except ValueError as error:
                 self.close()
                 self._refused(str(error))
@@ -71,10 +71,10 @@ class MemoryChannel(Channel):
         if not self.closed:
             self.closed = True
             if not self.peer.closed:
-                self.peer._soon(self.peer._end)
+                self.peer.schedule(self.peer.end)
 
-    def _end(self) -> None:
-        self._deliver()
+    def end(self) -> None:
+        self.deliver()
         if not self.closed:
             self.close()
             self._ended()

@@ -1,7 +1,5 @@
 """Make mirrors of the parameter tree for tests."""
 
-# ruff: noqa: D102  the models have the methods of the classes that they replace
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

@@ -5,6 +5,7 @@ Only the parts of control that answer requests are models. There is no socket, n
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 import httpx
@@ -28,11 +29,24 @@ from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.administration import Administration
+from appliance.control.block_orders import BlockOrders
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.policies import Policies
+from appliance.control.queries import Queries
+from appliance.control.recording_orders import RecordingOrders
 from appliance.control.request_methods import request_methods
 from appliance.control.rest import RestLink
+from appliance.control.standby_orders import StandbyOrders
+from appliance.control.token_orders import TokenOrders
+from appliance.hosts.certification import Certification
+from appliance.hosts.checked_ports import PortChecks
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.hosts.self_service import HostSelfService
+from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.asgi import sent
+from tests.support.idle import idle
 from tests.support.inline_loop import InlineLoop
 from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock
@@ -52,25 +66,20 @@ _ANSWERS: dict[type, Any] = {
 }
 
 
-class Part:
-    """Every part of control that answers requests, and each of its methods; an order ends with `error` if it is set."""
-
-    revision = 7
+class Carried:
+    """Answers every request instead of control's parts; an order ends with `error` if it is set."""
 
     def __init__(self) -> None:
-        self.carried_out: list[tuple[AdminRequest[Any], str | None]] = []
+        self.orders: list[tuple[AdminRequest[Any], str | None]] = []
         """The orders that took effect, each with its author."""
         self.error: Exception | None = None
 
-    def __getattr__(self, _name: str) -> "Part":
-        return self
-
-    async def __call__(self, request: AdminRequest[Any], who: str | None = None) -> Any:
+    async def out(self, request: AdminRequest[Any], who: str | None = None) -> Any:
         """Answer a request with an example."""
         if type(request) in CHANGES:
             if self.error is not None:
                 raise self.error
-            self.carried_out.append((request, who))
+            self.orders.append((request, who))
         return _ANSWERS.get(type(request)) or example(cast(Any, answer_to(type(request))))
 
 
@@ -90,7 +99,6 @@ class Tokens:
         ]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return one of them."""
         return self.rows.get(token_id)
 
     def used(self, token_id: str) -> None:
@@ -121,18 +129,32 @@ class RestWorld:
         with using(VirtualClock(wall=_NOW)):
             self._runner = asyncio.Runner(loop_factory=InlineLoop)
             self._runner.get_loop()  # which keeps this clock
-        self.part, self.tokens, self.trail = Part(), Tokens(), Trail()
+        self.carried, self.tokens, self.trail = Carried(), Tokens(), Trail()
         self.gate, self.control = make_api()
         self._ends = memory_link(ApiLink)
         self._runner.run(self._connect())
 
     async def _connect(self) -> None:
-        part: Any = self.part
+        queries, hosts = idle(Queries), idle(HostEnrolment)
+        hosts.itself, hosts.ports = idle(HostSelfService), idle(PortChecks)
         methods = request_methods(
-            queries=part, policies=part, monitors=part, hosts=part, certification=part, tokens=part,
-            recordings=part, blocks=part, evidence=part, standby=part,
-        )  # fmt: skip
-        administration = Administration(part, methods, durable=self.trail.durable, require_room=lambda: None)
+            queries=queries,
+            policies=idle(Policies),
+            monitors=idle(SpecificationManager),
+            hosts=hosts,
+            certification=idle(Certification),
+            tokens=idle(TokenOrders),
+            recordings=idle(RecordingOrders),
+            blocks=idle(BlockOrders),
+            evidence=idle(EvidenceOrders),
+            standby=idle(StandbyOrders),
+        )
+        administration = Administration(
+            queries,
+            [replace(method, answer=self.carried.out) for method in methods],
+            durable=self.trail.durable,
+            require_room=lambda: None,
+        )
         rest = RestLink(
             administration, cast(Any, self.tokens), cast(Any, self.trail), served=lambda _pin: None, require_proof=False
         )  # fmt: skip
@@ -164,7 +186,7 @@ class RestWorld:
             given = {"content": body}
         self._ends[0].messages.clear()
         self.trail.records.clear()
-        self.part.carried_out.clear()
+        self.carried.orders.clear()
         return self.play(lambda: sent(self.gate, method, target, headers=headers, **given))
 
     def bypassing(
@@ -172,7 +194,7 @@ class RestWorld:
     ) -> dict[str, Any]:
         """Send control an order with a token, as a compromised api would; return its only record."""
         self.trail.records.clear()
-        self.part.carried_out.clear()
+        self.carried.orders.clear()
 
         async def play() -> None:
             self._ends[1].send(RequestMade(10_000, request, self.tokens.texts[role], asked))

@@ -16,6 +16,5 @@ def product_files() -> Iterator[Path]:
 
 
 def files_of_tests() -> Iterator[Path]:
-    """Yield every file of the tests."""
     for folder in (ROOT / "tests", LANGUAGE_TESTS):
         yield from sorted(folder.rglob("*.py"))

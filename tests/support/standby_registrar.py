@@ -63,7 +63,6 @@ class Registrar:
             return value
 
     def change(self, number: int) -> None:
-        """Make one change."""
         topic = f"/registrar/topic_{number % _TOPICS}"
         if number % 2:
             key = f"/registrar/key_{number % _KEYS}"

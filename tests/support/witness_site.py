@@ -157,7 +157,6 @@ class Site:
         return peer
 
     def connect(self, host: Host, address: str, port: int, seconds: float = LIMIT) -> socket.socket:
-        """Connect from a host."""
         made = host.run(lambda: socket.create_connection((address, port), timeout=seconds))
         return self.sockets.enter_context(made)
 

@@ -465,7 +465,6 @@ def test_a_slot_that_another_file_fills_is_found(begin: str, value: str) -> None
 
 
 def parsed(path: str, text: str) -> Source:
-    """Return a parsed source."""
     return Source(path, text, list(ast.walk(ast.parse(text))))
 
 

@@ -130,7 +130,6 @@ def test_compiled_properties_are_proved(logic: str) -> None:
 
 
 def tables_of(compiled: CompiledProperty) -> AutomatonTables:
-    """Return the automaton of a property."""
     assert isinstance(compiled, FiniteProperty | TimedStateMachine)
     made = compiled.automaton
     timeouts = compiled.timeouts if isinstance(compiled, TimedStateMachine) else ()

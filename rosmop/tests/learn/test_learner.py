@@ -45,7 +45,6 @@ class Recorded:
         return self.rows[-1][1]
 
     def messages(self) -> Iterator[Row]:
-        """Return all messages."""
         return iter(self.rows)
 
 

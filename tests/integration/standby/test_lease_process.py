@@ -57,7 +57,6 @@ class Site:
         self.gate = WitnessGate(self._rules, peers, "nonce")
 
     def bound(self, address: str, port: int) -> socket.socket:
-        """Return a socket with this address."""
         sock = self.hosts[address].run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         sock.bind((address, port))
         sock.settimeout(0.05)

@@ -52,7 +52,6 @@ class FleetSite:
         self.token = self.run("token", "add", "tester").stdout.strip()
 
     def write_config(self, **changes: Any) -> None:
-        """Write the configuration."""
         config = {
             "data": str(self.data), "listen": f"127.0.0.1:{self.port}", "certificate": str(self.server.certificate),
             "key": str(self.server.key), "database": self.database, "limits": {"reserve_bytes": 1} | self.limits,
@@ -150,7 +149,6 @@ class FleetSite:
         return sum(1 for _file in (self.data / "segments").rglob("*.gz"))
 
     def health(self) -> dict[str, Any]:
-        """Return the health."""
         return self.answer("/v1/health")
 
     def indexed(self) -> None:

@@ -32,7 +32,6 @@ class Carrier:
         self.token = site.run("token", "add", "olga", "--role", "operator").stdout.strip()
 
     def add(self, bundle: bytes, robot: str = "arm1", token: str = "") -> httpx.Response:
-        """Add a bundle."""
         with self.site.client() as client:
             headers = {"Authorization": f"Bearer {token or self.token}"}
             return client.post("/v1/evidence", params={"robot": robot}, content=bundle, headers=headers)

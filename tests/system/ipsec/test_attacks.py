@@ -47,7 +47,6 @@ def kit(site: TunnelSite) -> Path:
 
 @pytest.fixture(scope="module")
 def other(site: TunnelSite) -> Host:
-    """Return another host."""
     return site.lab.host("other", f"{OTHER}/24")
 
 
@@ -72,7 +71,6 @@ class Datagrams:
         threading.Thread(target=self._read, daemon=True).start()
 
     def next(self) -> tuple[bytes, str]:
-        """Return the next one."""
         return self._arrived.get(timeout=LIMIT)
 
     def first_of(self, word: bytes, send: Callable[[bytes], None]) -> str:

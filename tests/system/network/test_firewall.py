@@ -171,7 +171,6 @@ def test_a_port_opened_by_notrack_rules_stays_closed(protected: Host, backend: B
 
 
 def run_in(host: Host, command: str) -> None:
-    """Run a command on a host."""
     process = host.popen(command.split())
     assert process.wait(timeout=30) == 0, command
 

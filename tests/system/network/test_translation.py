@@ -37,7 +37,6 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture
 def machine(lab: Lab) -> Host:
-    """Return the machine."""
     return lab.hosts["machine"]
 
 

@@ -47,7 +47,6 @@ class Client:
 
 @pytest.fixture
 def client() -> Client:
-    """Return a client."""
     return Client(Settings())
 
 

@@ -166,7 +166,7 @@ def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
     answer = world().asked(method, target, body, role, tag)
     assert answer.status_code in (200, 201), answer.text
     [made] = world().made
-    assert world().part.carried_out == [(made.request, f"a-{role}")]
+    assert world().carried.orders == [(made.request, f"a-{role}")]
     return made
 
 
@@ -219,7 +219,7 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
             if expected[1]:
                 require_problem(answer, *expected)
             changes = operation.is_change and not dry and not expected[1]
-            assert [who for _order, who in world().part.carried_out] == [f"a-{role}"] * changes, case
+            assert [who for _order, who in world().carried.orders] == [f"a-{role}"] * changes, case
             if role is None:  # the journal folds equal calls without a token
                 assert {one["decision"] for one in world().trail.records} <= {"deny"}
             elif operation.is_change:
@@ -251,7 +251,7 @@ def test_control_itself_denies_what_the_api_should_have_denied(request_type: typ
                 "deny",
                 f"a-{role}",
             )
-            assert not world().part.carried_out
+            assert not world().carried.orders
 
 
 REJECTIONS = (
@@ -278,12 +278,12 @@ def test_a_rejection_by_control_is_a_problem(
     method, target, body = request_
     if kind == "refused" and target.startswith("/v1/monitors"):
         kind = "specifications-refused"
-    world().part.error = error
+    world().carried.error = error
     try:
         with capture_logs():
             answer = world().asked(method, target, body, tag="*")
     finally:
-        world().part.error = None
+        world().carried.error = None
     assert answer.status_code == status, answer.text
     require_problem(answer, status, kind)
     assert "secret" not in answer.text
@@ -411,7 +411,7 @@ def test_pruning_is_for_admins() -> None:
     assert world().asked("POST", target, None, "admin", "*").status_code == 200
     answer = world().asked("POST", target, None, "operator", "*")
     assert "removing files that the folder does not have is for admins" in answer.text
-    assert not world().part.carried_out
+    assert not world().carried.orders
 
 
 BY_HAND = {

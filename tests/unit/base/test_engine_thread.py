@@ -29,7 +29,6 @@ class Engine:
         return now + self._dues.pop(0) if self._dues else math.inf
 
     def end(self, thread: EngineThread) -> bool:
-        """End the thread."""
         self.closed = True
         return thread.end(_LIMIT)
 

@@ -131,7 +131,6 @@ def site(tmp_path: Path) -> BundleSite:
 
 @pytest.fixture
 def authority(site: BundleSite) -> FleetAuthority:
-    """Return the fleet's authority."""
     return site.authority
 
 
@@ -157,8 +156,6 @@ def pusher(authority: FleetAuthority, make_log: MakeLog, path: Path, tmp_path: P
 
 @pytest.fixture
 def poller(site: BundleSite, tmp_path: Path) -> Client:
-    """Return the client that polls for bundles."""
-
     def step(url: str) -> str:
         authority = site.authority
         collector = robot_connection(url, authority.ca, *authority.issue(ROBOT))

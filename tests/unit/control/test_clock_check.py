@@ -27,7 +27,6 @@ class Trail:
 
 @pytest.fixture
 def trail() -> Trail:
-    """Return a trail."""
     return Trail()
 
 

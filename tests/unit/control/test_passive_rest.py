@@ -31,7 +31,6 @@ class Standby:
     """A standby that hands nothing over."""
 
     def state(self) -> StandbyState:
-        """Return its state."""
         return example(StandbyState, role="standby", other={"name": "a", "address": "10.0.0.1"})
 
     async def hand_over(self) -> None:

@@ -185,7 +185,6 @@ class Slow:
         return []
 
     async def until_begun(self) -> None:
-        """Wait until the tests run."""
         assert await asyncio.to_thread(self.begun.wait, 10)
 
 

@@ -81,7 +81,6 @@ class Everything:
         return [kept(VIEWER), kept(ADMIN)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
-        """Return one of them."""
         return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
 
     def used(self, token_id: str) -> None:

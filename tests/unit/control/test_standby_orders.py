@@ -27,7 +27,6 @@ class Pair:
         self.did: list[str] = []
 
     def state(self) -> StandbyState:
-        """Return the state."""
         other = {"name": "b", "address": "10.0.0.2"}
         return example(StandbyState, name="a", role=self.role, other=other)
 

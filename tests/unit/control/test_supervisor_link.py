@@ -56,7 +56,6 @@ class Supervisor:
         self._channel.send(message)
 
     def close(self) -> None:
-        """Close it."""
         self._channel.close()
 
 
@@ -68,7 +67,6 @@ def answers() -> list[TunnelsEnclosed]:
 
 @pytest.fixture
 async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLifeline, Supervisor]]:
-    """Yield both ends of a lifeline."""
     ours, theirs = socket.socketpair()
     lifeline = ControlLifeline(theirs.detach(), asyncio.Event(), answers.append, print, print)
     supervisor = Supervisor(ours)

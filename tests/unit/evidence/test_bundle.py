@@ -46,7 +46,6 @@ Members = dict[str, bytes]
 
 
 def members_of(bundle: Path) -> Members:
-    """Return all members of a bundle."""
     with zipfile.ZipFile(bundle) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 

@@ -24,7 +24,6 @@ __all__ = ["control", "key", "make_log", "notary", "path"]
 
 @pytest.fixture
 def workers() -> Iterator[Workers]:
-    """Return one worker."""
     made = Workers(1)
     yield made
     made.close()

@@ -25,7 +25,6 @@ class _Clock:
 
 @pytest.fixture
 def clock() -> _Clock:
-    """Return a clock."""
     return _Clock()
 
 

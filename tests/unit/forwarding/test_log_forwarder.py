@@ -75,7 +75,6 @@ def forwarder(path: Path, kept: Kept, chosen: Chosen = "all") -> LogForwarder:
 
 
 def run(one: LogForwarder, steps: int = 100) -> None:
-    """Step the forwarder until it has to wait."""
     for _ in range(steps):
         if one.step() > 0:
             return

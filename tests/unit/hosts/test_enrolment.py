@@ -219,8 +219,6 @@ def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: str) -> None:
-    """Run a test's work on a bench."""
-
     async def inside() -> None:
         bench = Bench(directory, **options)
         try:

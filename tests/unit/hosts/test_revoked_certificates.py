@@ -32,7 +32,6 @@ def serials(count: int) -> list[str]:
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
-    """A state."""
     one = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield one
     one.close()

@@ -37,7 +37,6 @@ def everything(host: object) -> list[Request]:
 
 
 def compiled(text: str) -> Policy:
-    """Return the policy."""
     return compile_policy(text, file="p.ini", hosts=KNOWN.hosts, robot=KNOWN.robot)
 
 

@@ -26,7 +26,6 @@ def seen(
 
 
 def compiled(learned: LearnedPolicy) -> Policy:
-    """Return the learned policy."""
     return compile_policy(learned.text, file="learned", robot=[ROBOT])
 
 

@@ -36,7 +36,6 @@ shutdown = localhost
 
 
 def compiled(text: str, **given: object) -> Policy:
-    """Return a policy from text."""
     return compile_policy(text, file="p.ini", **given)  # type: ignore[arg-type]  # forwarded as given
 
 

@@ -98,7 +98,6 @@ class Costs:
         raise AssertionError(f"not within 1000 turns: {self.order[-20:]}")
 
     def close(self) -> None:
-        """Close all."""
         self.loop.close()
         for sock in self._open:
             sock.close()

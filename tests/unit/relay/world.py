@@ -155,7 +155,6 @@ class World:
         self.engine.attach(self.link)
 
     def listen(self) -> socket.socket:
-        """Return a listening socket of the test."""
         sock = socket.create_server((LOOPBACK, 0))
         sock.setblocking(False)
         self.open.append(sock)

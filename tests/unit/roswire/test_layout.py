@@ -49,7 +49,6 @@ def read_leaf(leaf: FixedField, data: bytes, position: int) -> Any:
 
 
 def read_element(part: ArrayPart, data: bytes, position: int) -> tuple[Any, int]:
-    """Read one element of an array."""
     if part.layout is not None:
         values, end = read(part.layout, data, position)
         assert part.element_size in (None, end - position)
@@ -61,7 +60,6 @@ def read_element(part: ArrayPart, data: bytes, position: int) -> tuple[Any, int]
 
 
 def read_string(data: bytes, position: int) -> tuple[str, int]:
-    """Read a string."""
     (size,) = struct.unpack_from("<I", data, position)
     return data[position + 4 : position + 4 + size].decode(), position + 4 + size
 

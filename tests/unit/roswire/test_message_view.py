@@ -24,7 +24,6 @@ LONG = Definitions.from_files(
 
 
 def inner(x: float, name: str) -> bytes:
-    """Return the bytes of an a/Inner."""
     return struct.pack("<dI", x, len(name)) + name.encode()
 
 

@@ -27,7 +27,6 @@ class QuotaClasses:
     now: float = 0.0
 
     def __call__(self, host: Address) -> QuotaClass:
-        """Return the class of this host."""
         return self.of.get(host, QuotaClass.UNKNOWN)
 
     def clock(self) -> float:
@@ -65,7 +64,6 @@ class Guest:
 def books(
     quota_classes: QuotaClasses, connections: Bounds, held: Bounds | None = None
 ) -> ConnectionTable[Address]:
-    """Return the table of a test."""
     bytes_ = held or Bounds(1000, 1000, 0, 0)
     return ConnectionTable(
         quota_classes,

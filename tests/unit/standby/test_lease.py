@@ -319,7 +319,6 @@ def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
 
 
 def exchanged(channel: WitnessChannel, robot: Robot, request: WitnessRequest) -> WitnessAnswer | None:
-    """Return the witness's answer to a request."""
     datagram = robot.gate.answer(channel.write(request), "10.0.0.2")
     assert datagram is not None
     found = channel.read(datagram)

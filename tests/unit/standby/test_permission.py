@@ -57,7 +57,6 @@ class Store:
         self.number = 0
 
     def follow(self, _notice: object, _room: int) -> Feed:
-        """Return a feed."""
         return Feed()
 
     async def settled(self) -> None:

@@ -67,7 +67,6 @@ SECONDS = 2 * LIMIT
 
 
 async def until(condition: Callable[[], Any]) -> None:
-    """Wait for a condition."""
     while not condition():
         await asyncio.sleep(0.01)
 

@@ -48,7 +48,6 @@ class Side:
         self.process = self._start()
 
     def lines(self) -> Iterator[str]:
-        """Yield its lines."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             yield line.strip()

@@ -184,7 +184,6 @@ def test_rules_that_another_program_removed_are_written_again() -> None:
 
 
 def request(name: str = "a", key: bytes | None = None, **body: object) -> bytes:
-    """Return a request."""
     full = {"boot": "nonce", "session": "mine", "number": 1, "do": "claim", "epoch": 1} | body
     return seal(REQUEST, name, key or KEYS[name], full)
 

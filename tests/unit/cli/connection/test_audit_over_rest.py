@@ -26,7 +26,6 @@ class Answer:
         self._breaks = breaks
 
     def iter_lines(self) -> Iterator[str]:
-        """Yield the lines."""
         yield from self._lines
         if self._breaks:
             raise NotRunningError("the connection broke")
@@ -55,7 +54,6 @@ class Rest:
 
 
 def log_of(*answers: Answer | Exception) -> RestLog:
-    """Return the log of this REST."""
     return RestLog(cast(RestClient, Rest(*answers)))
 
 

@@ -32,7 +32,6 @@ def reset(state: Path, *options: str) -> tuple[int, str]:
 
 
 def last(state: Path) -> MonitorRevisionRow | None:
-    """Return the last revision."""
     store = StateStore(state / "control", failed=print, kind=InlineDatabase)
     try:
         return next(iter(store.monitor_revisions(1)), None)

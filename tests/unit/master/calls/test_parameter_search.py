@@ -50,7 +50,6 @@ class Site:
         return [-1, f"Cannot find parameter [{key}] in an upwards search", ""]
 
     def search(self, caller_id: str, key: str, *, own: bool = False) -> Answer:
-        """Make one search."""
         peer = Peer(ipaddress.ip_address(HOST), HOST, "10.0.0.1")
         caller = Caller(peer, caller_id, 0, own=own)
         return autojump.run(self.calls.search_param(caller, key))

@@ -55,7 +55,6 @@ class Post:
         self.lost.append((incarnation.name, call.parameters[0]))
 
     def node_on(self, host: str, name: str) -> Incarnation:
-        """Return a node of another host."""
         node = self.world.node(name)
         node.host = ipaddress.ip_address(host)
         return node

@@ -71,7 +71,6 @@ HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 9)]
 
 
 def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation:
-    """Return an incarnation with these ports."""
     uri = "http://127.0.0.1:4000/"
     outer, relay, *more = ports
     api = parse_node_uri(uri)

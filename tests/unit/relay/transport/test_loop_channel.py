@@ -56,7 +56,6 @@ def send(sock: socket.socket, count: int) -> None:
 
 @pytest.fixture
 def ends() -> Iterator[Ends]:
-    """Yield both ends."""
     ends = Ends()
     yield ends
     ends.close()

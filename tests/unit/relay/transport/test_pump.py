@@ -28,7 +28,6 @@ _ROOM = 64
 
 
 def frame(body: bytes) -> bytes:
-    """Return a frame with this body."""
     return struct.pack("<I", len(body)) + body
 
 
@@ -81,7 +80,6 @@ class Pumped:
             return b""
 
     def close(self) -> None:
-        """Close all."""
         self.epoll.close()
         for pair in self.pairs:
             for sock in pair:
