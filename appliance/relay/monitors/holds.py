@@ -1,4 +1,4 @@
-"""Monitors that hold their topics: those that begin to when specifications are loaded, and the report for control.
+"""Monitors that hold their topics: those that begin to when specifications are loaded, and the report for control."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
