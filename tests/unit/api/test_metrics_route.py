@@ -1,7 +1,6 @@
 """Tests of `appliance.telemetry.metrics` and `appliance.api.metrics_route`."""
 
 import os
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
 from appliance.api.metrics_route import rendered, rendered_standby
+from appliance.base import clock
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import RecorderState
@@ -57,7 +57,7 @@ def body(
         memory={"latched": 12},
         limited=[("/scan", "publisher", 3)],
         hosts=[
-            host("a", "up", remote="10.0.0.9", seconds=7, bytes_in=100, bytes_out=50, expires=time.time() + 1000),
+            host("a", "up", remote="10.0.0.9", seconds=7, bytes_in=100, bytes_out=50, expires=clock.wall() + 1000),
             host("b", "revoked", revoked=5.0),
             host("c", "not enrolled", serial=None),
         ],
