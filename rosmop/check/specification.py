@@ -22,11 +22,13 @@ from rosmop.check.reachable_types import identity, reached
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
+from rosmop.check.traps import rival_changes, traps
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
 from rosmop.form.findings import Diagnostic, SpecificationError
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
+from rosmop.run.state import MOST_BYTES
 from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.types.messages import MessageTypes, nearest, shown
@@ -87,6 +89,8 @@ def _compile_all(
             compiled.append(code)
     _check_types(shared, compiled)
     shared.findings += bypassing(compiled, shared.publications, shared.functions)
+    shared.findings += rival_changes([specification for _, specification in pairs])
+    shared.findings += _same_names(shared.specifications)
     return compiled
 
 
@@ -98,6 +102,10 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
+    if MOST_BYTES < size <= MAX_BYTES:
+        text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"
+        text += " a restart of the relay loses it"
+        shared.findings.append(Diagnostic(specification.position, "warning", text))
     if size > MAX_BYTES:
         shared.findings.append(
             Diagnostic(
@@ -111,8 +119,7 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
 
 def _check_names(shared: CompilationContext, specifications: Sequence[tree.Specification]) -> None:
     seen: dict[str, tree.Specification] = {}
-    owners: dict[str, str] = {}
-    for specification, names in zip(specifications, shared.specifications, strict=True):
+    for specification in specifications:
         if specification.name in seen:
             first = seen[specification.name].position
             text = (
@@ -120,13 +127,18 @@ def _check_names(shared: CompilationContext, specifications: Sequence[tree.Speci
             )
             shared.findings.append(Diagnostic(specification.position, "error", text))
         seen[specification.name] = specification
-        for variable in names.variables.values():
-            if variable.sliced:
+
+
+def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagnostic]:
+    """Yield warnings about variables of the same name in specifications that use variables of each other."""
+    for place, names in enumerate(specifications):
+        for other in specifications[:place]:
+            if other.name not in names.uses and names.name not in other.uses:
                 continue
-            other = owners.setdefault(variable.name, names.name)
-            if other != names.name:
-                text = f"{shown(variable.name)} is also a variable of {other}; each has its own"
-                shared.findings.append(Diagnostic(variable.position, "warning", text))
+            for name, variable in names.variables.items():
+                if name in other.variables and not (variable.sliced or other.variables[name].sliced):
+                    text = f"{shown(name)} is also a variable of {other.name}; each has its own"
+                    yield Diagnostic(variable.position, "warning", text)
 
 
 def _compile(
@@ -153,6 +165,7 @@ def _compile(
     known = tuple(code for code in properties if code is not None)
     shared.findings += unused_events(specification, known)
     shared.findings += lint_statements(specification)
+    shared.findings += traps(specification)
     if names.parameters:
         shared.findings += kept_slices(names.name, good, known, specification.properties)
     variables = {variable.name: variable.code for variable in names.variables.values()}

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from rosmop.check.call_expressions import stream_of
@@ -14,6 +15,9 @@ from rosmop.text import tree
 from rosmop.types.messages import shown
 
 _DEFAULT = re.compile(r"[\[,]\s*+default\s++[A-Za-z_]")
+_WITHOUT_UNIT = re.compile(
+    r"\b((?:within|timeout)\s+(\d+(?:\.\d+)?))(?![\d.]|\s*[num]?s\b|\s*(?:m|h|min|us)\b)"
+)
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
@@ -30,6 +34,9 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagn
         handler = f"`@{compiled.categories[-1]} {{ … }}`"
         text = f"this property has no effect without a handler; write {handler} after it"
         findings.append(Diagnostic(node.position, "warning", text))
+    for bound in _WITHOUT_UNIT.finditer(compiled.formula):
+        text = f"`{bound[1]}` has no unit, so it is {bound[2]} s; write `{bound[2]}s` or `{bound[2]}ms`"
+        findings.append(replace(compiled.source.finding(bound.start(), text), severity="warning"))
     for fact in analyse(compiled, [category for category in handlers if category in compiled.categories]):
         position = handlers.get(fact.category) if fact.kind == "never runs" else node.position
         trace = f" (shortest trace: {' '.join(fact.trace)})" if fact.trace else ""

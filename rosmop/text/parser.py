@@ -76,8 +76,23 @@ def _parse(text: str, file: str) -> Tree[Token]:
         offset = len(text) if at_end or error.pos_in_stream is None else error.pos_in_stream
         if text[offset - 1 : offset + 1] == "->":
             offset -= 1
+        early = _ended_early(text, offset)
+        if early is not None:
+            advice = (
+                "a comment ends at the first `*/`: here in `/*/`; write a space before its `/`, or use `//`"
+            )
+            raise SpecificationError.at(start_of(file, text, early), advice) from None
         begin, message = describe(text, offset, _accepted(error))
         raise SpecificationError.at(start_of(file, text, begin), message) from None
+
+
+def _ended_early(text: str, offset: int) -> int | None:
+    """Return where the last comment before an error ends in a name such as `/*/cmd_vel`; None if it does not."""
+    comments = [piece for piece in _PREPROCESSED.finditer(text, 0, offset) if piece["comment"]]
+    last = comments[-1] if comments else None
+    if last is None or not last[0].startswith("/*") or not last[0][2:].endswith("/*/"):
+        return None
+    return last.end() - 3 if text[last.end() : offset].count("\n") <= 1 else None
 
 
 def start_of(file: str, text: str, offset: int) -> Position:
@@ -134,6 +149,9 @@ def _check_directives(text: str, file: str) -> None:
         word, place = piece["word"], piece.start()
         if word in _CONDITIONS:
             conditions.append((word, place))
+        elif word == "include" and (included := re.search(r'"([^"\n]*\.rv)"', piece[0])):
+            instead = f"load {included[1]} with this file: its variables are seen here, but not its functions"
+            raise _directive_error(text, file, place, f'#include "{included[1]}"', instead)
         elif word == "endif":
             del conditions[-1:]
         elif word == "define":

@@ -1,0 +1,141 @@
+"""Warn of valid code that lets an unsafe message pass, or stops a safe one, against its author's likely intention."""
+
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+
+from rosmop.form.findings import Diagnostic
+from rosmop.text import tree
+from rosmop.types.messages import shown
+
+_FLOATING = frozenset({("double",), ("float",)})
+_MIN_MAX = frozenset({("std", "min"), ("std", "max"), ("min",), ("max",)})
+_TESTS_OF_NAN = frozenset({"isnan", "isfinite", "isinf"})
+_UNORDERED = frozenset({"<", "<=", ">", ">="})
+
+
+def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
+    """Yield warnings about the events of a specification."""
+    tests = {node.parts[-1] for node in tree.walk(specification) if isinstance(node, tree.Name)}
+    for event in specification.events:
+        yield from _always_dropped(event)
+        yield from _lost_changes(event)
+        if not tests & _TESTS_OF_NAN:
+            yield from _passed_nan(event)
+
+
+def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:
+    """Warn of an event that drops every message, although its action has conditions."""
+    decides = any(
+        isinstance(node, tree.IfStatement | tree.SwitchStatement) for node in tree.walk(event.action)
+    )
+    if isinstance(event.trigger, tree.MessageTrigger) and decides and _ends(event.action):
+        text = (
+            f"{shown(event.name)} drops every message, because each path ends with `return;`, which drops it"
+        )
+        yield Diagnostic(
+            event.position, "warning", f"{text}; leave out the `return;` of the path that passes"
+        )
+
+
+def _ends(statement: tree.Statement | None) -> bool:
+    """Whether each path through a statement drops the message."""
+    match statement:
+        case tree.ReturnStatement():
+            return True
+        case tree.Block(statements=statements):
+            return any(isinstance(one, tree.DropStatement) or _ends(one) for one in statements)
+        case tree.IfStatement(yes=yes, no=no):
+            return _ends(yes) and _ends(no)
+    return False
+
+
+def _lost_changes(event: tree.EventDefinition) -> Iterator[Diagnostic]:
+    """Warn of a field that is assigned just before the message is dropped."""
+    fields = {parameter.name for parameter in event.parameters}
+    for block in tree.walk(event.action):
+        if not isinstance(block, tree.Block) or not _ends(block):
+            continue
+        for statement in block.statements:
+            if isinstance(statement, tree.ExpressionStatement) and (name := _assigned(statement)) in fields:
+                text = f"the new value of {shown(name)} is lost, because this path drops the message"
+                yield Diagnostic(
+                    statement.position,
+                    "warning",
+                    f"{text}; to send the changed message, leave out the `return;`",
+                )
+
+
+def _assigned(statement: tree.ExpressionStatement) -> str:
+    """Return the first name of the target of an assignment; empty for another statement."""
+    target = statement.expression
+    if not isinstance(target, tree.Assignment):
+        return ""
+    place: object = target.target
+    while not isinstance(place, tree.Name):
+        if not isinstance(place, tree.SyntaxNode):
+            return ""
+        place = tree.fields_of(place)[1]
+    return place.parts[0]
+
+
+def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
+    """Warn of a bound that NaN passes: each comparison with it is false, and `std::min` may return it."""
+    numbers = {one.name for one in event.parameters if one.type.name in _FLOATING}
+    for node in tree.walk(event.action):
+        match node:
+            case tree.IfStatement(
+                condition=tree.BinaryExpression(operator=operator) as bound, yes=yes, no=None
+            ):
+                found = numbers & {_name(bound.left), _name(bound.right)}
+                if operator in _UNORDERED and found and (_ends(yes) or found & _assigned_in(yes)):
+                    (name,) = list(found)[:1]
+                    text = (
+                        f"NaN passes this bound of {shown(name)}, because each comparison with NaN is false"
+                    )
+                    yield Diagnostic(
+                        bound.position,
+                        "warning",
+                        f"{text}; negate the opposite comparison (`!(x <= 1)`), or use `isnan`",
+                    )
+            case tree.CallExpression(callee=tree.Name(parts=parts)) if parts in _MIN_MAX:
+                for name in sorted(numbers & {_name(argument) for argument in node.arguments}):
+                    text = f"`{parts[-1]}` passes NaN in {shown(name)} on, or takes it for the other bound"
+                    yield Diagnostic(node.position, "warning", f"{text}; test it with `isnan` before")
+
+
+def _name(node: tree.Expression) -> str:
+    return node.parts[0] if isinstance(node, tree.Name) else ""
+
+
+def _assigned_in(statement: tree.Statement) -> set[str]:
+    return {_assigned(node) for node in tree.walk(statement) if isinstance(node, tree.ExpressionStatement)}
+
+
+def rival_changes(specifications: Sequence[tree.Specification]) -> Iterator[Diagnostic]:
+    """Yield warnings about two specifications that change the same field of a topic: the later one decides."""
+    changed = [
+        (specification, topic, field, binding)
+        for specification in specifications
+        for topic, field, binding in _changes(specification)
+    ]
+    seen: set[tuple[str, str, str]] = set()
+    for (first, topic, one, _), (second, there, other, binding) in combinations(changed, 2):
+        same = one == other or one.startswith(f"{other}.") or other.startswith(f"{one}.")
+        key = first.name, second.name, topic
+        if first is not second and topic == there and same and key not in seen:
+            seen.add(key)
+            text = f"{first.name} also changes {other} of {topic}; the order of the files decides: {second.name} has"
+            yield Diagnostic(binding.position, "warning", f"{text} the last word")
+
+
+def _changes(specification: tree.Specification) -> Iterator[tuple[str, str, tree.Binding]]:
+    for event in specification.events:
+        if isinstance(event.trigger, tree.MessageTrigger):
+            assigned = _assigned_in(event.action)
+            for binding in event.trigger.pattern:
+                if binding.variable in assigned:
+                    path = ".".join(
+                        step.name if step.index is None else f"{step.name}[{step.index}]"
+                        for step in binding.path
+                    )
+                    yield event.trigger.topic, path, binding
