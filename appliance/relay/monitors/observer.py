@@ -107,9 +107,18 @@ class Observer:
     def report(
         self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
     ) -> None:
-        """Report everything in an outcome except its result, and publish its messages."""
+        """Publish the messages of an outcome; then report everything in it except its result.
+
+        A published message may be a stop, so it waits for no report.
+        """
+        self._send(outcome)
+        self._report(outcome, point, observed)
+
+    def _report(
+        self, outcome: Outcome, point: ObservationPoint, observed: ObservedMessage | None = None
+    ) -> None:
         for earlier in outcome.before:
-            self.report(earlier, NOWHERE)
+            self._report(earlier, NOWHERE)
         if outcome.began_holding:
             self._held()
         if outcome.events:
@@ -133,20 +142,25 @@ class Observer:
                 after=published.data[:SHOWN],
                 size=len(published.data),
             )
-            self._send(outcome, number, point)
+            if (judged := outcome.judged.get(number)) is not None:
+                self._judged(judged, _of_publication(point, published.topic), published.data)
 
-    def _send(self, outcome: Outcome, number: int, point: ObservationPoint) -> None:
-        """Publish a message, unless a monitor behind its publisher has dropped it; report what those monitors did."""
-        published, judged = outcome.published[number], outcome.judged.get(number)
-        if judged is not None:
-            there = _of_publication(point, published.topic)
-            self.report(judged, there)
-            if judged.result == "dropped":
-                self.dropped(judged, there, memoryview(published.data))
-                return
-            if judged.result == "changed":
-                self.changed(judged, there, published.data[:SHOWN], len(published.data))
-        self._publish(published.topic, published.data if judged is None else bytes(judged.buffer))
+    def _send(self, outcome: Outcome) -> None:
+        """Publish the messages of an outcome in the order in which they were published."""
+        for earlier in outcome.before:
+            self._send(earlier)
+        for published in outcome.sent():
+            self._publish(published.topic, published.data)
+        for judged in outcome.judged.values():
+            self._send(judged)
+
+    def _judged(self, judged: Outcome, point: ObservationPoint, data: bytes) -> None:
+        """Report the effects of the monitors behind a publisher on its message, which had these bytes."""
+        self._report(judged, point)
+        if judged.result == "dropped":
+            self.dropped(judged, point, memoryview(data))
+        elif judged.result == "changed":
+            self.changed(judged, point, data[:SHOWN], len(data))
 
     def report_line(
         self,

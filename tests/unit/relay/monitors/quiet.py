@@ -45,7 +45,7 @@ class Reports:
 class QuietMonitors:
     """An interceptor whose specifications are loaded at once; `published` has what its monitors publish."""
 
-    def __init__(self) -> None:
+    def __init__(self, publish: Callable[[str, bytes], None] | None = None) -> None:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []
         loop: Any = Timers()
@@ -54,7 +54,7 @@ class QuietMonitors:
             loop,
             reporter,
             budget=1.0,
-            publish=lambda topic, data: self.published.append((topic, data)),
+            publish=publish or (lambda topic, data: self.published.append((topic, data))),
             changed=lambda _topics: None,
         )
         self.interceptor._loader = self  # type: ignore[assignment]  # without its thread
