@@ -52,6 +52,7 @@ class LaunchPlan(msgspec.Struct, frozen=True):
     argv: tuple[str, ...] = ()
     environment: dict[str, str] = {}
     ended_early: int = 0
+    nice: int = 0
 
 
 def title_of(role: str, index: int | None) -> str:
@@ -87,6 +88,7 @@ def _prepare(plan: LaunchPlan) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     privileges.raise_file_limit(plan.files)
     privileges.raise_oom_score(plan.ended_early)
+    os.nice(plan.nice)
     if plan.view is not None:
         private_view.enter(plan.view, plan.account)
     if not plan.network:

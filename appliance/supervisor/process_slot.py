@@ -95,6 +95,7 @@ class ProcessSlot:
             path=str(role.path(facts)) if role.path else None,
             capabilities=role.capabilities,
             ended_early=role.ended_early,
+            nice=role.nice,
             takes_secret=role.secret is not None,
             secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
         )

@@ -80,7 +80,8 @@ class Role:
     is its descriptor or None. `inputs` are files and folders of the operator, which the supervisor opens for the
     role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
     besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
-    kills a higher one earlier if memory is short.
+    kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
+    no console delays a stop.
     """
 
     name: str
@@ -107,6 +108,7 @@ class Role:
     secret: Callable[[Facts], Path | None] | None = None
     inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
     ended_early: int = 0
+    nice: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
 
 
@@ -176,7 +178,7 @@ ROLES = (
     ),
     Role(
         "compiler", "rosrv-compiler", "compiler", "appliance.compiler.process:main",
-        ended_early=700, links=("control",), network=False, dispensable=True, on_demand=True,
+        ended_early=700, nice=5, links=("control",), network=False, dispensable=True, on_demand=True,
         sandbox=lambda _facts: SandboxPlan(allowlist=True),
     ),
     Role(
@@ -195,7 +197,7 @@ ROLES = (
     ),
     _ours(
         "api", "rosrv-api", "api", "appliance.api.process:main",
-        ended_early=800, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
+        ended_early=800, nice=10, files=4096, after="control", listens=True, dispensable=True, stands_by=True,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
         ),
@@ -212,7 +214,7 @@ ROLES = (
     ),
     _ours(
         "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
-        ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api",
         inputs=lambda facts: facts.syslog_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
@@ -223,7 +225,7 @@ ROLES = (
     ),
     _ours(
         "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
-        ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api",
         inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
@@ -234,7 +236,7 @@ ROLES = (
     ),
     _ours(
         "bundles", "rosrv-bundles", "bundles", "appliance.bundles.process:main",
-        ended_early=600, after="control", dispensable=True, inputs=lambda facts: facts.fleet_reads,
+        ended_early=600, nice=10, after="control", dispensable=True, inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,
             families=ROUTES,

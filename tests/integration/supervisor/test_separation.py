@@ -79,6 +79,16 @@ def test_the_order_of_oom_kills(appliance: Appliance) -> None:
     assert scores["rosmaster"] == scores["signer"] == own
 
 
+def test_the_weights_of_processes(appliance: Appliance) -> None:
+    """The api, the compiler and the forwarders yield the processor to the processes that carry messages and calls."""
+    nice = {
+        role: os.getpriority(os.PRIO_PROCESS, int(row["pid"])) - os.getpriority(os.PRIO_PROCESS, 0)
+        for role, row in appliance.processes().items()
+    }
+    assert nice["api"] == 10
+    assert nice["relay"] == nice["control"] == nice["rosmaster"] == 0
+
+
 def test_planted_code_is_not_loaded_at_the_next_start(appliance: Appliance) -> None:
     """Code that a compromised process, or a backup, puts into Python's user folders is never loaded."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
