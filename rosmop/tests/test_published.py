@@ -1,4 +1,4 @@
-"""Messages that a monitor publishes go through the monitors behind it, and never in a circle."""
+"""Published messages go through the monitors behind their publisher, and never in a circle."""
 
 import pytest
 
@@ -36,8 +36,8 @@ def test_published_messages_step_properties_and_are_dropped() -> None:
     assert monitors.value("count", "n") == 3
 
 
-def test_publications_of_timers_and_init_are_judged() -> None:
-    """Each place that can publish is followed by the monitors behind it."""
+def test_messages_of_timers_are_judged() -> None:
+    """Publications of a tick go through the monitors behind it."""
     tick = """p() { geometry_msgs::Twist t;
         event e() every 1s { t.linear.x = 9; PUBLISH(/cmd_vel, geometry_msgs/Twist, t); } }"""
     [outcome] = load(tick, y=CAP).advance(10**9)

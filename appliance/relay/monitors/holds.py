@@ -1,4 +1,4 @@
-"""Monitors that hold their topics: those that begin to when specifications are loaded, and the report for control."""
+"""Let monitors hold their topics when specifications are loaded, and report those that hold to control."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING

@@ -6,8 +6,7 @@ The messages of other topics go through the topic's pipeline (`topic_pipeline.py
 Invariants:
 - A fault of a monitor, or a defect of this program, drops only the current message, and is reported.
 - Refused specifications change nothing. A relay whose first specifications are refused blocks all messages.
-- Specifications are replaced between two messages. Messages that a monitor publishes go only through the monitors
-  behind it.
+- Specifications are replaced between two messages. A published message goes only through later monitors.
 - The clock of monitors never goes back or jumps: it starts at the time of day when the relay started, and follows the
   monotonic clock. All messages of a batch have the same time.
 - A message may take `budget` seconds of processor time in its monitors. Beyond that, its processing is cut off, which
