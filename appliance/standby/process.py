@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import secrets
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,9 @@ class LeaseProcess:
             linked=self.control_linked,
             lost=lambda _reason: self.control_linked(),
         )
-        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.peers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        # The kernel chooses this port, so that no other host can fill the buffer with forged answers.
+        self.asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._report = messages.ReplicationReported(0, False, None)
         self._present = False
         self._absent_since = clock.since_boot()
@@ -87,10 +90,11 @@ class LeaseProcess:
 
     async def run(self) -> None:
         """Keep the lease. Raises `OSError` if the epoch cannot be stored: the appliance is then passive."""
-        self.socket.setblocking(False)
-        self.socket.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
+        self.peers.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
         loop = asyncio.get_running_loop()
-        loop.add_reader(self.socket.fileno(), self._readable)
+        for one, received in ((self.peers, self.peer_sent), (self.asking, self.witness_sent)):
+            one.setblocking(False)
+            loop.add_reader(one, self._readable, one, received)
         self.child.attach(messages.Ready())
         while not self.child.ended.is_set():
             self.tick()
@@ -99,8 +103,9 @@ class LeaseProcess:
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), delay)
-        loop.remove_reader(self.socket.fileno())
-        self.socket.close()
+        for one in (self.peers, self.asking):
+            loop.remove_reader(one)
+            one.close()
 
     # --- the lease ---
 
@@ -130,39 +135,40 @@ class LeaseProcess:
             write_whole(self._epoch_file, f"{epoch}\n".encode(), 0o600)
             self._stored = epoch
         for message in due:
+            to = self._membership
             if isinstance(message, WitnessRequest):
-                self.send(
-                    self._witness.write(message), self._membership.witness, self._membership.witness_port
-                )
+                self.send(self.asking, self._witness.write(message), (to.witness, to.witness_port))
             else:
-                self.send(self._peer.write(message), self._membership.other_address, self._membership.port)
+                self.send(self.peers, self._peer.write(message), (to.other_address, to.port))
         self._tell_supervisor()
         self._tell_control()
 
-    def send(self, datagram: bytes, address: str, port: int) -> None:
+    def send(self, sender: socket.socket, datagram: bytes, to: tuple[str, int]) -> None:
         """Send a datagram."""
         with contextlib.suppress(OSError):  # no route at present; the lease asks again
-            self.socket.sendto(datagram, (address, port))
+            sender.sendto(datagram, to)
 
-    def _readable(self) -> None:
+    def _readable(self, receiver: socket.socket, received: Callable[[bytes, str], None]) -> None:
         for _ in range(_BATCH):
             try:
-                datagram, (address, _port) = self.socket.recvfrom(_LARGEST)
+                datagram, (address, _port) = receiver.recvfrom(_LARGEST)
             except BlockingIOError:
                 break
             except OSError:
                 continue  # an earlier datagram was not delivered
-            self.received(datagram, address)
+            received(datagram, address)
         self._wake.set()
 
-    def received(self, datagram: bytes, address: str) -> None:
-        """Take a datagram of the witness or of the other appliance; ignore one of any other host."""
-        if address == self._membership.witness:
-            found = self._witness.read(datagram)
-            if found is not None:
-                self._answered, self._answer = clock.since_boot(), found[1]
-                self._after(self._lease.answered(*found))
-        elif address == self._membership.other_address:
+    def witness_sent(self, datagram: bytes, address: str) -> None:
+        """Take an answer of the witness; ignore a datagram of any other host."""
+        found = self._witness.read(datagram) if address == self._membership.witness else None
+        if found is not None:
+            self._answered, self._answer = clock.since_boot(), found[1]
+            self._after(self._lease.answered(*found))
+
+    def peer_sent(self, datagram: bytes, address: str) -> None:
+        """Take a message of the other appliance; ignore a datagram of any other host."""
+        if address == self._membership.other_address:
             message = self._peer.read(datagram)
             if message is not None:
                 self._after(self._lease.received(clock.since_boot(), message))

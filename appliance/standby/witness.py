@@ -71,9 +71,9 @@ _FREEBIND, _SO_MARK = (
 _PROGRAM_SECONDS = 20.0  # at a boot, the first rule loads kernel modules from a slow disk
 _CHECK_SECONDS = 1.0
 _RESET_SECONDS, _RESET_ROUNDS = 0.6, 8  # a kernel answers one segment outside the window each half second
-_BATCH = 256  # datagrams between two checks of the time
+_BATCH = 64  # datagrams of unknown sources between two checks of the time, and of the sockets of known ones
+_EACH = 8  # datagrams of each known source in this time, so that a flood of one delays no renewal of another
 _LOOK_SECONDS = 0.2  # between two requests of a follower
-_LOOKS_A_SECOND = 50  # that the firewall accepts from a follower, so that a flood delays no renewal
 _MOST_PENDING = 8
 _CONFIDENCE = 0.9  # of the time that an answer has left
 _CLOCK_BOOTTIME = 7  # runs while the computer sleeps; Python 3.5 does not name it
@@ -351,10 +351,11 @@ class WitnessGate:
         self._nonce = nonce
         self._last = dict.fromkeys(self._peers, 0)
         self.rejected = 0
+        self.fresh = ""  # the name in the last datagram, if it was authentic and new
 
     def answer(self, datagram: bytes, address: str) -> Optional[bytes]:
         """Return the answer to a datagram from `address`, or None if the datagram is not authenticated."""
-        name = name_in(datagram)
+        name, self.fresh = name_in(datagram), ""
         peer = self._peers.get(name)
         body = None
         if peer is not None and peer.address == address:
@@ -383,6 +384,7 @@ class WitnessGate:
             answer.update(stale=True, last=self._last[name])
             return answer
         self._last[name] = body["number"]
+        self.fresh = name
         other = next(iter(set(self._appliances) - {name}))  # not used for `look`, the operation of followers
         reason = self._witness.handle(name, body["do"], body["epoch"], other)
         record = self._witness.record
@@ -523,7 +525,8 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
     """Return the nftables file that admits one appliance, or none, as one transaction."""
     names = sorted(settings.appliances)
     control = "{ %s }" % ", ".join(map(str, (*_TUNNEL_PORTS, settings.listen[1])))
-    translate, arriving, leaving = [], ['iif "lo" accept'], []  # type: List[str], List[str], List[str]
+    local = 'iif "lo" ip daddr %s udp dport %d drop' % settings.listen  # no appliance is on this computer
+    translate, arriving, leaving = [], [local, 'iif "lo" accept'], []  # type: List[str], List[str], List[str]
     for name in names:
         address = settings.appliances[name].address
         if name == admitted:
@@ -541,10 +544,8 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
                 "%s drop" % match,
             ]
     followers = [settings.followers[name].address for name in sorted(settings.followers)]
-    limit = "limit rate over %d/second burst %d packets drop" % (_LOOKS_A_SECOND, _LOOKS_A_SECOND)
-    requests = ["udp dport %d ip saddr %s %s" % (settings.listen[1], one, limit) for one in followers]
     addresses = ", ".join([settings.appliances[name].address for name in names] + followers)
-    requests.append("udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses))
+    requests = ["udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses)]
     leaving += [
         "ip daddr %s ip protocol tcp reject with tcp reset" % settings.fixed,
         "ip daddr %s drop" % settings.fixed,
@@ -555,7 +556,7 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
         ("translate_others", "nat hook prerouting priority -100", translate),
         ("arriving", "filter hook input priority 0", arriving + requests),
         ("leaving", "filter hook output priority 0", leaving),
-        ("forwarded", "filter hook forward priority 0", arriving[1:] + leaving),
+        ("forwarded", "filter hook forward priority 0", arriving[2:] + leaving),
     )
     return "table ip %s\ndelete table ip %s\ntable ip %s {\n%s}\n" % (
         TABLE,
@@ -593,15 +594,17 @@ def iptables_rules(settings: WitnessSettings, admitted: str, present: Dict[str, 
             rules += ["%s %s %s" % (side, address, rule) for rule in _passing(control)]
             rules += ["%s %s %s" % (side, address, reset), "%s %s -j DROP" % (side, address)]
     going += ["-d %s %s" % (settings.fixed, reset), "-d %s -j DROP" % settings.fixed]
-    requests = ["-s %s -j RETURN" % settings.appliances[name].address for name in names]
-    requests += [
-        "-s %s -p udp --dport %d -m limit --limit %d/second --limit-burst %d -j RETURN"
-        % (settings.followers[name].address, settings.listen[1], _LOOKS_A_SECOND, _LOOKS_A_SECOND)
-        for name in sorted(settings.followers)
-    ]
+    peers = [settings.appliances[name].address for name in names]
+    peers += [settings.followers[name].address for name in sorted(settings.followers)]
+    requests = ["-s %s -j RETURN" % one for one in peers]
     requests.append("-p udp --dport %d -j DROP" % settings.listen[1])
     chains = {
-        "in": ["-i lo -j RETURN", *coming, *requests],
+        "in": [
+            "-i lo -d %s -p udp --dport %d -j DROP" % settings.listen,
+            "-i lo -j RETURN",
+            *coming,
+            *requests,
+        ],
         "out": going,
         "forward": coming + going,
         "nat": translate,
@@ -979,28 +982,81 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         record=record, save=lease.write, admit=enforcement.admit, boot=boot, clock=time.monotonic
     )
     gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex(), settings.followers)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as requests:
-        requests.setsockopt(socket.SOL_IP, _FREEBIND, 1)
-        requests.bind(settings.listen)
-        requests.setblocking(False)
+    with RequestSockets(settings.listen) as requests:
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
         rejected = 0
         while True:  # until the process is ended; each turn is bounded
-            ready, _, _ = select.select([requests], [], [], 0.2)
-            for _ in range(_BATCH if ready else 0):
-                if not _answer_one(requests, gate):
-                    break
+            for one, most in requests.ready():
+                for _ in range(most):
+                    if not _answer_one(one, gate, requests):
+                        break
             if enforcement.go_on(witness.enforce_again) and gate.rejected > rejected:
                 log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
                 rejected = gate.rejected
 
 
-def _answer_one(requests: socket.socket, gate: WitnessGate) -> bool:
+class RequestSockets:
+    """The sockets for requests: one for all hosts, and one for each appliance and follower since its last new request.
+
+    The kernel gives datagrams from the address *and port* of that request to the connected socket. Another host cannot
+    guess this port, so datagrams with a forged address fill only the buffer of the common socket. A connected socket is
+    read first.
+    """
+
+    def __init__(self, listen: Tuple[str, int]) -> None:
+        self._listen = listen
+        self._common = self._bound()
+        self._connected = {}  # type: Dict[str, Tuple[socket.socket, Tuple[str, int]]]
+
+    def __enter__(self) -> "RequestSockets":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in [self._common] + [one for one, _ in self._connected.values()]:
+            one.close()
+
+    def ready(self) -> List[Tuple[socket.socket, int]]:
+        """Wait for requests; return each socket that has some, and the number to read from it at once."""
+        connected = [one for one, _ in self._connected.values()]
+        found, _, _ = select.select([*connected, self._common], [], [], 0.2)
+        return [(one, _BATCH if one is self._common else _EACH) for one in found]
+
+    def prefer(self, name: str, source: Tuple[str, int]) -> None:
+        """Connect a socket to the source of a new request. Raises `OSError`; then the common socket serves it."""
+        before = self._connected.get(name)
+        if before is not None and before[1] == source:
+            return
+        one = self._bound()
+        try:
+            one.connect(source)
+        except OSError:
+            one.close()
+            raise
+        self._connected[name] = (one, source)
+        if before is not None:
+            before[0].close()
+
+    def _bound(self) -> socket.socket:
+        one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            one.setsockopt(socket.SOL_IP, _FREEBIND, 1)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)  # only for sockets of the same user
+            one.bind(self._listen)
+        except OSError:
+            one.close()
+            raise
+        one.setblocking(False)
+        return one
+
+
+def _answer_one(one: socket.socket, gate: WitnessGate, requests: RequestSockets) -> bool:
     try:
-        datagram, (address, port) = requests.recvfrom(LONGEST + 1)
-        answer = gate.answer(datagram, address)
+        datagram, source = one.recvfrom(LONGEST + 1)
+        answer = gate.answer(datagram, source[0])
         if answer is not None:
-            requests.sendto(answer, (address, port))
+            one.sendto(answer, source)
+        if gate.fresh:
+            requests.prefer(gate.fresh, source)
     except BlockingIOError:
         return False
     except OSError:

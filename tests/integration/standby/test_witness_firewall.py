@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import signal
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -171,6 +172,31 @@ def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) ->
     eventually(lambda: "without a valid authentication code" in site.log(), site.log)
     assert len(site.log().splitlines()) < 40
     site.connect(site.robot, FIXED, MASTER).close()
+
+
+def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
+    """While the witness reads nothing, a flood from its address fills one buffer; the renewal is in another."""
+    process = site.serve()
+    a = site.peer("a")
+    epoch = a.granted(1)
+    raw = site.attacker.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
+    site.sockets.enter_context(raw)
+    local = site.robot.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    site.sockets.enter_context(local)
+    process.popen.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(2_000):
+            raw.sendto(forged(ADDRESSES["a"], os.urandom(100)), (ROBOT, 0))
+            with contextlib.suppress(PermissionError):  # by the firewall
+                local.sendto(os.urandom(100), (ROBOT, WITNESS))
+        renewal = a.channel.write(WitnessRequest("renew", epoch, 1, 0.0))
+        a.socket.send(renewal)
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+    a.socket.settimeout(AT_ONCE)
+    found = a.channel.read(a.socket.recv(1024))
+    assert found is not None
+    assert found[1].ok
 
 
 def test_the_appliances_socket_gets_the_lease(site: Site) -> None:

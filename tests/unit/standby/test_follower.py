@@ -496,16 +496,16 @@ def test_each_computer_has_its_own_commands(tmp_path: Path, capsys: pytest.Captu
     assert not (tmp_path / "epoch").exists()
 
 
-def test_requests_of_followers_pass_with_a_limit(tmp_path: Path) -> None:
-    """A flood of one follower delays no renewal; other addresses are dropped."""
+def test_requests_pass_only_from_appliances_and_followers(tmp_path: Path) -> None:
+    """Requests of other addresses are dropped, and all requests of this computer, where no appliance runs."""
     settings = read_settings(str(written(tmp_path)))
     rules = nft_rules(settings, "a")
-    limit = "udp dport 7411 ip saddr 10.0.0.20 limit rate over 50/second burst 50 packets drop"
-    assert rules.count(limit) == 1
+    assert rules.count('iif "lo" ip daddr 10.0.0.1 udp dport 7411 drop\n        iif "lo" accept') == 1
     assert "udp dport 7411 ip saddr != { 10.0.0.2, 10.0.0.3, 10.0.0.20 } drop" in rules
     lines = iptables_rules(settings, "a", {}).splitlines()
     own = [line for line in lines if line.startswith("-A rosrv-witness-in ")]
+    assert own[0] == "-A rosrv-witness-in -i lo -d 10.0.0.1 -p udp --dport 7411 -j DROP"
     assert own[-2:] == [
-        "-A rosrv-witness-in -s 10.0.0.20 -p udp --dport 7411 -m limit --limit 50/second --limit-burst 50 -j RETURN",
+        "-A rosrv-witness-in -s 10.0.0.20 -j RETURN",
         "-A rosrv-witness-in -p udp --dport 7411 -j DROP",
     ]

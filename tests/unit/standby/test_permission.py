@@ -80,7 +80,7 @@ class Pair:
         here, self.supervisor = socket.socketpair()
         self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
         parts: Any = self.lease
-        parts.send = lambda datagram, _address, port: self.requests.append(datagram) if port == 7411 else None
+        parts.send = lambda _from, datagram, to: self.requests.append(datagram) if to[1] == 7411 else None
         parts.child = SimpleNamespace(tell=self.to_control.append)
         self.database = Store()
         self.standby = 0  # the last change on the standby's disk
@@ -134,7 +134,7 @@ class Pair:
                 assert answer is not None
                 self.answers.append(answer)
             case "answer" if self.answers:
-                self.lease.received(self.answers.popleft(), "10.0.0.1")
+                self.lease.witness_sent(self.answers.popleft(), "10.0.0.1")
             case "lose" if self.answers:
                 self.answers.popleft()
             case "report":
@@ -184,7 +184,8 @@ class Pair:
             task.cancel()
         self.supervisor.close()
         parts: Any = self.lease
-        parts.socket.close()
+        parts.peers.close()
+        parts.asking.close()
         parts.supervisor.close()
 
 

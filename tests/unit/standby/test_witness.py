@@ -258,6 +258,24 @@ def test_a_replayed_request_changes_nothing() -> None:
         assert answer is not None and answer["stale"] is True and answer["last"] == 5
 
 
+def test_only_a_new_request_moves_the_socket_of_an_appliance() -> None:
+    """A forged, replayed or earlier datagram names no sender whose port the witness would prefer."""
+    robot = granted()
+    seen = []
+    for datagram, address in (
+        (request(do="renew", epoch=2, number=5), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=5), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=4), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6, boot="earlier"), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6, key=KEYS["b"]), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6), "10.0.0.3"),
+        (request(do="renew", epoch=2, number=6), "10.0.0.2"),
+    ):
+        robot.gate.answer(datagram, address)
+        seen.append(robot.gate.fresh)
+    assert seen == ["a", "", "", "", "", "", "a"]
+
+
 def test_a_request_to_an_earlier_start_changes_nothing() -> None:
     """The answer has the nonce of this start."""
     robot = Robot().expired()
