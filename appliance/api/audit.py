@@ -22,11 +22,11 @@ from appliance.api.denials import asks_policy
 from appliance.api.dry_run_policy import explained, granted
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.route_roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
+from appliance.api.route_roles import Operator, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.shown_records import PAGE, RECORD_REFERENCE, page_of, readable, readable_by
-from appliance.api.streams import StreamResponse, Streams, in_thread, peer_of, turn
+from appliance.api.streams import StreamResponse, Streams, Work, in_thread, peer_of
 from appliance.audit.chain_findings import Verification
 from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
@@ -136,18 +136,18 @@ class LogReader:
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
-        self.searches = asyncio.Semaphore(_SEARCHES)
+        self.searches = Work("searches of the audit log", _SEARCHES)
         self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
-        self.verification = asyncio.Semaphore(1)
+        self.verification = Work("verifications", 1)
 
-    async def read(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+    async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
         """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
-        async with turn(self.searches, "searches of the audit log"):
+        async with self.searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
 
-    async def record(self, record_id: str, neighbours: int) -> RecordInContext:
+    async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
         """Return a record with its neighbours. Raises `ProblemError`."""
-        shown = await self.read(show, self.path, record_id, neighbours)
+        shown = await self.read(bearer, show, self.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
         return shown
@@ -195,7 +195,15 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         newest = order == "newest"
         return JSONResponse(
             await desk.read(
-                page_of, desk.path, wanted, cursor, limit, bearer, newest_first=newest, equality=equality
+                bearer,
+                page_of,
+                desk.path,
+                wanted,
+                cursor,
+                limit,
+                bearer,
+                newest_first=newest,
+                equality=equality,
             )
         )
 
@@ -216,29 +224,30 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
         Ends when the token does. A browser that reconnects goes on where it was.
         """
         start = int(last_event_id) if last_event_id is not None else after
-        follower = await desk.read(Follower, desk.path, wanted, start)
+        follower = await desk.read(bearer, Follower, desk.path, wanted, start)
         give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
         following = _follow(services, desk, follower, bearer, wanted.text, equality=equality)
         return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
 
 def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
-    @router.get("/verify", dependencies=[OPERATOR])
-    async def verify_audit() -> Verification:
+    @router.get("/verify")
+    async def verify_audit(bearer: Operator) -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
         The checkpoints of the signer are not compared; `rosrv audit verify` on the machine also does that.
         """
-        async with turn(desk.verification, "verifications"):
+        async with desk.verification.turn(bearer):
             return await desk.in_thread(verify, desk.path)
 
-    @router.get("/checkpoints", dependencies=[VIEWER])
+    @router.get("/checkpoints")
     async def audit_checkpoints(
+        bearer: Viewer,
         after: Annotated[int, Query(ge=0, le=10**18, description="only records with a greater number")] = 0,
         limit: Limit = 1000,
     ) -> LogCheckpoints:
         """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
-        return LogCheckpoints(await desk.read(signed_checkpoints, desk.path, after, limit))
+        return LogCheckpoints(await desk.read(bearer, signed_checkpoints, desk.path, after, limit))
 
     @router.get(
         "/export", responses=file("application/x-ndjson", "One record per line."), response_class=Response
@@ -249,7 +258,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records as a search
         shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
         """
-        found = await desk.read(_exported, desk.path, wanted, bearer)
+        found = await desk.read(bearer, _exported, desk.path, wanted, bearer)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         return StreamResponse(
             StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
@@ -264,7 +273,7 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
-        shown = await desk.record(record_id, neighbours)
+        shown = await desk.record(bearer, record_id, neighbours)
         around = {"before": shown.before, "after": shown.after}
         answer = {
             name: [as_object(readable_by(one, bearer)) for one in some] for name, some in around.items()
@@ -277,20 +286,20 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
         policy in force that would allow it.
         """
-        shown = await desk.record(record_id, 0)
+        shown = await desk.record(bearer, record_id, 0)
         record = readable_by(shown.entry, bearer).record
         known = None
         if asks_policy(record):
             known = await ask(services.control, PolicyWanted(), bearer)
-        async with services.judging:
+        async with services.judging.turn(bearer):
             return await asyncio.to_thread(explained, record, known)
 
     @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:
         """Return the smallest change of the policy in force that grants what this record says was refused."""
-        shown = await desk.record(record_id, 0)
+        shown = await desk.record(bearer, record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)
-        async with services.judging:
+        async with services.judging.turn(bearer):
             try:
                 return await asyncio.to_thread(granted, shown.entry.record, known)
             except UngrantableError as error:

@@ -7,10 +7,10 @@ from fastapi import Query
 
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.route_roles import VIEWER
+from appliance.api.route_roles import Viewer
 from appliance.api.routing import Routes
 from appliance.api.services import Services
-from appliance.api.streams import turn
+from appliance.api.streams import Work
 from appliance.audit.denial_summary import LARGEST_SUMMARY, DenialSummary, summary_of_log
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
@@ -19,10 +19,11 @@ from appliance.audit.query import Filter
 def routes(services: Services) -> Routes:
     """Return the route."""
     router = Routes(prefix="/v1/audit", tags=["audit"])
-    one = asyncio.Semaphore(1)
+    one = Work("summaries of the audit log", 1)
 
-    @router.get("/summary", dependencies=[VIEWER])
+    @router.get("/summary")
     async def summarise_audit(
+        bearer: Viewer,
         since: Annotated[
             str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")
         ] = None,
@@ -31,7 +32,7 @@ def routes(services: Services) -> Routes:
     ) -> DenialSummary:
         """The denials of each host: number, first and last time, most frequent rules or reasons, callers."""
         begin, end = (None if time is None else given(time) for time in (since, until))
-        async with turn(one, "summaries of the audit log"):
+        async with one.turn(bearer):
             try:
                 return await asyncio.to_thread(
                     summary_of_log, services.audit_log, Filter(since=begin, until=end), limit

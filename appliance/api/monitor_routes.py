@@ -48,12 +48,12 @@ class _Looking:
             raise unknown_monitor(name, loaded)
         return loaded, row
 
-    async def described(self, loaded: Monitors, name: str) -> Described:
-        async with self._services.judging:
+    async def described(self, bearer: Bearer, loaded: Monitors, name: str) -> Described:
+        async with self._services.judging.turn(bearer):
             return await asyncio.to_thread(self.compiler.described, loaded, name)
 
-    async def picture(self, loaded: Monitors, name: str) -> str | None:
-        async with self._services.judging:
+    async def picture(self, bearer: Bearer, loaded: Monitors, name: str) -> str | None:
+        async with self._services.judging.turn(bearer):
             return await asyncio.to_thread(self.compiler.picture, loaded, name)
 
 
@@ -72,7 +72,7 @@ def routes(services: Services) -> Routes:
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
         """One monitor: state, counters, the text of its file, its events and properties."""
         loaded, state = await looking.state(bearer, name)
-        found = await looking.described(loaded, name)
+        found = await looking.described(bearer, loaded, name)
         shown = Monitor(
             **asdict(state),
             revision=loaded.revision,
@@ -90,7 +90,7 @@ def routes(services: Services) -> Routes:
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
         """Return the automata of its properties (SVG); 404 when it has none that is finite."""
         loaded, _state = await looking.state(bearer, name)
-        drawn = await looking.picture(loaded, name)
+        drawn = await looking.picture(bearer, loaded, name)
         if drawn is None:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")
@@ -107,7 +107,7 @@ def routes(services: Services) -> Routes:
         A monitor that no longer exists also has its history.
         """
         found: list[LogEntry] = await looking.desk.read(
-            records_of, looking.desk.path, name, cursor, limit + 1
+            bearer, records_of, looking.desk.path, name, cursor, limit + 1
         )
         happened = [
             _happened(entry if reads_contents(bearer) else without_contents(entry)) for entry in found[:limit]

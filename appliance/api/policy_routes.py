@@ -73,7 +73,7 @@ def routes(services: Services) -> Routes:
 
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(control, admin.PolicyWanted(), bearer)
-        async with services.judging:
+        async with services.judging.turn(bearer):
             asked = msgspec.structs.asdict(question)
             return _explained(await asyncio.to_thread(explanation, current=current, **asked))
 
@@ -102,7 +102,7 @@ def routes(services: Services) -> Routes:
     async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
         """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
         current = await ask(control, admin.PolicyWanted(), bearer)
-        async with services.judging:
+        async with services.judging.turn(bearer):
             ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
         cases = sorted(map(_case, ran), key=lambda case: case.passed)
         passed = sum(case.passed for case in cases)
@@ -160,7 +160,7 @@ async def _load(call: OperationCall[admin.PolicyLoad]) -> Tagged[Report]:
         raise ProblemError(412, "changed-meanwhile", text)
     live = (await call.ask(admin.RegistrationsWanted())).registrations
     try:
-        async with services.judging if call.dry_run else services.ordering:
+        async with services.judging.turn(call.bearer) if call.dry_run else services.ordering:
             report = await asyncio.to_thread(judge_change, order, current, live)
     except ProblemError as refusal:
         if call.dry_run:

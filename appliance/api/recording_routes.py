@@ -18,7 +18,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Investigator, Viewer, answered
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import StreamResponse, in_thread, peer_of, turn
+from appliance.api.streams import StreamResponse, Work, in_thread, peer_of
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import (
     RecordedMessages,
@@ -97,14 +97,14 @@ def _add_bag(router: Routes, services: Services) -> None:
 
 
 def _add_reading(router: Routes, services: Services) -> None:
-    reading = asyncio.Semaphore(1)
+    reading = Work("readings of recordings", 1)
 
     async def read(
         asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
     ) -> _T:
         """Read from the bag of the recording that control returns; only one bag is read at a time."""
         recording = answered(await services.control.ask(asked, bearer))
-        async with turn(reading, "readings of recordings"):
+        async with reading.turn(bearer):
             try:
                 return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
             except FileNotFoundError:

@@ -8,16 +8,16 @@ from appliance.api.access import TokenAuthenticator
 from appliance.api.control import ControlLink
 from appliance.api.history import SampleHistory
 from appliance.api.journal import Journal
-from appliance.api.streams import Streams
+from appliance.api.streams import Streams, Work
 from appliance.configuration.settings import Settings
-from appliance.quotas.table import REST_EXPORTS
+from appliance.quotas.table import REST_EXPORTS, REST_WORK
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
     """The parts that the routes share; `stopping` is set when the process must end.
 
-    `judging` limits how many texts are compiled at once for queries and dry runs. `ordering` limits the same for
+    `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same for
     orders, so that orders never wait for queries. `exports` limits the exports of the audit log.
     """
 
@@ -27,7 +27,7 @@ class Services:
     journal: Journal
     stopping: asyncio.Event
     history: SampleHistory
-    judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    judging: Work = field(default_factory=lambda: Work("dry runs and explanations", REST_WORK.bounds.whole))
     ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
     exports: Streams = field(
         default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)

@@ -2,7 +2,7 @@
 
 A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
 connections nor a machine with many tokens can take the places of others, in particular of operators and admins. When
-the response ends, for any reason, its place is free again.
+the response ends, for any reason, its place is free again. `Work` does the same for answers that need much time.
 """
 
 import asyncio
@@ -18,7 +18,8 @@ from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.pool import Pool, QuotaClass
-from appliance.quotas.table import QuotaRow
+from appliance.quotas.table import REST_WORK, QuotaRow
+from appliance.rpc.fair_queue import Turns
 
 _PATIENCE_SECONDS = 5.0
 A = TypeVar("A", str, bytes)
@@ -71,18 +72,34 @@ class Streams:
             self.roles.pop(token, None)
 
 
-@contextlib.asynccontextmanager
-async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
-    """Wait briefly for one of the `turns` and hold it during the block. Raises `ProblemError` (503)."""
-    try:
-        async with asyncio.timeout(_PATIENCE_SECONDS):
-            await turns.acquire()
-    except TimeoutError:
-        raise ProblemError(503, "busy", f"too many {what} at once: try again", retry_after=5) from None
-    try:
-        yield
-    finally:
-        turns.release()
+class Work:
+    """Slow answers of one kind, `whole` at once, in turns of tokens. `what` names them in the refusal."""
+
+    def __init__(self, what: str, whole: int) -> None:
+        self._what = what
+        self._turns: Turns[tuple[str, TokenRole]] = Turns(
+            REST_WORK.bounds.sized(whole, max(1, whole // 2)), _class_of
+        )
+
+    @contextlib.asynccontextmanager
+    async def turn(self, bearer: Bearer) -> AsyncIterator[None]:
+        """Wait briefly for the token's turn, and keep it during the block. Raises `ProblemError` (503)."""
+        token = bearer.id, bearer.role
+        try:
+            async with asyncio.timeout(_PATIENCE_SECONDS):
+                await self._turns.enter(token)
+        except TimeoutError:
+            raise ProblemError(
+                503, "busy", f"too many {self._what} at once: try again", retry_after=5
+            ) from None
+        try:
+            yield
+        finally:
+            self._turns.leave(token)
+
+
+def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
+    return QuotaClass.NAMED if token[1] == "viewer" else QuotaClass.REGISTERED
 
 
 async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:

@@ -364,6 +364,16 @@ REST_EXPORTS = QuotaRow(
     alarm="`rest call` with status 503",
     shown_by=_STREAMS_SHOWN_BY,
 )
+REST_WORK = QuotaRow(
+    thing="slow answers of REST of one kind under way: dry runs and explanations (4: searches of the audit log; 1: its"
+    " summary, its verification, a recording)",
+    bounds=Bounds(whole=2, host=1, unknown=0, kept=1),
+    at_limit="the request waits for its token's turn, and gets 503 with Retry-After after 5 s",
+    between="next is the token with the longest wait since its last turn",
+    counting="a host is a token; kept: not for viewers",
+    alarm="`rest call` with status 503",
+    shown_by=("unit/api/test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",),
+)
 AUDIT_KINDS = QuotaRow(
     thing="kinds of folded denials in the audit log",
     bounds=Bounds(whole=8192, host=256, unknown=64, kept=0),
@@ -467,7 +477,7 @@ QUOTA_ROWS = (
     PARAMETER_BYTES, LARGE_WRITES, MASTER_CHANGES, PROBES, NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS, RELAY_FRAMES,
     RELAY_QUEUES, RELAY_LATCHED, RELAY_CONNECTIONS, RELAY_HEADERS, RELAY_TURN, LIMITED_TOPIC, RELAY_MESSAGE,
     RECORDER_MEMORY, RECORDER_DISK, DRY_RUNS, SLICES, REST_CONNECTIONS, REST_STREAMS, REST_STREAM_PEERS,
-    REST_EXPORTS, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
+    REST_EXPORTS, REST_WORK, AUDIT_KINDS, AUDIT_READ_KINDS, AUDIT_BYTES, AUDIT_RESERVE, NODE_PORTS, NAMES, GRANTS,
     IKE_HANDSHAKES, DESCRIPTORS,
 )  # fmt: skip
 """Every row, in the order of the page. A test checks that none is missing."""

@@ -25,7 +25,7 @@ _BOUNDS = Bounds(whole=AT_ONCE, host=1, unknown=1, kept=1)
 _VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # approximate bytes that XML-RPC adds to a value
 
 
-def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns:
+def bulk_turns(quota_class: Callable[[Address], QuotaClass]) -> Turns[Address]:
     """Return the turns for the bulks of all requests."""
     return Turns(_BOUNDS, quota_class)
 
@@ -36,7 +36,7 @@ class Bulk:
     `in_thread` charges the host for work in a thread, which is not part of the request's own steps.
     """
 
-    def __init__(self, turns: Turns, host: Address, processor: ProcessorTime) -> None:
+    def __init__(self, turns: Turns[Address], host: Address, processor: ProcessorTime) -> None:
         self._turns = turns
         self._host = host
         self._processor = processor

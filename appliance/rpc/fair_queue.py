@@ -11,19 +11,19 @@ host is unknown. So a host that begins does not wait for long requests of guests
 import asyncio
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
+from typing import Generic
 
-from appliance.policy.model import Address
-from appliance.quotas.pool import Bounds, Pool, QuotaClass
+from appliance.quotas.pool import Bounds, Holder, Pool, QuotaClass
 
 Queue = deque[asyncio.Future[None]]
 
 
-def itself(host: Address) -> Hashable:
+def itself(host: Hashable) -> Hashable:
     """Return the host itself as its group."""
     return host
 
 
-class Turns:
+class Turns(Generic[Holder]):
     """The slots for requests within the quotas of `bounds`; other requests wait for their turn.
 
     While a slot is free, a request waits only because its host or its group has used up its quota. `alike(host)`
@@ -34,24 +34,24 @@ class Turns:
     def __init__(
         self,
         bounds: Bounds,
-        quota_class: Callable[[Address], QuotaClass],
-        alike: Callable[[Address], Hashable] = itself,
+        quota_class: Callable[[Holder], QuotaClass],
+        alike: Callable[[Holder], Hashable] = itself,
         pause: Callable[[str], float] = lambda _host: 0.0,
         *,
         own_slots: bool = False,
     ) -> None:
-        self.slots: Pool[Address] = Pool("requests being served", bounds, quota_class)
+        self.slots: Pool[Holder] = Pool("requests being served", bounds, quota_class)
         self._quota_class = quota_class
         self._alike = alike
         self.pause = pause
         self._own_slots = own_slots
-        self._own: dict[Hashable, Address] = {}  # the host that has the own slot of its group
+        self._own: dict[Hashable, Holder] = {}  # the host that has the own slot of its group
         self._together = max(bounds.host, bounds.whole // 2)
         self._taken: dict[Hashable, int] = {}  # slots by group, without its own
-        self._taken_as: dict[Address, Hashable] = {}
-        self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
+        self._taken_as: dict[Holder, Hashable] = {}
+        self.waiting: OrderedDict[Hashable, OrderedDict[Holder, Queue]] = OrderedDict()
 
-    async def enter(self, host: Address) -> None:
+    async def enter(self, host: Holder) -> None:
         """Wait until this host's audit records are paid, then take a slot or wait for a turn."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
@@ -69,7 +69,7 @@ class Turns:
                 self._give_up(kind, host, turn)
             raise
 
-    def leave(self, host: Address) -> None:
+    def leave(self, host: Holder) -> None:
         """Release a slot, and give free slots to the longest waiting hosts that may have them."""
         self._give_back(host)
         while self.waiting and (following := self._next()) is not None:
@@ -86,7 +86,7 @@ class Turns:
             else:
                 turn.set_result(None)
 
-    def _next(self) -> tuple[Hashable, Address] | None:
+    def _next(self) -> tuple[Hashable, Holder] | None:
         """Take a slot for the next host, and return the host with its group. Return None if no host may have a slot."""
         for kind, hosts in self.waiting.items():
             if self._taken.get(kind, 0) < self._together or (self._own_slots and kind not in self._own):
@@ -95,7 +95,7 @@ class Turns:
                         return kind, host
         return None
 
-    def _take(self, host: Address, kind: Hashable) -> bool:
+    def _take(self, host: Holder, kind: Hashable) -> bool:
         kind = self._taken_as.get(host, kind)  # the group that the host's other slots are counted for
         if self._own_slots and kind not in self._own and self._quota_class(host) is not QuotaClass.UNKNOWN:
             self._own[kind] = host
@@ -106,7 +106,7 @@ class Turns:
         self._taken_as[host] = kind
         return True
 
-    def _give_back(self, host: Address) -> None:
+    def _give_back(self, host: Holder) -> None:
         kind = self._taken_as[host]
         if not self.slots.held(host):
             del self._own[kind]
@@ -118,7 +118,7 @@ class Turns:
         if not self.slots.held(host) and self._own.get(kind) != host:
             del self._taken_as[host]
 
-    def _give_up(self, kind: Hashable, host: Address, turn: asyncio.Future[None]) -> None:
+    def _give_up(self, kind: Hashable, host: Holder, turn: asyncio.Future[None]) -> None:
         hosts = self.waiting.get(kind, OrderedDict())
         queue = hosts.get(host)
         if queue is None or turn not in queue:

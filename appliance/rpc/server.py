@@ -109,7 +109,7 @@ class HttpServer:
     at_once: AtOnce = not_at_once
     limits: HttpLimits
     connection_table: ConnectionTable[Address]
-    turns: Turns
+    turns: Turns[Address]
     time: ProcessorTime
     first: Program | None = None
     keep: bool = True

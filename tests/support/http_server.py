@@ -126,7 +126,7 @@ class Server:
             farewells=shares.farewells,
             arriving=shares.arriving,
         )
-        self.turns = Turns(shares.requests, _named)
+        self.turns: Turns[Address] = Turns(shares.requests, _named)
         self.time = ProcessorTime(lambda host: host, shares.clock)
         self._handler = handler
         self.socket = listen("127.0.0.1", 0)

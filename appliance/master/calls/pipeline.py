@@ -14,7 +14,7 @@ from appliance.master.calls.call_execution import Execution, ServedRequest
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
 from appliance.master.endpoints.node_ports import AdvertisedAddresses
 from appliance.master.graph.registry import Incarnation
-from appliance.policy.model import Category
+from appliance.policy.model import Address, Category
 from appliance.rpc.bulk import Bulk, weigh
 from appliance.rpc.fair_queue import Turns
 from appliance.rpc.method_name import method_named
@@ -41,7 +41,7 @@ class Pipeline:
     trail: AuditTrail
     limits: XmlRpcLimits
     offload: int
-    bulk: Turns
+    bulk: Turns[Address]
     processor: ProcessorTime
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:

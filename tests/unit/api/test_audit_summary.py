@@ -11,6 +11,7 @@ import pytest
 from starlette.responses import Response
 
 from appliance.api import audit_summary
+from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.audit.denial_summary import DenialSummary
@@ -21,6 +22,9 @@ from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
 pytestmark = pytest.mark.nightly
 
 __all__ = ["key", "make_log", "notary", "path"]
+
+
+_VIEWER = Bearer("v", "v", "viewer", 1e12, "shown")
 
 
 class _Log:
@@ -39,7 +43,7 @@ def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
 def asked(log: Path, since: str | None = None) -> DenialSummary | int:
     """Return the summary, or the status of the problem."""
     try:
-        body = asyncio.run(route(log)(since, None, 20)).body
+        body = asyncio.run(route(log)(_VIEWER, since, None, 20)).body
         return msgspec.json.decode(bytes(body), type=DenialSummary)
     except ProblemError as problem:
         return problem.status
@@ -76,7 +80,7 @@ def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.Monke
 
     async def both() -> None:
         ask = route(tmp_path)
-        await asyncio.gather(ask(None, None, 20), ask(None, None, 20))
+        await asyncio.gather(ask(_VIEWER, None, None, 20), ask(_VIEWER, None, None, 20))
 
     asyncio.run(both())
     assert most == 1

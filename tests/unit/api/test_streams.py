@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
-from appliance.api.streams import StreamResponse, Streams
+from appliance.api.streams import StreamResponse, Streams, Work
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
@@ -73,3 +73,38 @@ def test_a_slot_is_released_when_the_response_ends(*, fails: bool) -> None:
         except ConnectionResetError:
             assert fails
     assert not streams.roles
+
+
+@pytest.mark.anyio
+async def test_a_viewer_with_many_requests_leaves_turns_to_an_admin() -> None:
+    """Sixty requests of a viewer's token: an admin begins at once, and another viewer waits for one."""
+    work, order, ends = Work("dry runs", 2), list[str](), [asyncio.Event() for _ in range(3)]
+
+    async def ask(who: Bearer) -> None:
+        async with work.turn(who):
+            order.append(who.name)
+            await ends[min(len(order), 3) - 1].wait()
+
+    asked = [asyncio.create_task(ask(bearer("flood"))) for _ in range(60)]
+    await asyncio.sleep(0)
+    asked += [asyncio.create_task(ask(who)) for who in (bearer("other"), bearer("root", "admin"))]
+    await asyncio.sleep(0)
+    assert order == ["flood", "root"]
+    ends[0].set()
+    ends[2].set()
+    while "other" not in order:
+        await asyncio.sleep(0)
+    assert order.index("other") == 3, "one more request of the flood was waiting before"
+    for task in asked:
+        task.cancel()
+    await asyncio.gather(*asked, return_exceptions=True)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("whole", [1, 2, 4])
+async def test_every_token_gets_a_turn(whole: int) -> None:
+    """Also if only one of these answers is made at once."""
+    work = Work("summaries", whole)
+    for who in (bearer("v"), bearer("root", "admin")):
+        async with work.turn(who):
+            pass

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, QuotaClass
 from appliance.rpc.fair_queue import Turns
 
@@ -16,7 +17,7 @@ OTHER = ipaddress.ip_address("10.0.0.2")
 WAIT = 20.0
 
 
-def slots(whole: int, host: int) -> Turns:
+def slots(whole: int, host: int) -> Turns[Address]:
     """Turns of hosts that are all known alike."""
     return Turns(Bounds(whole, host, 0, 0), lambda _host: QuotaClass.REGISTERED)
 
@@ -95,7 +96,7 @@ async def test_a_cancelled_request_gets_no_turn() -> None:
 async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
     """Hosts without a registration never get the reserved slots, and unknown hosts never get those of others."""
     quota_classes = {HOST: QuotaClass.REGISTERED}
-    turns = Turns(Bounds(8, 4, 2, 4), lambda host: quota_classes.get(host, QuotaClass.NAMED))
+    turns: Turns[Address] = Turns(Bounds(8, 4, 2, 4), lambda host: quota_classes.get(host, QuotaClass.NAMED))
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(200)]
     stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests]
     await asyncio.sleep(0)
@@ -114,7 +115,9 @@ async def test_requests_of_many_guests_leave_slots_for_the_robot() -> None:
 async def test_a_host_that_begins_waits_for_no_guest() -> None:
     """Guests with long requests fill the slots; each other host that the policy names is still served, one by one."""
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(1, 5)]
-    turns = Turns(Bounds(8, 4, 2, 4), lambda host: QuotaClass(host not in guests[3:]), own_slots=True)
+    turns: Turns[Address] = Turns(
+        Bounds(8, 4, 2, 4), lambda host: QuotaClass(host not in guests[3:]), own_slots=True
+    )
     stuck = [asyncio.create_task(turns.enter(guest)) for guest in guests for _ in range(16)]
     await asyncio.sleep(0)
     assert turns.slots.total == 4, "the slots of hosts without a registration are full"
@@ -142,7 +145,9 @@ async def test_a_host_that_begins_waits_for_no_guest() -> None:
 
 async def test_own_slots_balance() -> None:
     """Whatever requests of two hosts of one group enter and leave, no slot is lost and none is added."""
-    turns = Turns(Bounds(4, 2, 0, 0), lambda _host: QuotaClass.NAMED, lambda _host: "group", own_slots=True)
+    turns: Turns[Address] = Turns(
+        Bounds(4, 2, 0, 0), lambda _host: QuotaClass.NAMED, lambda _host: "group", own_slots=True
+    )
     for first, second in ((HOST, OTHER), (OTHER, HOST)):
         for order in ((0, 1, 2), (1, 0, 2), (2, 1, 0), (2, 0, 1)):
             inside = [first, second, first]
@@ -157,7 +162,7 @@ async def test_own_slots_balance() -> None:
 async def test_many_addresses_of_one_network_take_turns_as_one() -> None:
     """A hundred guests with a hundred requests each have half of the slots, and every second turn."""
     guests = [ipaddress.ip_address(f"10.1.0.{n}") for n in range(100)]
-    turns = Turns(
+    turns: Turns[Address] = Turns(
         Bounds(8, 4, 0, 0),
         lambda _host: QuotaClass.REGISTERED,
         lambda host: "guests" if host in guests else host,
@@ -191,7 +196,9 @@ async def test_a_host_in_debt_waits_outside_the_slots() -> None:
     debtor, payer = ipaddress.ip_address("10.0.0.66"), ipaddress.ip_address("10.0.0.1")
     debts = {str(debtor): 0.01}
     bounds = Bounds(1, 1, 0, 0)
-    turns = Turns(bounds, lambda _host: QuotaClass.REGISTERED, pause=lambda host: debts.get(host, 0.0))
+    turns: Turns[Address] = Turns(
+        bounds, lambda _host: QuotaClass.REGISTERED, pause=lambda host: debts.get(host, 0.0)
+    )
     waiting = [asyncio.create_task(turns.enter(debtor)) for _ in range(50)]
     for _ in range(100):
         async with asyncio.timeout(20.0):
