@@ -59,9 +59,9 @@ def test_a_policy_is_reloaded_over_rest(machine: Host, demo: Compose, rest: Rest
     before = machine.run(lambda: rest.get("/v1/policy")).json
     policy: Path = demo.directory / "policies" / "containers.ini"
     policy.write_text(policy.read_text() + "\n# edited by its operator\n")
-    answer = machine.run(lambda: rest.post("/v1/policy/reload"))
+    answer = machine.run(lambda: rest.post("/v1/policy/reload", match="*"))
     assert answer.status == 200, answer.body
     after = machine.run(lambda: rest.get("/v1/policy")).json
     assert after["revision"] > before["revision"]
     assert after["text"].endswith("# edited by its operator\n")
-    assert eventually(lambda: demo.audit("--event", "policy reloaded"), demo.story)
+    assert eventually(lambda: len(demo.audit("--event", "policy loaded")) > 1, demo.story)
