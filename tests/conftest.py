@@ -26,8 +26,8 @@ from tests.support.virtual_clock import VirtualClock
 
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
 _MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
-_CLOCK = pytest.StashKey[VirtualClock]()
-_WALL = 1_790_000_000.0  # seconds since the epoch: the same date for each run
+_TIME = pytest.StashKey[contextlib.ExitStack]()
+_WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, after that of the files
 _NIGHTLY = (
     "tests/integration/",
     "tests/system/",
@@ -109,8 +109,7 @@ def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) ->
 def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
     if may_depend_on_chance(item):
         return (yield)
-    machine = item.stash.setdefault(_CLOCK, VirtualClock(wall=_WALL))
-    with clock.using(machine), WATCH.watching() as found:
+    with WATCH.watching() as found:
         result = yield
     if found:  # the product may have caught the error
         pytest.fail(f"this test {'; '.join(dict.fromkeys(found))}: mark it `nightly`", pytrace=False)
@@ -119,7 +118,10 @@ def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide in the fixtures of a test."""
+    """Begin the test's own time, and forbid what chance can decide in its fixtures."""
+    if not may_depend_on_chance(item):
+        item.stash[_TIME] = contextlib.ExitStack()
+        item.stash[_TIME].enter_context(clock.using(VirtualClock(wall=_WALL)))
     return (yield from _watched(item))
 
 
@@ -131,8 +133,12 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide at the end of a test."""
-    return (yield from _watched(item))
+    """Forbid what chance can decide at the end of a test, and end its time."""
+    try:
+        return (yield from _watched(item))
+    finally:
+        if _TIME in item.stash:
+            item.stash[_TIME].close()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -49,7 +49,10 @@ class Budget:
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.quota_class = quota_class
-        self._plenty, self._scarce = bounds, dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host)
+        self._plenty, self._scarce = (
+            bounds,
+            dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host),
+        )
         self._kept = reserve.kept
         self._clock = clock
         self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)

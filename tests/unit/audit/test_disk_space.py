@@ -15,6 +15,8 @@ from tests.support.audit import decision, settle
 from tests.support.engines import ByHand, let_pass
 from tests.support.small_disk import small_disk
 
+pytestmark = pytest.mark.nightly
+
 _RESERVE = 16 << 20
 
 

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +21,7 @@ from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up, copy_database
 from appliance.backup.restore import restore
+from appliance.base.clock import wall_ns
 from appliance.ipsec.signed_checkpoints import CheckpointMemory
 from tests.support.audit import decision, settle
 from tests.support.engines import open_log
@@ -36,7 +36,7 @@ def state(tmp_path: Path) -> Path:
     for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
     key = Ed25519PrivateKey.generate()
-    memory = CheckpointMemory(state / "signer", time.time_ns)
+    memory = CheckpointMemory(state / "signer", wall_ns)
 
     def sign(number: int, text: bytes) -> None:
         memory.approve(text)

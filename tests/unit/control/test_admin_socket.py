@@ -62,6 +62,7 @@ async def served(state: Path) -> AsyncIterator[Slow]:
         server.close()
 
 
+@pytest.mark.nightly
 async def test_an_order_past_its_timeout_is_withdrawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

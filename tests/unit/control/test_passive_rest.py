@@ -3,13 +3,13 @@
 import asyncio
 import socket
 import sqlite3
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from appliance.base.clock import wall
 from appliance.channel import admin
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.channel import Channel
@@ -40,7 +40,7 @@ class Standby:
 
 def made(name: str) -> tuple[TokenRow, str]:
     """Return a token, and its text."""
-    return make_token(name, "viewer", now=time.time(), seconds=60)
+    return make_token(name, "viewer", now=wall(), seconds=60)
 
 
 def save(folder: Path, *rows: TokenRow) -> None:

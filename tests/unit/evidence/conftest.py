@@ -2,7 +2,6 @@
 
 import asyncio
 import hashlib
-import time
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
+from appliance.base.clock import wall_ns
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.channel.answers.monitor_answers import RevisionTexts
@@ -63,7 +63,7 @@ class Control:
         self.orders = EvidenceOrders(log, self.trail)
         self.policies: dict[int, str] = {}
         self.specifications: dict[int, dict[str, str]] = {}
-        self.begun = time.time_ns()
+        self.begun = wall_ns()
         self.worked = 0
         self.recordings: dict[str, Recording] = {}
 
@@ -96,7 +96,7 @@ class Control:
         """Record the time until now and close the recording, in its own folder."""
         digest = hashlib.sha256(bag).hexdigest()
         recording = example(
-            Recording, id="ab" * 10, began=self.begun, ended=time.time_ns(), sha256=digest, **about
+            Recording, id="ab" * 10, began=self.begun, ended=wall_ns(), sha256=digest, **about
         )
         self.trail.happened("recording closed", "complete", recording=recording.id, sha256=digest)
         (folder / recording.id).mkdir()
@@ -136,7 +136,7 @@ class Control:
 
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
         """Write a bundle to a file and return its path."""
-        span = TimeSpan(self.begun if since is None else since, time.time_ns() if until is None else until)
+        span = TimeSpan(self.begun if since is None else since, wall_ns() + 1 if until is None else until)
         place.write_bytes(b"".join(export(self.log.path, span, self.ask)))
         return place
 
@@ -149,6 +149,6 @@ def control(make_log: MakeLog) -> Control:
     running.load_policy(7, "[Nodes]\ndefault = *\né = *\n")
     running.load_specifications(2, {"a.rv": "a() { }", "msg/p/T.msg": "int32 x\n", "../b\n.rv": "b() { }"})
     running.work(5)
-    running.begun = time.time_ns()
+    running.begun = wall_ns()
     running.work()
     return running

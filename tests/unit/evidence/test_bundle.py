@@ -11,7 +11,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -28,6 +27,7 @@ from appliance.audit.query import Filter
 from appliance.audit.retention import Retention
 from appliance.audit.search import search
 from appliance.base import clock
+from appliance.base.clock import wall_ns
 from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import bundle_verifier
@@ -120,6 +120,7 @@ def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
         assert done.returncode == status, done.stdout + done.stderr
 
 
+@pytest.mark.nightly
 def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control) -> None:
     """A bundle has all records of its time span, earlier loads, and signed texts, but no other revisions."""
     found = members_of(bundle)
@@ -141,9 +142,10 @@ def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control
     assert page.count('<tr class="deny">') == sum(record["decision"] == "deny" for record in decisions[1:])
 
 
+@pytest.mark.nightly
 def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> None:
     """Two exports have the same manifest and members; only the record of the proof differs."""
-    until = time.time_ns()
+    until = wall_ns() + 1
     control.work(3)
     first, second = (
         members_of(control.exported(tmp_path / name, until=until)) for name in ("a.zip", "b.zip")
@@ -389,6 +391,7 @@ def test_an_empty_file_is_not_a_bundle(bundle: Path, tmp_path: Path, reviewer: R
     assert reviewer.status(bundle, "--checkpoints", empty) == 0
 
 
+@pytest.mark.nightly
 def test_a_zip_bomb_is_not_unpacked(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -643,7 +646,7 @@ def test_records_removed_by_retention_are_listed(
 @pytest.mark.nightly
 def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     """Records that retention copied to the end of the log belong to their original time."""
-    until = time.time_ns()
+    until = wall_ns() + 1
     for number in range(1200):
         control.log.record(decision(control.log, number))
     control.log.record(
@@ -657,6 +660,7 @@ def test_copied_records_are_separate_runs(control: Control, tmp_path: Path, revi
     assert reviewer.status(bundle) == 0, reviewer.said
 
 
+@pytest.mark.nightly
 def test_empty_and_too_large_time_spans_are_rejected(
     control: Control, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -665,7 +669,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
         export(control.log.path, TimeSpan(0, 1), control.ask)
     monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
     with pytest.raises(BundleError, match="more than 3 records"):
-        export(control.log.path, TimeSpan(0, time.time_ns()), control.ask)
+        export(control.log.path, TimeSpan(0, wall_ns() + 1), control.ask)
 
 
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -679,9 +683,10 @@ def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch,
     log.close()
 
 
+@pytest.mark.nightly
 def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
     """If a text changes during the export, the bundle matches its manifest or the export fails."""
-    pieces = export(control.log.path, TimeSpan(control.begun, time.time_ns()), control.ask)
+    pieces = export(control.log.path, TimeSpan(control.begun, wall_ns() + 1), control.ask)
     control.policies[7] = "[Nodes]\n"
     with pytest.raises(BundleError, match=r"policies/7\.ini changed during the export"):
         list(pieces)

@@ -3,7 +3,6 @@
 import base64
 import datetime
 import stat
-import time
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
-from appliance.base.clock import using
+from appliance.base.clock import using, utc_now, wall
 from appliance.ipsec.certificate_authority import (
     CERTIFICATE_FILE,
     KEY_FILE,
@@ -57,7 +56,7 @@ def test_a_certificate_takes_only_the_key_from_the_request(tmp_path: Path, kind:
     assert not made.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert not made.extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign
     assert int(issued.serial, 16) == made.serial_number
-    left = made.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
+    left = made.not_valid_after_utc - utc_now()
     assert datetime.timedelta(days=89) < left <= datetime.timedelta(days=90)
     assert issued.expires == made.not_valid_after_utc.timestamp()
 
@@ -141,7 +140,7 @@ def number_of(revocations: bytes) -> int:
 def test_the_number_of_the_list_grows_whatever_the_clock_does(tmp_path: Path) -> None:
     """charon ignores a list with a lower number, and would accept certificates that were revoked since."""
     numbers = [number_of(CertificateAuthority(tmp_path).revocations([]))]
-    with using(VirtualClock(wall=time.time() - 3600)):
+    with using(VirtualClock(wall=wall() - 3600)):
         authority = CertificateAuthority(tmp_path)  # the signer was started again
         numbers += [number_of(authority.revocations([])) for _ in range(2)]
         (tmp_path / LIST_FILE).unlink()

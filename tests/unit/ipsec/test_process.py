@@ -187,6 +187,7 @@ def failure_of(directory: Path, esp: Esp) -> Failed:
     return asyncio.run(work())
 
 
+@pytest.mark.nightly
 def test_the_last_output_of_charon_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The supervisor gets charon's exit and its last 40 lines, each up to a length."""
     program = tmp_path / "charon"

@@ -1,11 +1,11 @@
 """Tests of what the signer remembers: only one past can be signed."""
 
 import hashlib
-import time
 from pathlib import Path
 
 import pytest
 
+from appliance.base.clock import wall_ns
 from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointMemory, CheckpointRefusedError
 
 _NONE = "0" * 64
@@ -29,7 +29,7 @@ def test_each_follows_the_one_before(tmp_path: Path) -> None:
     previous = _NONE
     for number in range(1, 10):
         text = checkpoint(number, previous)
-        CheckpointMemory(tmp_path, time.time_ns).approve(text)
+        CheckpointMemory(tmp_path, wall_ns).approve(text)
         previous = digest(text)
 
 
@@ -37,7 +37,7 @@ def test_asked_again(tmp_path: Path) -> None:
     """A checkpoint whose signature was lost on the way is signed again, if it is the same."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
-    signed = CheckpointMemory(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, wall_ns)
     for text in (first, second, first, second):
         signed.approve(text)
 
@@ -62,7 +62,7 @@ def test_asked_again(tmp_path: Path) -> None:
 )
 def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
     """A second history, a gap, and other texts are refused with the reason, and change nothing."""
-    signed = CheckpointMemory(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, wall_ns)
     signed.approve(checkpoint(1))
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(CheckpointRefusedError, match=reason):
@@ -72,7 +72,7 @@ def test_refused(tmp_path: Path, text: bytes, reason: str) -> None:
 
 def test_logs_are_separate_and_bounded(tmp_path: Path) -> None:
     """Each log has its own history; control cannot fill the signer's disk with invented logs."""
-    signed = CheckpointMemory(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, wall_ns)
     for number in range(MOST_LOGS):
         signed.approve(checkpoint(1, log=f"{number:032x}"))
     with pytest.raises(CheckpointRefusedError, match=r"remove \.signed files"):
@@ -83,7 +83,7 @@ def test_cut_by_a_crash(tmp_path: Path) -> None:
     """A hash that a crash cut short was not approved; the checkpoint can be approved again."""
     first = checkpoint(1)
     second = checkpoint(2, digest(first))
-    signed = CheckpointMemory(tmp_path, time.time_ns)
+    signed = CheckpointMemory(tmp_path, wall_ns)
     signed.approve(first)
     signed.approve(second)
     (memory,) = tmp_path.glob("*.signed")

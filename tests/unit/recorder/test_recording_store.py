@@ -1,11 +1,11 @@
 """The store has complete recordings only; the hosts and kinds with the most bytes make room."""
 
-import time
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from appliance.base.clock import wall_ns
 from appliance.channel.answers.recording_answers import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
 from appliance.recorder.recording_store import ABOUT, RecordingStore
 
@@ -66,7 +66,7 @@ def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recordi
 
 def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
     """The next recorder finds saved recordings in time order; unfinished ones are parts, damaged ones are ignored."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     second, first = put(store, recording(2)), put(store, recording(1))
     store.part("f" * 20).mkdir()
     about = (tmp_path / first.id / ABOUT).read_bytes()
@@ -75,13 +75,13 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
         spoilt = tmp_path / (letter * 20)
         spoilt.mkdir()
         (spoilt / ABOUT).write_bytes(damaged)
-    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     assert again.recordings == [first, second]
     assert again.parts() == [again.part("f" * 20)]
     again.remove(first, "eve", "")
     assert not (tmp_path / first.id).exists()
     assert again.find(first.id) is None
-    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     assert list(again.removed()) == [(first, "eve", "")]
     again.note(first.id)
     assert not list(again.removed())
@@ -90,16 +90,16 @@ def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
 
 def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
     """A recording is reported again until control has noted it."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     first, second = put(store, recording(1)), put(store, recording(2))
     store.note(first.id)
     store.note("0" * 20)
-    assert RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns).unnoted() == [second]
+    assert RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns).unnoted() == [second]
 
 
 def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
     """The oldest of the kind with the most bytes is removed, so that a flood of drops removes no other recording."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     put(store, recording(1, "order", 8 * MIB))
     put(store, recording(2, "fault", 8 * MIB))
     for number in range(3, 8):
@@ -112,7 +112,7 @@ def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
 
 def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
     """However many recordings a guest causes, it has a quarter of the disk, and those of other hosts stay."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     put(store, recording(1, size=8 * MIB, charged_to=ROBOT))
     put(store, recording(2, size=8 * MIB, charged_to="10.0.0.7"))
     for number in range(3, 50):
@@ -126,7 +126,7 @@ def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
 
 def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
     """Ten guests take the free space and then each other's; for the robot, half of the disk is cleared again."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
 
     def arrive(number: int, charged_to: str) -> str:
         _gone, why_not = room_for(store, charged_to)
@@ -148,7 +148,7 @@ def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
 
 def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
     """The reason for the missing recording is reported."""
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     for number in range(8):
         put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
     assert room_for(store, "10.0.0.9") == ([], "recorder.disk is full")
@@ -157,11 +157,11 @@ def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
 def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control receives all recordings in one message, however many topics they have."""
     monkeypatch.setattr("appliance.recorder.recording_store._MOST_DESCRIBED", 1000)
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     for number in range(1, 9):
         put(store, recording(number))
     cleared(store, room=True)
-    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
     left = [(tmp_path / found.id / "recording.json").stat().st_size for found in store.recordings]
     assert 0 < sum(left) <= 1000
 

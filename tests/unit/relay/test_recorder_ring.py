@@ -2,12 +2,11 @@
 
 import mmap
 import os
-import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.base.clock import using
+from appliance.base.clock import using, wall_ns
 from appliance.channel.messages import RingGiven
 from appliance.recorder.excluded_topics import known_sums
 from appliance.recorder.ring import SMALLEST
@@ -19,9 +18,7 @@ from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
 EVER = 0, 1 << 63
 
 
-def given(
-    descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = time.time_ns
-) -> RecorderRing:
+def given(descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = wall_ns) -> RecorderRing:
     """Return the recorder of a relay."""
     return RecorderRing(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
@@ -79,9 +76,7 @@ def test_excluded_topics_are_not_recorded(memory: int, never: tuple[str, ...]) -
 def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
     """A guest's string that claims a camera's type is still recorded."""
     sums = known_sums(["sensor_msgs/Image"])
-    recorded = RecorderRing(
-        RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), time.time_ns
-    )
+    recorded = RecorderRing(RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), wall_ns)
     header = {"type": "sensor_msgs/Image", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "callerid": "/g"}
     stream = recorded.open("/orders", "10.0.0.9", header)
     assert stream is not None

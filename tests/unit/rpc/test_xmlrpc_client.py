@@ -16,6 +16,7 @@ from roswire.xmlrpc import build_response
 pytestmark = [pytest.mark.anyio, pytest.mark.timeout(20)]
 
 
+@pytest.mark.nightly
 async def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
     """The time limit of a call also holds on a kept connection; it is closed, and the next call opens another."""
     asked = 0
@@ -47,6 +48,7 @@ async def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> N
     server.close()
 
 
+@pytest.mark.nightly
 async def test_a_large_call_has_more_time() -> None:
     """Otherwise a new ROS master, which reads all parameters in one long call, would never have them."""
     small_failed = asyncio.Event()
@@ -111,6 +113,7 @@ def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.nightly
 async def test_a_deep_answer_of_a_node_is_refused() -> None:
     """An answer that is deeper than what nodes are asked for is nonsense, and costs the call alone."""
 

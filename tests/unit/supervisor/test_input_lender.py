@@ -13,6 +13,8 @@ from appliance.supervisor.input_lender import Borrower, lend_inputs
 from tests.support.certificates import make_certificates
 from tests.support.requirements import need_root
 
+pytestmark = pytest.mark.nightly
+
 USER: Final = 61099
 _READ = """
 import sys

@@ -82,6 +82,7 @@ def seen(home: Path, view: PrivateView | None) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
 @pytest.mark.parametrize("mode", [0o700, 0o750, 0o755])
 def test_another_user_runs_the_program_of_a_closed_home(home: Path, mode: int, umask: int) -> None:
@@ -110,6 +111,7 @@ def test_another_user_runs_the_program_of_a_closed_home(home: Path, mode: int, u
     assert (home / "x y/appliance/main.py").read_text() == "content"
 
 
+@pytest.mark.nightly
 def test_one_closed_file_is_enough(home: Path) -> None:
     """A file of the program that a pull under umask 077 closed is shown like a closed folder."""
     home.chmod(0o755)

@@ -1,19 +1,19 @@
 """Tests of `appliance.supervisor.process_slot`: the delay before a restart."""
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from appliance.base.clock import now
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
 from appliance.supervisor.roles import Facts, Role
 
 
 def process(*, lived: float) -> Any:
     """Return a process that started this number of seconds ago."""
-    return SimpleNamespace(started=time.monotonic() - lived, since="2026-01-01T00:00:00.000Z")
+    return SimpleNamespace(started=now() - lived, since="2026-01-01T00:00:00.000Z")
 
 
 @pytest.fixture

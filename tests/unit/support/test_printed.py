@@ -43,6 +43,7 @@ def test_an_error_counts_as_silence(output: str, status: int) -> None:
         row_of(done(output, status))
 
 
+@pytest.mark.nightly
 def test_waiting_goes_on_without_an_answer() -> None:
     """The condition is tried again; the last error is in the message of a failure."""
     answers = iter([done("", 2), done(STANDS_BY, 1), done('{"role":"active"}\n', 0)])

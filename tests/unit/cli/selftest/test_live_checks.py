@@ -71,6 +71,7 @@ def test_a_delayed_record_is_found(log: Log) -> None:
     assert log.searches == 3
 
 
+@pytest.mark.nightly
 def test_a_missing_record_is_searched_for_five_seconds(log: Log) -> None:
     """Over REST each search is a request, and too many at once are refused (429)."""
     log.answers = [[NOT_OURS]]
@@ -86,6 +87,7 @@ def test_a_refused_search_is_repeated(log: Log) -> None:
     assert outcome(log)[0] == "ok"
 
 
+@pytest.mark.nightly
 def test_an_unreadable_log_is_not_a_defect(log: Log) -> None:
     """The result says that the record could not be checked, and why."""
     log.answers = [NotRunningError("https://h: too many requests")]
