@@ -109,7 +109,10 @@ def _policy(status: Status) -> Iterator[_Condition]:
         sections = "], [".join(policy.audit_only)
         text = f"the policy denies nothing by [{sections}]; denials are only recorded (audit-only)"
         yield "warning", "policy-audit-only", "policy", text
-    if policy.differs_from_file:
+    if policy.file_refused:
+        text = f"revision {policy.revision} stays in force, {policy.file} is refused: {policy.file_refused}"
+        yield "alarm", "policy-refused", "policy", text
+    elif policy.differs_from_file:
         text = f"revision {policy.revision} differs from {policy.file}"
         yield "notice", "policy-differs", "policy", text
 

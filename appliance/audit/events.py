@@ -18,6 +18,8 @@ EVENTS: dict[str, str] = {
     "policy loaded": "A policy came into force; `detail` has who loaded it, its source, and the hash of its text.",
     "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",
     "policy refused": "A new policy has errors and was rejected as a whole; the previous policy stays in force.",
+    "policy file refused": "The appliance started, and the policy's file has errors or fails its tests; the revision"
+    " that was in force before stays in force.",
     "host enrolled": "A host got a certificate and its virtual address; `detail` has both and who requested it.",
     "host renewed": "A host got a new certificate; its previous certificate was revoked.",
     "host revoked": "A host was excluded: its certificate is revoked, its tunnel closed, its registrations removed.",
@@ -169,8 +171,8 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel refused",
         ),
         Severity.ALARM: (
-            "forwarding gap", "monitor not built", "monitors restarted", "probe failed", "process failing",
-            "protection forgotten", "publication refused", "records lost", "topics held",
+            "forwarding gap", "monitor not built", "monitors restarted", "policy file refused", "probe failed",
+            "process failing", "protection forgotten", "publication refused", "records lost", "topics held",
         ),
     }.items()
     for name in names

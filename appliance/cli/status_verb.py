@@ -220,10 +220,11 @@ def _bundle(bundles: BundlesState) -> Text:
 def _policy(policy: PolicyState) -> Text:
     differs = ""
     if policy.differs_from_file:
-        theirs = policy.who != DISK
-        differs = (
-            "; differs from the file" if theirs else "; the file has changed, load it: rosrv policy reload"
-        )
+        differs = "; differs from the file"
+        if policy.file_refused:
+            differs = "; the file is REFUSED: rosrv policy check"
+        elif policy.who == DISK:
+            differs = "; the file has changed, load it: rosrv policy reload"
     warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
     how = loaded_by(policy.who, policy.loaded)
     line = Text(f"revision {policy.revision} of {policy.file}, {how}{warnings}{differs}")

@@ -105,8 +105,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     settings = resolve(config, os.environ, flags)
     setproctitle.setproctitle("rosrv: supervisor")
     configure_logs("supervisor")
-    node_ports = read_inputs(settings)
     membership = _membership_in(settings.state)
+    node_ports = read_inputs(settings, None if membership is None else membership.witness)
     run_appliance(
         settings,
         roles_of(

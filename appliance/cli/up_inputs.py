@@ -1,65 +1,90 @@
 """Validate the policy and the specifications before `rosrv up` starts anything.
 
 RVMaster reads both again and decides. If an operator loaded a policy or specifications, these survive a restart.
-RVMaster then does not read the file or the folder, so the file or the folder may be invalid.
+RVMaster then does not read the file or the folder, so the file or the folder may be invalid. The file of the policy may
+also be invalid if the store has a revision: this one then stays in force.
 """
 
 import contextlib
+import ipaddress
 import os
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from appliance.base.actors import DISK
-from appliance.base.input_files import read_given_text
 from appliance.configuration.settings import Settings
-from appliance.policy.judgement import PolicyContext, judge
+from appliance.control.policy_gate import KeptPolicy, PolicyRefusedError, policy_at_start
+from appliance.control.robot import robot_addresses
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.policy.policy_findings import PolicyError
-from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
 from rosmop.tool.terminal import refused
 
 _STATE = Path("control", "state.db")
 _VALID = "valid"
+_NOTHING = "; nothing was started (--policy FILE)"
+_LAST_POLICY = """
+    SELECT revision, text, file, who, COALESCE(signature, '')
+    FROM policy_revision LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC LIMIT 1
+"""
 
 
-def read_inputs(settings: Settings) -> range:
-    """Validate policy and specifications; return the range of ports that the policy file gives to nodes.
+def read_inputs(settings: Settings, witness: str | None = None) -> range:
+    """Validate policy and specifications; return the range of ports that the policy gives to nodes.
+
+    One of two appliances, with a `witness`, starts with what was in force on the active one.
 
     Raises `StartError` with every error of the policy or of the specifications.
     """
     state = settings.state / _STATE
     if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
         _require_specifications(settings.monitors, settings.site_keys)
-    return read_node_ports(settings)
+    return read_node_ports(settings, witness)
 
 
-def read_node_ports(settings: Settings) -> range:
-    """Validate the policy; return the range of ports that the policy file gives to nodes.
+def read_node_ports(settings: Settings, witness: str | None = None) -> range:
+    """Return the range of ports that the policy gives to nodes: the policy that RVMaster will bring into force.
 
-    Raises `StartError` with every error of the policy.
+    Raises `StartError` with every error of the policy file, if there is no policy but this.
     """
+    stored = _Stored(None, {}, complete=True)
+    state = settings.state / _STATE
     try:
-        text, signature = _text(settings.policy), read_signature(settings.policy)
-        known = PolicyContext(site_keys=settings.site_keys)
-        return judge(text, str(settings.policy), known, signature).policy.ports
-    except (PolicyError, StartError) as error:
-        if not _is_read_at_start(settings.state / _STATE, "policy_revision"):
-            return DEFAULT_PORTS
-        if isinstance(error, StartError):
-            raise
-        raise StartError("\n".join(str(finding) for finding in error.findings)) from None
+        stored = _stored_in(state)
+        known = PolicyContext(stored.hosts, robot_addresses(settings, witness), site_keys=settings.site_keys)
+        kept = stored.policy
+        first = kept is not None and (kept.who != DISK or witness is not None)
+        return policy_at_start(kept, settings.policy, known, kept_first=first).policy.ports
+    except PolicyRefusedError as error:
+        if not stored.complete or stored.policy is not None:
+            return DEFAULT_PORTS  # RVMaster decides; it has the whole state
+        hint = "" if settings.policy.exists() else _NOTHING
+        raise StartError(f"{error}{hint}") from None
 
 
-def _text(file: Path) -> str:
+class _Stored(NamedTuple):
+    """The stored policy and hosts; not `complete`: an earlier run left changes that are not in the database."""
+
+    policy: KeptPolicy | None
+    hosts: Mapping[str, Address]
+    complete: bool
+
+
+def _stored_in(state: Path) -> _Stored:
     try:
-        return read_given_text(file)
-    except OSError as error:
-        why = error.strerror
-    except UnicodeDecodeError as error:
-        why = f"it is not UTF-8 text: {error.reason}"
-    raise StartError(f"{file}: cannot read the policy: {why}; nothing was started (--policy FILE)")
+        if not state.exists():
+            return _Stored(None, {}, complete=True)
+        complete = not state.with_suffix(".ahead").stat().st_size
+        with contextlib.closing(sqlite3.connect(f"file:{state}?mode=ro", uri=True)) as database:
+            row = database.execute(_LAST_POLICY).fetchone()
+            hosts = database.execute("SELECT name, address FROM host WHERE revoked IS NULL").fetchall()
+    except (OSError, sqlite3.Error):
+        return _Stored(None, {}, complete=False)
+    policy = None if row is None else KeptPolicy(*row)
+    return _Stored(policy, {name: ipaddress.ip_address(address) for name, address in hosts}, complete)
 
 
 def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:

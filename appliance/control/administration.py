@@ -13,7 +13,8 @@ from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.evidence_orders import NotSealedError
 from appliance.control.lease_client import HandOverError
-from appliance.control.policies import PolicyRefusedError, RevisionChangedError
+from appliance.control.policies import RevisionChangedError
+from appliance.control.policy_gate import PolicyRefusedError
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecorderAwayError
 from appliance.control.request_methods import RequestMethod

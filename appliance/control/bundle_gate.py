@@ -27,7 +27,8 @@ from appliance.channel.link import Link
 from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from appliance.configuration.settings import Fleet
 from appliance.control.bundle_health import RobotHealth
-from appliance.control.policies import Policies, PolicyCases, PolicyRefusedError, RevisionChangedError
+from appliance.control.policies import Policies, PolicyCases, RevisionChangedError
+from appliance.control.policy_gate import PolicyRefusedError
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared

@@ -1,7 +1,7 @@
 """Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
 
-A new policy is compiled and tested before it takes effect. An invalid policy changes nothing, and all findings are
-reported. The store keeps every policy that came into force as a revision.
+A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. An invalid policy changes
+nothing, and all findings are reported. The store keeps every policy that came into force as a revision.
 
 Operators' changes are made one at a time. A change that expects a revision other than the one in force is rejected. A
 change is answered once it is on disk and the relays have carried it out: revoked traffic no longer passes.
@@ -19,44 +19,30 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
-from appliance.base.input_files import read_given_text
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.control.errors import UnknownThingError
+from appliance.control.policy_gate import (
+    KeptPolicy,
+    PolicyRefusedError,
+    judged,
+    policy_at_start,
+    read_policy,
+    with_cases,
+)
 from appliance.policy.host_sets import Network
-from appliance.policy.judgement import PolicyContext, judge
+from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.policy.policy_findings import PolicyError
 from appliance.signing.fingerprints import fingerprint
-from appliance.signing.site_keys import read_signature, signer
+from appliance.signing.site_keys import signer
 from appliance.store.revisions import Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
-_KEPT = (
-    "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To discard it, start with"
-    " the version and configuration that took it, run `rosrv policy reload` there, and start again"
-)
-
-
-class PolicyRefusedError(Exception):
-    """The policy is rejected; `findings` has every reason, as `file:line:column: error: text`."""
-
-    def __init__(self, findings: list[str]) -> None:
-        super().__init__("\n".join(findings))
-        self.findings = findings
-
-
-def _error_text(error: OSError | UnicodeDecodeError) -> str:
-    return (
-        error.strerror or str(error)
-        if isinstance(error, OSError)
-        else f"it is not UTF-8 text: {error.reason}"
-    )
 
 
 class PolicyCases(NamedTuple):
@@ -64,6 +50,11 @@ class PolicyCases(NamedTuple):
 
     file: str
     text: str | None
+
+
+def kept_policy(row: RevisionRow) -> KeptPolicy:
+    """Return a stored revision for the gate."""
+    return KeptPolicy(row.revision, row.text, row.file, row.who, row.signature)
 
 
 class RevisionChangedError(Exception):
@@ -110,6 +101,8 @@ class Policies(Revisions[RevisionRow]):
         self._carried_out = carried_out
         self._site_keys = site_keys
         self._current: Policy | None = None
+        self.file_refused = ""
+        """Why the file was refused at the last start or reload, in a line; empty: it was not."""
 
     @property
     def current(self) -> Policy:
@@ -122,7 +115,7 @@ class Policies(Revisions[RevisionRow]):
     def differs_from_file(self) -> bool:
         """Whether the policy in force differs from the file."""
         try:
-            return _read(self.file) != (self.current.text, self.in_force.signature)
+            return read_policy(self.file) != (self.current.text, self.in_force.signature)
         except PolicyRefusedError:
             return True
 
@@ -130,18 +123,21 @@ class Policies(Revisions[RevisionRow]):
         """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
 
         After a crash of control (`restarted`), this is the policy that was in force. At the start of the appliance, it
-        is the file. Exception: if an operator's own revision (from a rollback or REST) was in force when the appliance
-        stopped, this revision is used.
+        is the file, if a reload would take it: otherwise the last revision stays in force, with an alarm. Exception: if
+        an operator's own revision (from a rollback or REST) was in force when the appliance stopped, this revision is
+        used.
         """
-        last = self.in_force if self._find_last(restarted=restarted) else None
-        policy, signature = policy_at_start(last, self.file, self.known)
-        kept = self.in_force
-        if last is None and (not kept.revision or (kept.text, kept.signature) != (policy.text, signature)):
+        kept_first = self._find_last(restarted=restarted)
+        kept = kept_policy(self.in_force) if self.revision else None
+        policy, signature, refused = policy_at_start(kept, self.file, self.known, kept_first=kept_first)
+        if kept is None or (kept.text, kept.signature) != (policy.text, signature):
             self._end_limit()
             self._keep(policy, signature, who=DISK, note="read at start")
             return
         self._enforce(policy)
         self._resume()
+        if refused is not None:
+            self._file_refused(refused)
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
@@ -159,7 +155,11 @@ class Policies(Revisions[RevisionRow]):
         """
         within, note = request.confirm_within, reloaded_by(who)
         async with self._changing(request.expected):
-            policy, signature = await self._prepared(lambda: _read(self.file), str(self.file), who)
+            try:
+                policy, signature = await self._prepared(lambda: read_policy(self.file), str(self.file), who)
+            except PolicyRefusedError as error:
+                self.file_refused = error.findings[0]
+                raise
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
     async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
@@ -188,7 +188,7 @@ class Policies(Revisions[RevisionRow]):
     def hosts_changed(self) -> int:
         """Compile the policy in force again, because hosts changed. Return the number of revocations."""
         try:
-            policy = _judged(self.current.text, self.in_force.signature, self.current.file, self.known)
+            policy = judged(self.current.text, self.in_force.signature, self.current.file, self.known)
         except PolicyRefusedError as error:  # a defect: the same text was valid before
             _log.error("the policy does not know the new hosts", findings=error.findings)
             return 0
@@ -209,7 +209,7 @@ class Policies(Revisions[RevisionRow]):
         Raises `PolicyRefusedError`. Raises `RevisionChangedError` if another revision came into force in the meantime.
         """
         row = await self._wanted(revision)
-        policy = _judged(row.text, row.signature, row.file, self.known)
+        policy = judged(row.text, row.signature, row.file, self.known)
         return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
@@ -249,7 +249,7 @@ class Policies(Revisions[RevisionRow]):
             differs_from_file=self.differs_from_file,
             warnings=[str(warning) for warning in self.current.warnings],
             confirm_by=self.confirm_by,
-            **self.with_cases(known).fields(),
+            **with_cases(known, self.file).fields(),
         )
 
     @property
@@ -258,18 +258,6 @@ class Policies(Revisions[RevisionRow]):
         return PolicyContext(
             dict(self._hosts()), self._robot, site_keys=self._site_keys, blocks=self._blocks()
         )
-
-    def with_cases(self, known: PolicyContext) -> PolicyContext:
-        """Add the test cases from the file beside the policy to a context."""
-        cases = self.file.with_name(f"{self.file.name}.tests.yaml")
-        text = error = None
-        try:
-            text = read_given_text(cases)
-        except FileNotFoundError:
-            pass
-        except (OSError, UnicodeDecodeError) as fault:
-            error = f"the policy's tests cannot be read: {_error_text(fault)}"
-        return replace(known, cases_file=str(cases), cases=text, cases_error=error)
 
     # --- inside ---
 
@@ -299,6 +287,18 @@ class Policies(Revisions[RevisionRow]):
             who=who,
         )
 
+    def _file_refused(self, error: PolicyRefusedError) -> None:
+        """Say that a start did not take the file, to those who look at the log, the records or the status."""
+        self.file_refused = error.findings[0]
+        text = f"revision {self.revision} stays in force, because the start refused {self.file}"
+        _log.error(text, findings=error.findings[:100])
+        self._trail.happened(
+            "policy file refused",
+            f"{text}: {self.file_refused}",
+            findings=error.findings[:100],
+            revision=self.revision,
+        )
+
     def _tested(
         self,
         read: Callable[[], tuple[str, str]],
@@ -308,11 +308,11 @@ class Policies(Revisions[RevisionRow]):
     ) -> tuple[Policy, str]:
         text, signature = read()
         tested = (
-            self.with_cases(known)
+            with_cases(known, self.file)
             if cases is None
             else replace(known, cases_file=cases.file, cases=cases.text)
         )
-        return _judged(text, signature, file, tested), signature
+        return judged(text, signature, file, tested), signature
 
     def _keep(
         self,
@@ -325,6 +325,7 @@ class Policies(Revisions[RevisionRow]):
         within: float | None = None,
     ) -> Loaded:
         take_effect()
+        self.file_refused = ""
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
         self._put_in_force(row, within)
@@ -352,32 +353,3 @@ class Policies(Revisions[RevisionRow]):
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
-
-
-def policy_at_start(last: RevisionRow | None, file: Path, known: PolicyContext) -> tuple[Policy, str]:
-    """Return the policy that a start brings into force, and its signature.
-
-    It is that of the stored revision `last`, or of the file (None). Raises `PolicyRefusedError`.
-    """
-    if last is None:
-        text, signature = _read(file)
-        return _judged(text, signature, str(file), known), signature
-    try:
-        return _judged(last.text, last.signature, last.file, known), last.signature
-    except PolicyRefusedError as error:
-        raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
-
-
-def _read(file: Path) -> tuple[str, str]:
-    """Return the file's text and signature. Raises `PolicyRefusedError`."""
-    try:
-        return read_given_text(file), read_signature(file)
-    except (OSError, UnicodeDecodeError) as error:
-        raise PolicyRefusedError([f"{file}: the policy cannot be read: {_error_text(error)}"]) from error
-
-
-def _judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
-    try:
-        return judge(text, file, known, signature).accepted()
-    except PolicyError as error:
-        raise PolicyRefusedError([str(finding) for finding in error.findings]) from error

@@ -220,4 +220,5 @@ class Queries:
             ],
             confirm_by=policies.confirm_by,
             loaded=policies.in_force.loaded,
+            file_refused=policies.file_refused,
         )

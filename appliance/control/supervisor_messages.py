@@ -14,7 +14,8 @@ from appliance.channel.channel import Channel
 from appliance.control.assembly import Parts
 from appliance.control.foundation import Foundation
 from appliance.control.operators import Operators
-from appliance.control.policies import PolicyRefusedError, RevisionChangedError
+from appliance.control.policies import RevisionChangedError
+from appliance.control.policy_gate import PolicyRefusedError
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC

@@ -17,7 +17,8 @@ import structlog
 
 from appliance.configuration.settings import Settings
 from appliance.control.foundation import make_host_table, open_listener
-from appliance.control.policies import PolicyRefusedError, policy_at_start
+from appliance.control.policies import kept_policy
+from appliance.control.policy_gate import PolicyRefusedError, policy_at_start
 from appliance.control.robot import robot_addresses
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import restore
@@ -119,7 +120,9 @@ class TakeoverCheck:
             robot_addresses(settings, self._membership.witness),
             site_keys=settings.site_keys,
         )
-        policy_at_start(next(iter(store.revisions(1)), None), settings.policy, known)
+        last = next(iter(store.revisions(1)), None)
+        kept = None if last is None else kept_policy(last)
+        policy_at_start(kept, settings.policy, known, kept_first=True)
         restore(Registry(), store)
         return next(iter(store.monitor_revisions(1)), None)
 

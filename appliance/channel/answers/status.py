@@ -65,6 +65,9 @@ class PolicyState(msgspec.Struct, frozen=True):
     audit_only: Annotated[list[str], doc("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
     loaded: Annotated[Moment | None, doc("when it came into force; null: an earlier version")] = None
+    file_refused: Annotated[
+        str, doc("why the file was refused at the last start or reload; empty: it was not")
+    ] = ""
 
 
 class IpsecState(msgspec.Struct, frozen=True):

@@ -50,6 +50,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),
         ("policy.audit_only", ["Publishers"], "policy-audit-only", "warning", "policy"),
         ("policy.differs_from_file", True, "policy-differs", "notice", "policy"),
+        ("policy.file_refused", "p.ini:1:1: error", "policy-refused", "alarm", "policy"),
         ("monitors.held", ["safeTrigger"], "monitor-held:safeTrigger", "alarm", "monitors"),
         ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),
         ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),

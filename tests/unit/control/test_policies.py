@@ -20,7 +20,8 @@ from appliance.channel.admin import (
     PolicyRollback,
     PolicyWanted,
 )
-from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
+from appliance.control.policies import Policies, RevisionChangedError
+from appliance.control.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
@@ -64,11 +65,11 @@ class Appliance:
     ) -> Iterator[Policies]:
         """Run control until the block ends; yield its policies."""
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
-        records = cast(Any, Records())
+        self.records = Records()
         policies = Policies(
             self.file,
             store,
-            records,
+            cast(Any, self.records),
             robot=(),
             hosts=hosts,
             blocks=blocks,
@@ -192,8 +193,8 @@ class Slow:
 async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A long policy with many tests is read, compiled and tested outside the loop."""
     appliance = Appliance(tmp_path)
-    slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
+        slow = Slow(monkeypatch, appliance)
         appliance.file.write_text(OTHER)
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
@@ -209,8 +210,8 @@ async def test_a_reload_overtaken_by_another_change_is_refused(
 ) -> None:
     """A policy that came into force during the tests is not silently replaced."""
     appliance = Appliance(tmp_path)
-    slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
+        slow = Slow(monkeypatch, appliance)
         await policies.store.settled()
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
@@ -227,9 +228,9 @@ async def test_hosts_changed_during_the_tests_are_seen(
 ) -> None:
     """A host whose certificate is revoked during the load has no rights by its old address."""
     appliance = Appliance(tmp_path)
-    slow = Slow(monkeypatch, appliance)
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
     with appliance.started(hosts=lambda: hosts) as policies:
+        slow = Slow(monkeypatch, appliance)
         appliance.file.write_text(OPEN.replace("[Nodes]\ndefault=*", "[Nodes]\ndefault=host:ocu host:new"))
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
@@ -242,6 +243,67 @@ async def test_hosts_changed_during_the_tests_are_seen(
             if policies.current.decide(Request(ipaddress.ip_address(text), "/n", Category.NODE, "/n")).allowed
         ]
         assert (allowed, slow.rounds) == (["10.0.0.8", "10.0.0.9"], 2)
+
+
+CASES = "cases:\n  - {host: 10.0.0.5, node: /n, publish: /t, expect: deny}\n"
+REFUSED: dict[str, Callable[[Path], object]] = {
+    "its tests fail": lambda file: file.with_name("policy.ini.tests.yaml").write_text(CASES),
+    "its tests cannot be read": lambda file: file.with_name("policy.ini.tests.yaml").write_bytes(b"\xff"),
+    "it has an error": lambda file: file.write_text("[Nonsense]\n"),
+    "it is not text": lambda file: file.write_bytes(b"\xff"),
+    "it is not there": lambda file: file.unlink(),
+    "it is not signed": lambda file: file.with_name("policy.ini.sig").unlink(),
+    "it is signed by another": lambda file: file.with_name("policy.ini.sig").write_text(
+        signed(OTHER, OTHER_KEY)
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+async def test_a_file_that_a_reload_refuses_is_refused_at_a_start(tmp_path: Path, reason: str) -> None:
+    """Each check of a load also holds at a start: the revision in force stays, and the alarm has the reason."""
+    appliance = Appliance(tmp_path)
+    beside = tmp_path / "policy.ini.sig"
+    beside.write_text(signed(OPEN))
+    with appliance.started(site_keys=[LINE]) as policies:
+        assert (policies.revision, policies.file_refused) == (1, "")
+        appliance.file.write_text(OTHER)
+        beside.write_text(signed(OTHER))
+        REFUSED[reason](appliance.file)
+        with pytest.raises(PolicyRefusedError) as refused:
+            await policies.reload(PolicyReload(), "operator")
+        assert policies.file_refused == refused.value.findings[0]
+    for restarted in (False, True, False):
+        with appliance.started(restarted=restarted, site_keys=[LINE]) as policies:
+            assert (policies.revision, policies.current.text) == (1, OPEN)
+            assert policies.file_refused == ("" if restarted else refused.value.findings[0])
+            recorded = [event for event, _resource in appliance.records.events]
+            assert recorded == ([] if restarted else ["policy file refused"])
+    appliance.file.write_text(OTHER)
+    beside.write_text(signed(OTHER))
+    (tmp_path / "policy.ini.tests.yaml").unlink(missing_ok=True)
+    with appliance.started(site_keys=[LINE]) as policies:
+        assert (policies.revision, policies.current.text, policies.file_refused) == (2, OTHER, "")
+
+
+async def test_a_refused_file_does_not_end_the_timeout(tmp_path: Path) -> None:
+    """An unconfirmed change still goes back if the file is broken at the start in between."""
+    appliance = Appliance(tmp_path)
+    with appliance.started() as policies:
+        appliance.file.write_text(OTHER)
+        await policies.reload(PolicyReload(confirm_within=600.0), "operator")
+    appliance.file.write_text("[Nonsense]\n")
+    with appliance.started() as policies:
+        assert (policies.revision, policies.current.text) == (2, OTHER)
+        assert policies.confirm_by is not None
+
+
+async def test_the_first_start_has_nothing_to_keep(tmp_path: Path) -> None:
+    """Without a revision that was in force, a policy that fails its tests ends the start, with all findings."""
+    appliance = Appliance(tmp_path)
+    REFUSED["its tests fail"](appliance.file)
+    with pytest.raises(PolicyRefusedError, match=r"policy.ini.tests.yaml:2:"):
+        appliance.started().__enter__()
 
 
 class DiedError(Exception):

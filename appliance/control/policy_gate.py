@@ -1,0 +1,116 @@
+"""The gate of the policy: what the text of a policy must pass before it comes into force, at a load and at a start.
+
+A start does not go around the gate: a file that a reload refuses does not come into force at the next start either.
+The supervisor imports this module too, so it does not import the store.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from appliance.base.input_files import read_given_text
+from appliance.policy.judgement import PolicyContext, judge
+from appliance.policy.policy import Policy
+from appliance.policy.policy_findings import PolicyError
+from appliance.signing.site_keys import read_signature
+
+_KEPT = (
+    "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To discard it, start with"
+    " the version and configuration that took it, run `rosrv policy reload` there, and start again"
+)
+_NOT_EITHER = "revision {0.revision}, which was in force before, cannot come into force either: {1}"
+
+
+class PolicyRefusedError(Exception):
+    """The policy is rejected; `findings` has every reason, as `file:line:column: error: text`."""
+
+    def __init__(self, findings: Sequence[str]) -> None:
+        super().__init__("\n".join(findings))
+        self.findings = list(findings)
+
+
+class KeptPolicy(NamedTuple):
+    """The last stored revision, which `who` brought into force."""
+
+    revision: int
+    text: str
+    file: str
+    who: str
+    signature: str
+
+
+class StartingPolicy(NamedTuple):
+    """The policy that a start brings into force, with its signature.
+
+    `refused` is the error of the file, if the revision that was in force before stays in force instead.
+    """
+
+    policy: Policy
+    signature: str
+    refused: PolicyRefusedError | None = None
+
+
+def policy_at_start(
+    kept: KeptPolicy | None, file: Path, known: PolicyContext, *, kept_first: bool
+) -> StartingPolicy:
+    """Return the policy that a start brings into force. Raises `PolicyRefusedError`.
+
+    It is that of the stored revision `kept`, if it comes first. Otherwise it is that of the file, if the file passes
+    the gate with its test cases, and `kept` if it does not.
+    """
+    if kept is not None and kept_first:
+        try:
+            return StartingPolicy(judged(kept.text, kept.signature, kept.file, known), kept.signature)
+        except PolicyRefusedError as error:
+            raise PolicyRefusedError([*error.findings, _KEPT.format(kept)]) from error
+    try:
+        text, signature = read_policy(file)
+        return StartingPolicy(judged(text, signature, str(file), with_cases(known, file)), signature)
+    except PolicyRefusedError as refused:
+        if kept is None:
+            raise
+        try:
+            policy = judged(kept.text, kept.signature, kept.file, known)
+        except PolicyRefusedError as error:
+            raise PolicyRefusedError(
+                [*refused.findings, _NOT_EITHER.format(kept, error.findings[0])]
+            ) from error
+        return StartingPolicy(policy, kept.signature, refused)
+
+
+def read_policy(file: Path) -> tuple[str, str]:
+    """Return the file's text and signature. Raises `PolicyRefusedError`."""
+    try:
+        return read_given_text(file), read_signature(file)
+    except (OSError, UnicodeDecodeError) as error:
+        raise PolicyRefusedError([f"{file}: the policy cannot be read: {_error_text(error)}"]) from error
+
+
+def judged(text: str, signature: str, file: str, known: PolicyContext) -> Policy:
+    """Return a policy that has passed the gate. Raises `PolicyRefusedError`."""
+    try:
+        return judge(text, file, known, signature).accepted()
+    except PolicyError as error:
+        raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
+
+
+def with_cases(known: PolicyContext, file: Path) -> PolicyContext:
+    """Add the test cases from the file beside the policy to a context."""
+    cases = file.with_name(f"{file.name}.tests.yaml")
+    text = error = None
+    try:
+        text = read_given_text(cases)
+    except FileNotFoundError:
+        pass
+    except (OSError, UnicodeDecodeError) as fault:
+        error = f"the policy's tests cannot be read: {_error_text(fault)}"
+    return replace(known, cases_file=str(cases), cases=text, cases_error=error)
+
+
+def _error_text(error: OSError | UnicodeDecodeError) -> str:
+    return (
+        error.strerror or str(error)
+        if isinstance(error, OSError)
+        else f"it is not UTF-8 text: {error.reason}"
+    )
