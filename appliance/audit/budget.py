@@ -2,7 +2,8 @@
 
 Each record is charged to its host, and the debt shrinks by `RATE` bytes a second. Only the calls of a host above its
 quota (`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller,
-and the last part of the reserve is kept for registered hosts. Unknown hosts are not charged: their denials are folded.
+and the last part of the reserve is kept for the robot and for hosts that the policy names. After a restart no host
+has a registration, so a registration is no condition. Unknown hosts are not charged: their denials are folded.
 
 Use this module from one thread only; `folded`, `summarised` and `room` may be called from any thread.
 """
@@ -37,7 +38,8 @@ def weight(record: AuditRecord) -> int:
 class Budget:
     """The debts of hosts. `quota_class` returns the class of a host; `clock` returns monotonic seconds.
 
-    `reserve` has the bounds that apply while only the reserve of the disk is left.
+    `reserve` has the bounds that apply while only the reserve of the disk is left. `kept_for` returns whether the last
+    part of the reserve is kept for a host.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class Budget:
         *,
         bounds: Bounds = AUDIT_BYTES.bounds,
         reserve: Bounds = AUDIT_RESERVE.bounds,
+        kept_for: Callable[[str], bool] = lambda _host: False,
         clock: Callable[[], float] = clock.now,
     ) -> None:
         self.quota_class = quota_class
@@ -53,7 +56,7 @@ class Budget:
             bounds,
             dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host),
         )
-        self._kept = reserve.kept
+        self._kept, self._kept_for = reserve.kept, kept_for
         self._clock = clock
         self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)
         self._paid = clock()
@@ -82,10 +85,11 @@ class Budget:
     def shut_out(self, host: str) -> str:
         """Return why a nearly full disk blocks this host; empty if it does not."""
         left = self._left
-        if left is None or left >= self._kept or self.quota_class(host) is QuotaClass.REGISTERED:
+        if left is None or left >= self._kept or self._kept_for(host):
             return ""
         return (
-            f"the disk of the audit log has {left} bytes left, which are kept for hosts with a registration"
+            f"the disk of the audit log has {left} bytes left, which are kept for the robot and for hosts that the"
+            " policy names"
         )
 
     def owing(self, host: str) -> str:

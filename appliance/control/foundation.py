@@ -115,7 +115,16 @@ async def make_foundation(
     signing = SignerRequests(audit)
     receipts = ReceiptFloor(settings)
     held_by = lifeline.log_held()
-    audit.set(open_audit(settings, signing, held_by, lambda host: _class_of(quota_class, host), receipts))
+    audit.set(
+        open_audit(
+            settings,
+            signing,
+            held_by,
+            class_of=lambda host: _class_of(quota_class, host),
+            kept_for=lambda host: bool(quota_class) and quota_class().has_reserve(host),
+            receipts=receipts,
+        )
+    )
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
         audit(),

@@ -17,12 +17,15 @@ def open_audit(
     settings: Settings,
     signing: SignerRequests,
     held_by: Callable[[list[int]], None],
+    *,
     class_of: Callable[[str], QuotaClass],
+    kept_for: Callable[[str], bool],
     receipts: ReceiptFloor,
 ) -> AuditLog:
     """Return the audit log.
 
-    `class_of` returns a host's quota class; `held_by` gets processes that lock it; `receipts` limits retention by age.
+    `class_of` returns a host's quota class; `kept_for`: whether the last of the disk is kept for it. `held_by` gets
+    processes that lock the log; `receipts` limits retention by age.
     """
     audit = settings.audit
     reserve = AUDIT_RESERVE.bounds.sized(
@@ -36,7 +39,7 @@ def open_audit(
         signer=signing.want,
         removals=signing.want_removal,
         held_by=held_by,
-        budget=Budget(class_of, reserve=reserve),
+        budget=Budget(class_of, reserve=reserve, kept_for=kept_for),
         reserve=reserve.whole,
         retention=Retention(
             days=audit.retention_days,

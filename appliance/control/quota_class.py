@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
+from appliance.policy.host_sets import EVERYONE
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import QuotaClass
@@ -31,6 +32,22 @@ class HostQuotaClass:
             return self(address_of(host))
         except ValueError:
             return QuotaClass.NAMED
+
+    def has_reserve(self, host: str) -> bool:
+        """Whether the last part of the audit log's reserve is kept for a host: the robot, or one that the policy names.
+
+        A policy that names nobody but `*` keeps it for hosts with a registration.
+        """
+        try:
+            address = address_of(host)
+        except ValueError:
+            return False
+        policy = self._policy()
+        if address.is_loopback or any(address in network for network in policy.robot):
+            return policy.blocked(address) is None
+        if policy.named <= {EVERYONE}:
+            return self(address) is QuotaClass.REGISTERED
+        return policy.names(address)
 
 
 def charged_to(policy: Policy, host: str) -> str:

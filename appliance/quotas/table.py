@@ -411,11 +411,12 @@ AUDIT_RESERVE = QuotaRow(
     bounds=Bounds(whole=64 << 20, host=1 << 20, unknown=0, kept=16 << 20),
     at_limit="a host's debt falls by 8 KiB a second and its calls wait; on a full disk every call is denied until"
     " there is room",
-    between="the last quarter is for hosts with a registration; calls of others are rejected with the reason",
+    between="the last quarter is for the robot and the hosts that the policy names by address or group (for hosts with"
+    " a registration if it names none); calls of others are rejected with the reason",
     alarm="`disk nearly full`; `rosrv status`",
     setting="audit.reserve_bytes",
     shown_by=(
-        "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_registered_hosts",
+        "unit/control/test_quota_class.py::test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart",
         "unit/audit/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
     ),
 )

@@ -3,6 +3,7 @@
 import ipaddress
 from dataclasses import replace
 
+from appliance.audit.budget import Budget
 from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.quota_class import HostQuotaClass, charged_to
 from appliance.policy.policy_compiler import compile_policy
@@ -53,3 +54,21 @@ def test_a_blocked_host_is_unknown() -> None:
     quota_class = HostQuotaClass(lambda: policy, lambda _host: 0)
     assert (quota_class(NAMED), quota_class(OTHER)) == (QuotaClass.UNKNOWN, QuotaClass.NAMED)
     assert (quota_class.of_text("10.0.0.1"), charged_to(policy, "10.0.0.1")) == (QuotaClass.UNKNOWN, UNKNOWN)
+
+
+def test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart() -> None:
+    """On a nearly full disk the robot and named hosts are served without a registration, and no guest with one is."""
+    rules = "[Groups]\nocus = 10.2.0.0/24\n[Nodes]\n/a = 10.0.0.1 ocus\ndefault = *\n"
+    policy = compile_policy(rules, file="a.ini", robot=[ipaddress.ip_address("172.17.0.1")])
+    registered: dict[object, int] = {ipaddress.ip_address("10.0.0.66"): 1}
+    policies = [policy]
+    quota_class = HostQuotaClass(lambda: policies[0], lambda host: registered.get(host, 0))
+    budget = Budget(quota_class.of_text, kept_for=quota_class.has_reserve)
+    budget.room(1)
+    hosts = ("172.17.0.1", "127.0.0.1", "10.0.0.1", "10.2.0.7", "10.0.0.66", "10.0.0.67", "")
+    assert [not budget.shut_out(host) for host in hosts] == [True] * 4 + [False] * 3
+    policies[0] = compile_policy("[Nodes]\ndefault = *\n", file="b.ini", robot=policy.robot)
+    assert [not budget.shut_out(host) for host in hosts] == [True, True, False, False, True, False, False]
+    policies[0] = replace(policy, blocks={NAMED: "blocked", ipaddress.ip_address("172.17.0.1"): "blocked"})
+    assert budget.shut_out("10.0.0.1")
+    assert budget.shut_out("172.17.0.1")
