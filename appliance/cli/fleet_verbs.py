@@ -27,6 +27,7 @@ from appliance.configuration.fleet_membership import (
     JoinRequest,
     settings_of,
 )
+from appliance.ipsec.signer import PUBLIC_KEY_FILE
 from appliance.signing.own_certificate import make_own_certificate
 from appliance.supervisor.users import account_of
 from rosmop.tool.terminal import refused, say
@@ -55,6 +56,8 @@ def join(
     invitation = _invitation(file)
     audit_key = pinned_key_path(state / AUDIT_LOG)
     try:
+        if not audit_key.exists():  # until the first checkpoint is signed, only the signer has the key
+            audit_key = state / "signer" / PUBLIC_KEY_FILE
         public = audit_key.read_text(encoding="ascii")
     except OSError as error:
         advice = (

@@ -5,6 +5,7 @@ With `--api`, they read the running appliance's log over REST.
 """
 
 import json
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -287,9 +288,9 @@ def _print_lines(entries: list[LogEntry], as_json_lines: bool) -> None:
 
 @contextmanager
 def _new_file(path: Path) -> Iterator[TextIO]:
-    file = path.open("x", encoding="ascii")
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     try:
-        with file:
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
             yield file
     except BaseException as error:
         path.unlink()

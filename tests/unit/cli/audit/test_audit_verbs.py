@@ -6,6 +6,7 @@ import os
 import pty
 import re
 import signal
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 
 import appliance
 from appliance.api.unrecorded import CATEGORIES
+from appliance.cli.audit.audit_verbs import _new_file
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
 from appliance.specifications.allocation import SERVICE, TOPIC
@@ -100,3 +102,15 @@ def test_tail_follows(state: Path) -> None:
         process.send_signal(signal.SIGINT)
         assert process.wait(_LIMIT_SECONDS) == 0
         assert process.stderr.read() == ""
+
+
+def test_an_export_is_private(tmp_path: Path) -> None:
+    """Records name hosts and messages, so only the owner of the file reads it, whatever the umask is."""
+    before = os.umask(0o022)
+    try:
+        with _new_file(tmp_path / "week.ndjson") as file:
+            file.write("{}\n")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "week.ndjson").stat().st_mode) == 0o600
+    assert (tmp_path / "week.ndjson").read_text() == "{}\n"

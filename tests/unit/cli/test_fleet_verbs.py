@@ -1,0 +1,54 @@
+"""Tests of `rosrv fleet`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.cli import fleet_verbs
+from appliance.configuration.fleet_membership import JoinRequest
+
+_CERTIFICATE = "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
+_INVITATION = {
+    "robot": "arm7", "collector": "https://192.0.2.9:8444", "authority": "", "receipt_key": "", "expires": 1,
+    "token": "rosrv-join_0123456789012345678901234567890123456789012",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("pinned", "sent"), [(None, "of the signer"), ("pinned", "pinned")])
+def test_a_join_needs_no_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pinned: str | None, sent: str
+) -> None:
+    """Until the log's key is pinned with the first signed checkpoint, the signer's own file has it."""
+    state, posted = tmp_path / "state", list[JoinRequest]()
+    for folder, text in (("signer", "of the signer"), ("control", pinned)):
+        (state / folder).mkdir(parents=True)
+        if text is not None:
+            (state / folder / "audit.pub").write_text(text)
+    invitation = tmp_path / "arm7.json"
+    invitation.write_text(json.dumps(_INVITATION))
+
+    class Collector:
+        """A collector that accepts."""
+
+        def __init__(self, *_: Any) -> None:
+            pass
+
+        def post(self, _path: str, body: bytes) -> None:
+            """Keep the request."""
+            posted.append(msgspec.json.decode(body, type=JoinRequest))
+
+        def close(self) -> None:
+            """Do nothing."""
+
+    def prepared(folder: Path, _invitation: Any) -> str:
+        folder.mkdir()
+        (folder / "invitation").touch()
+        return _CERTIFICATE
+
+    monkeypatch.setattr(fleet_verbs, "CollectorConnection", Collector)
+    monkeypatch.setattr(fleet_verbs, "_prepared", prepared)
+    fleet_verbs.join(invitation, state)
+    assert [request.key for request in posted] == [sent]
