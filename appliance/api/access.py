@@ -23,6 +23,7 @@ from typing import cast
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
 from appliance.configuration.settings import is_loopback
@@ -62,6 +63,7 @@ class TokenAuthenticator:
         self._used = used
         self._reported: dict[str, float] = {}  # by token: the time of the last report
         self._tokens: dict[str, TokenKept] = {}
+        self._ends = Deadlines()
         self._stated = False
         self._recognised: dict[bytes, str] = {}
         self._key = secrets.token_bytes(32)
@@ -80,6 +82,8 @@ class TokenAuthenticator:
     def state(self, tokens: Iterable[TokenKept]) -> None:
         """Accept only these tokens from now on."""
         self._tokens = {token.id: token for token in tokens}
+        for token in self._tokens.values():
+            self._ends.passed(token.id, token.expires)  # from now on, no step of the clock postpones an end
         self._stated = True
         self._recognised.clear()
         self._reported.clear()
@@ -87,7 +91,8 @@ class TokenAuthenticator:
     def still_good(self, bearer: Bearer) -> bool:
         """Whether a previously valid token may still be used."""
         kept = self._tokens.get(bearer.id)
-        return kept is not None and clock.wall() < kept.expires  # a rotation may have brought its end forward
+        # A rotation may have brought its end forward.
+        return kept is not None and not self._ends.passed(kept.id, kept.expires)
 
     async def recognise(self, authorization: str | None, host: str) -> Bearer:
         """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
@@ -104,7 +109,7 @@ class TokenAuthenticator:
             if parsed is None
             else await self._matches(text, parsed[1], kept, host)
         ):
-            if clock.wall() < kept.expires:
+            if not self._ends.passed(kept.id, kept.expires):
                 self._remember(peer_key(host))
                 self._report_use(kept.id)
                 return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)

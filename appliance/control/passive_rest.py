@@ -8,7 +8,7 @@ from typing import Any
 
 import structlog
 
-from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
@@ -31,6 +31,7 @@ class ReplicatedTokens:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._rows: dict[str, TokenRow] | None = None
+        self._ends = Deadlines()
 
     @property
     def known(self) -> bool:
@@ -46,18 +47,18 @@ class ReplicatedTokens:
                 found = connection.execute("SELECT * FROM token").fetchall()
             rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
             changed, self._rows = rows != self._rows, rows
+            self.usable()  # from now on, no step of the clock postpones an end
             return changed
         return False
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
         row = (self._rows or {}).get(token_id)
-        return row if row is not None and row.usable(clock.wall()) else None
+        return row if row is not None and row.usable(self._ends) else None
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens."""
-        now = clock.wall()
-        return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(now)]
+        return [kept_by_api(row) for row in (self._rows or {}).values() if row.usable(self._ends)]
 
 
 class PassiveRest:

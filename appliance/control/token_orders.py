@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import cast
 
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
@@ -36,7 +37,9 @@ class TokenOrders:
     def __init__(self, store: StateStore, trail: AuditTrail, changed: Callable[[], None]) -> None:
         self._store = store
         self._trail = trail
+        self._ends = Deadlines()
         self._rows = {row.id: row for row in store.tokens()}
+        self.usable()  # from now on, no step of the clock postpones an end
         settings = store.settings()
         self._untold = bool(settings.get(_UNTOLD))
         self._uses = store.token_uses()
@@ -53,13 +56,12 @@ class TokenOrders:
 
     def usable(self) -> list[TokenKept]:
         """Return the data by which the api recognises tokens. The api checks `expires`."""
-        now = clock.wall()
-        return [kept_by_api(row) for row in self._rows.values() if row.usable(now)]
+        return [kept_by_api(row) for row in self._rows.values() if row.usable(self._ends)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         """Return the token with this id, if it is usable now."""
         row = self._rows.get(token_id)
-        return row if row is not None and row.usable(clock.wall()) else None
+        return row if row is not None and row.usable(self._ends) else None
 
     def used(self, token_id: str) -> None:
         """Note that a token is used now. The time is stored unless the disk is full."""
@@ -79,7 +81,7 @@ class TokenOrders:
             return None
         self._untold = True
         self._store.save_setting(_UNTOLD, "yes")
-        if self._named(FIRST_NAME, clock.wall()):
+        if self._named(FIRST_NAME):
             await self.revoke(admin.TokenRevoke(FIRST_NAME))
         return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
@@ -96,11 +98,11 @@ class TokenOrders:
         """
         name, now = request.name, clock.wall()
         _require_lifetime(request.seconds)
-        if self._named(name, now):
+        if self._named(name):
             raise TokenRefusedError(
                 f"there is a token {name!r} already: rotate or revoke it, or choose another name"
             )
-        self._require_room(now)
+        self._require_room()
         try:
             row, text = make_token(name, request.role, now=now, seconds=request.seconds)
         except BadTokenNameError as error:
@@ -129,7 +131,7 @@ class TokenOrders:
         stay valid. Raises `TokenRefusedError` and `StoreError`.
         """
         name, now = request.name, clock.wall()
-        earlier = self._require_named(name, now)
+        earlier = self._require_named(name)
         last = max(earlier, key=lambda row: row.expires)
         seconds = last.expires - last.created if request.seconds is None else request.seconds
         _require_lifetime(seconds)
@@ -138,7 +140,7 @@ class TokenOrders:
         if name in self._rotating:
             raise TokenRefusedError(f"another order rotates the token {name!r} now: rosrv token list")
         if request.grace:
-            self._require_room(now)
+            self._require_room()
         row, text = make_token(name, last.role, now=now, seconds=seconds)
         until = now + request.grace
         ended = [
@@ -171,7 +173,7 @@ class TokenOrders:
 
     async def revoke(self, request: admin.TokenRevoke, who: str = "") -> answers.Token:
         """End all valid tokens of a name now. Raises `TokenRefusedError` and `StoreError`."""
-        ended = [self._end(row, who) for row in self._require_named(request.name, clock.wall())]
+        ended = [self._end(row, who) for row in self._require_named(request.name)]
         await self._store.settled()
         return self._shown(ended[-1])
 
@@ -187,24 +189,25 @@ class TokenOrders:
         )
         return revoked
 
-    def _named(self, name: str, now: float) -> list[TokenRow]:
+    def _named(self, name: str) -> list[TokenRow]:
         """Return the valid tokens of a name: several while earlier ones have their grace time."""
-        return [row for row in self._rows.values() if row.name == name and row.usable(now)]
+        return [row for row in self._rows.values() if row.name == name and row.usable(self._ends)]
 
-    def _require_named(self, name: str, now: float) -> list[TokenRow]:
-        found = self._named(name, now)
+    def _require_named(self, name: str) -> list[TokenRow]:
+        found = self._named(name)
         if not found:
-            names = {row.name for row in self._rows.values() if row.usable(now)}
+            names = {row.name for row in self._rows.values() if row.usable(self._ends)}
             known = ", ".join(sorted(names)) or "none"
             raise TokenRefusedError(f"there is no token {name[:80]!r} that is valid; there are: {known}")
         return found
 
-    def _require_room(self, now: float) -> None:
-        if sum(row.usable(now) for row in self._rows.values()) >= _MOST:
+    def _require_room(self) -> None:
+        if sum(row.usable(self._ends) for row in self._rows.values()) >= _MOST:
             raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
 
     def _keep(self, *rows: TokenRow) -> None:
         self._rows |= {row.id: row for row in rows}
+        self.usable()
         self._store.save_tokens(*rows)
         self._changed()
 

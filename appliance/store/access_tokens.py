@@ -14,6 +14,7 @@ import secrets
 from typing import NamedTuple
 
 from appliance.base.actors import DISK
+from appliance.base.deadlines import Deadlines
 from appliance.signing.request_signing import TokenKeys, keys_of
 
 _FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -41,9 +42,9 @@ class TokenRow(NamedTuple):
     revoked: float | None
     keys: TokenKeys | None = None  # None: made by a version that derived no keys
 
-    def usable(self, now: float) -> bool:
-        """Whether the token is valid at this time."""
-        return self.revoked is None and now < self.expires
+    def usable(self, ends: Deadlines) -> bool:
+        """Whether the token is valid now; `ends` has its end since it is known."""
+        return self.revoked is None and not ends.passed(self.id, self.expires)
 
 
 def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:

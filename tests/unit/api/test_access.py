@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from appliance.api.access import TokenAuthenticator
+from appliance.api.access import Bearer, TokenAuthenticator
 from appliance.api.problems import ProblemError
 from appliance.base import clock
 from appliance.base.clock import using
@@ -52,6 +52,21 @@ def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> No
     assert recognise(door, f"Bearer {text}") == 401
     door.state([kept(row)])
     assert recognise(door, f"Bearer {text}").name == "alice"
+
+
+def test_a_step_back_of_the_clock_revives_no_token() -> None:
+    """A token that has ended stays ended, and one that was known lasts no longer."""
+    with using(machine := VirtualClock()):
+        row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
+        door = TokenAuthenticator(10, lambda _token: None)
+        door.state([kept(row)])
+        bearer = Bearer(row.id, row.name, "viewer", row.expires, text)
+        machine.set_wall(clock.wall() - 86_400)
+        machine.advance(59)
+        assert door.still_good(bearer)
+        machine.advance(2)
+        door.state([kept(row)])
+        assert not door.still_good(bearer)
 
 
 def test_an_expired_token_is_refused() -> None:

@@ -12,6 +12,7 @@ import pytest
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.base.clock import using, wall
+from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import RotatedToken
 from appliance.control import token_orders
@@ -268,7 +269,7 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
             path.write_bytes(data)
         ahead.write_bytes(whole[:length])
         store = StateStore(lives.home, failed=pytest.fail, kind=InlineDatabase)
-        usable = [row.id for row in store.tokens() if row.usable(wall())]
+        usable = [row.id for row in store.tokens() if row.usable(Deadlines())]
         store.close()
         assert len(usable) == 1
         seen.add(usable[0] == old.id)
