@@ -19,7 +19,7 @@ from roswire.errors import InvalidNameError, PeerError
 from roswire.xmlrpc import XmlRpcLimits
 from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
 from tests.support.pattern_cost import steps
-from tests.support.sources import ROOT, product_files
+from tests.support.sources import LANGUAGE_TESTS, ROOT
 
 UNLIMITED = 64 << 20
 """Characters of a text that nothing limits: the largest message of ROS, and more than any request."""
@@ -77,9 +77,11 @@ class Pattern(NamedTuple):
 
 def files() -> Iterator[Path]:
     """Yield every file of the product and of the collector, except local code."""
-    for path in [*product_files(), *sorted((ROOT / "fleet" / "rosrv_fleet").rglob("*.py"))]:
-        if not str(path.relative_to(ROOT)).startswith(tuple(LOCAL)):
-            yield path
+    for folder in ("appliance", "rosmop", "roswire", "fleet/rosrv_fleet"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            local = str(path.relative_to(ROOT)).startswith(tuple(LOCAL))
+            if not (local or path.is_relative_to(LANGUAGE_TESTS)):
+                yield path
 
 
 def patterns_of(path: Path) -> Iterator[Pattern]:

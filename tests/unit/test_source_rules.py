@@ -279,9 +279,9 @@ WALL_CLOCK = {
         "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
-        "bundles/verified_bundles.py",
-        "control/passive_rest.py", "control/token_orders.py", "hosts/appliance_table.py",
+        "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "base/deadlines.py", "bundles/verified_bundles.py",
+        "control/token_orders.py", "hosts/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
         "signing/own_certificate.py",
