@@ -152,7 +152,7 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
 
 
 def _standby_access(membership: Membership) -> StandbyAccess:
-    return StandbyAccess(membership.other_address, membership.witness, membership.port)
+    return StandbyAccess(membership.other_address, membership.port)
 
 
 def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:

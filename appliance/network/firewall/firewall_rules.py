@@ -229,16 +229,14 @@ class ForwarderAccess:
 
 @dataclass(frozen=True)
 class StandbyAccess:
-    """The other one of two appliances, the witness, and the port of both appliances (TCP and UDP)."""
+    """The other one of two appliances, and the port of both (TCP and UDP)."""
 
     other: str
-    witness: str
     port: int
 
     def __post_init__(self) -> None:
         PortRange.one(self.port)
         family_of(self.other)
-        family_of(self.witness)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -453,7 +451,7 @@ def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
 
 
 def _standby(access: StandbyAccess | None) -> tuple[PacketRule, ...]:
-    """Let only the other appliance and the witness send to the port of replication (TCP) and lease (UDP)."""
+    """Let only the other appliance send to the port of replication (TCP) and lease (UDP)."""
     if access is None:
         return ()
     port = PortRange.one(access.port)
@@ -464,7 +462,6 @@ def _standby(access: StandbyAccess | None) -> tuple[PacketRule, ...]:
         ),
         _arriving("replication: no other host", PacketVerdict.RESET, tcp_ports=port),
         datagrams("lease: the other appliance may", PacketVerdict.RETURN, source=access.other),
-        datagrams("lease: the witness may", PacketVerdict.RETURN, source=access.witness),
         datagrams("lease: no other host", PacketVerdict.DROP),
     )
 
