@@ -23,9 +23,7 @@ The longest names on robots have far less than a quarter of this number.
 """
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*+\Z")
-_CANONICAL = re.compile(
-    r"(?:/[A-Za-z0-9_]++){1,512}\Z"
-)  # a name of MAX_NAME_LENGTH has at most 512 segments
+_CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]++){1,512}\Z")  # a name of MAX_NAME_LENGTH has at most 512 segments
 _TOOL = re.compile(r"(?:/[A-Za-z0-9_-]++){1,512}\Z")
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*+/[A-Za-z][A-Za-z0-9_]*+\Z")
 # Parameters come from YAML files, where `/arm/joint-1.left/gains` and `/analyzers/Base Driver` are common.
