@@ -10,7 +10,8 @@ import sys
 import time
 
 from tests.world.loop import BrokenPromiseError
-from tests.world.world import run
+from tests.world.pair import PairWorld
+from tests.world.world import World, run
 
 
 def main(arguments: list[str]) -> int:
@@ -21,14 +22,16 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, help="replay this seed, with each of its events")
     parser.add_argument("--first", type=int, default=0, help="the first seed (default: %(default)s)")
     parser.add_argument("--seeds", type=int, default=200, help="the number of seeds (default: %(default)s)")
+    parser.add_argument("--pair", action="store_true", help="two appliances and a witness")
     chosen = parser.parse_args(arguments)
+    kind = PairWorld if chosen.pair else World
     if chosen.seed is not None:
-        run(chosen.seed, lambda line: sys.stdout.write(f"{line}\n"))
+        run(chosen.seed, lambda line: sys.stdout.write(f"{line}\n"), kind)
         return 0
     broken, began = 0, time.process_time()
     for seed in range(chosen.first, chosen.first + chosen.seeds):
         try:
-            run(seed)
+            run(seed, kind=kind)
         except BrokenPromiseError as error:
             broken += 1
             sys.stdout.write(f"seed {seed}: {error}\n")

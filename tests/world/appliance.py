@@ -7,7 +7,7 @@ relay decides with the product's own grant table. Its connections are rows, whic
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
@@ -15,6 +15,9 @@ from appliance.control.assembly import Parts
 from appliance.control.process import _run as run_control
 from appliance.relay.connections.admission import missing
 from appliance.relay.grant_table import GrantTable
+from appliance.standby.membership import LINK_FILE, Membership, save_membership
+from appliance.standby.process import EPOCH, LeaseProcess
+from appliance.supervisor.lease_watch import LeaseWatch
 from tests.world.loop import BrokenPromiseError, Machine, Process
 from tests.world.network import LinkEnd
 from tests.world.ros import RosMaster
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 
 MASTER_PORT = 11311
 ROSMASTER_PORT = 11312
+_BOOT_SECONDS = (0.5, 3.0, 20.0)
 _RESTART_SECONDS = (0.2, 0.5, 1.5)
 
 
@@ -93,6 +97,8 @@ class Relay:
             ):
                 table.withdraw(message)
         for connection in [one for one in self.connections if self.refusal(one)]:
+            if isinstance(message, messages.StateEnded):
+                self._world.interrupted(connection)
             self.disconnect(connection, "revoked")
         self._world.check()
 
@@ -103,6 +109,8 @@ class Relay:
     def connect(self, port: int, kind: str, resource: str, host: str, caller_id: str) -> Connection | None:
         """Serve a peer at a port, if it may have what it asks for."""
         connection = Connection(self.keys.get(port, ""), kind, resource, host, caller_id)
+        if not self.process.alive:
+            return None
         if connection not in self.connections and not self.refusal(connection):
             self._opened += 1
             self.connections[connection] = self._opened
@@ -133,27 +141,30 @@ class Appliance:
     machine: Machine
     state: Path
     durability: Literal["strict", "batched"]
+    rosmaster_port: int = ROSMASTER_PORT
+    membership: Membership | None = None
     sockets: dict[str, Socket] = field(default_factory=dict)
     control: Process | None = None
     relay: Relay = field(init=False)
     rosmaster: RosMaster = field(init=False)
     ready: bool = False
     lives: int = 0
+    supervisor: Process = field(init=False)
+    lease: Process | None = None
 
     def __post_init__(self) -> None:
         self.address = self.machine.name
-        self.supervisor = self.world.process("supervisor", self.machine)
         self.admin = Socket("admin", 0)
         self.policy = self.state / "policy.ini"
         (self.state / "control").mkdir(parents=True)
-        self._announced = False
         self._lifeline: LinkEnd | None = None
+        self._lease_lifeline: LinkEnd | None = None
         self.parts: Parts | None = None  # of the present control
         self.settings = Settings(
             policy=self.policy,
             state=self.state,
             listen=f"{self.address}:{MASTER_PORT}",
-            rosmaster_port=ROSMASTER_PORT,
+            rosmaster_port=self.rosmaster_port,
             isolation="none",
             api="off",
             hosts=self.state / "hosts.yaml",
@@ -161,8 +172,77 @@ class Appliance:
             audit=Audit(durability=self.durability),
             liveness=LivenessSection(silent=20.0),
         )
+        if self.membership is not None:
+            save_membership(self.state / LINK_FILE, self.membership)
+        self._boot()
+
+    def _boot(self) -> None:
+        """Start the supervisor and all processes without control."""
+        self.supervisor = self.world.process("supervisor", self.machine)
+        self._announced = False
+        self._lifeline = self._lease_lifeline = None
+        self.control = None
+        self.sockets.clear()
         self.start_rosmaster()
         self.start_relay()
+        self.watch = LeaseWatch(
+            member=self.membership is not None, activate=self._activate, passivate=self._passivate
+        )
+
+    def start(self) -> None:
+        """Start control, and on one of two appliances the lease."""
+        if self.membership is not None:
+            self.start_lease()
+        self.start_control()
+
+    @property
+    def active(self) -> bool:
+        """Whether the appliance may serve."""
+        return self.supervisor.alive and self.watch.active
+
+    def crash(self) -> None:
+        """Lose all processes; the disk keeps what was written. The machine starts again after some time."""
+        lease = [self.lease] if self.lease is not None else []
+        for process in (self.control, self.relay.process, self.rosmaster.process, self.supervisor, *lease):
+            if process is not None:
+                process.kill()
+        self.ready = False
+        self.world.loop.outside.call(self.world.random.choice(_BOOT_SECONDS), self._again)
+
+    def _again(self) -> None:
+        if not self.supervisor.alive:
+            self._boot()
+            self.start()
+
+    def start_lease(self) -> None:
+        """Start the process `lease`."""
+        assert self.membership is not None
+        self.lease = self.world.process("lease", self.machine)
+        mine, its = LinkEnd.pair(self.supervisor, self.lease)
+        self._lease_lifeline = mine
+        mine.process.run(mine.attach, None, self._heard_lease, lambda: None)
+        made = self.lease.run(LeaseProcess, self.membership, cast(Any, its), self.state / EPOCH)
+        self.lease.start(made.run()).add_done_callback(self.world.done)
+
+    def _heard_lease(self, message: Any, _descriptors: tuple[Any, ...]) -> None:
+        match message:
+            case messages.LeaseHeld(until, epoch):
+                self.watch.held(until, epoch)
+            case messages.LeaseEnded():
+                self.watch.ended()
+
+    def _activate(self, epoch: int) -> None:
+        self.world.activated(self, epoch)
+        if self._lifeline is not None:
+            self._lifeline.send(messages.Activated(epoch))
+
+    def _passivate(self) -> None:
+        """End everything that serves the robot; each process starts again, passive."""
+        self.world.say(f"{self.address} is passive")
+        self.sockets.clear()
+        self.restart_rosmaster()
+        self.restart_relay()
+        self.kill_control()
 
     def restart_rosmaster(self) -> None:
         """Start a new `rosmaster` without state, in place of the present one."""
@@ -171,7 +251,9 @@ class Appliance:
 
     def start_rosmaster(self) -> None:
         """Start `rosmaster`."""
-        self.rosmaster = RosMaster(self.world, self.world.process("rosmaster", self.machine), ROSMASTER_PORT)
+        self.rosmaster = RosMaster(
+            self.world, self.world.process("rosmaster", self.machine), self.rosmaster_port
+        )
         if self._lifeline is not None:
             self._lifeline.send(messages.ProcessesChanged([]))
 
@@ -196,6 +278,8 @@ class Appliance:
         self._lifeline = mine
         self.ready = False
         mine.process.run(mine.attach, None, self._received, lambda: None)
+        if self.membership is not None and self.watch.epoch is not None:
+            mine.send(messages.Activated(self.watch.epoch))
         for name, sock in {"admin": self.admin, **self.sockets}.items():
             mine.send(messages.SocketRestored(name), (sock,))
         mine.send(messages.SocketsRestored(len(self.sockets), self._announced))
@@ -204,6 +288,10 @@ class Appliance:
         task = self.control.start(run_control(self.settings, its, config))  # type: ignore[arg-type]
         task.add_done_callback(self.world.done)
         self._link_relay()
+        if self._lease_lifeline is not None and self.lease is not None:
+            leases, controls = LinkEnd.pair(self.lease, self.control)
+            self._lease_lifeline.send(messages.LinkOpened("control", 0), (leases,))
+            mine.send(messages.LinkOpened("lease", 0), (controls,))
 
     def _assembled(self, parts: Parts) -> None:
         self.parts = parts
@@ -219,7 +307,11 @@ class Appliance:
         if self.control is not None and self.control.alive:
             self.control.kill()
             self.ready = False
-            self.supervisor.call(self.world.random.choice(_RESTART_SECONDS), self.start_control)
+            self.supervisor.call(self.world.random.choice(_RESTART_SECONDS), self._start_again)
+
+    def _start_again(self) -> None:
+        if self.control is None or not self.control.alive:
+            self.start_control()
 
     def _received(self, message: Any, descriptors: tuple[Any, ...]) -> None:
         match message:
@@ -227,6 +319,8 @@ class Appliance:
                 self.sockets[name] = descriptors[0]
             case messages.SocketDropped(name):
                 self.sockets.pop(name, None)
+            case messages.Ready(detail) if "stands_by" in detail:
+                self.world.say(f"control of {self.address} stands by")
             case messages.Ready():
                 self.ready = self._announced = True
                 self.world.say(f"control of {self.address} is ready")

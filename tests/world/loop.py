@@ -164,6 +164,15 @@ class WorldLoop(asyncio.BaseEventLoop):
         task.add_done_callback(self.tasks.pop, context=self.outside.context)
         return task
 
+    def add_reader(self, file: Any, act: Callable[[], object]) -> None:  # type: ignore[override]  # the world's own files
+        """Call a function of the present process when a file is readable."""
+        process = present_process()
+        file.readable = lambda: process.run(act)
+
+    def remove_reader(self, file: Any) -> None:  # type: ignore[override]
+        """Do not call it any more."""
+        file.readable = lambda: None
+
     def discard(self) -> None:
         """End the world; what its tasks would do at their ends has no effect any more."""
         for task in [*self.tasks]:

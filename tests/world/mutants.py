@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from appliance.control import process as control_process
+from appliance.control.passive import PassiveControl
+from appliance.control.replication import Replication
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.relay_control import RelayControl
@@ -27,11 +29,17 @@ from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.policy.model import Decision
 from appliance.relay.grant_table import GrantTable
+from appliance.standby import witness
+from appliance.standby.lease import ApplianceLease
+from appliance.standby.replica import Replica
+from appliance.standby.replication_sender import ReplicationSender
 from appliance.store.changes import Value
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database
+from appliance.supervisor.lease_watch import LeaseWatch
 from appliance.telemetry.audit_trail import AuditTrail
-from tests.world.world import run
+from tests.world.pair import PairWorld
+from tests.world.world import World, run
 
 
 def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
@@ -104,6 +112,21 @@ MUTANTS: dict[str, tuple[Any, str, Any]] = {
 }  # fmt: skip
 
 
+PAIR_MUTANTS: dict[str, tuple[Any, str, Any]] = {
+    "an answer does not wait for the standby": (Replication, "stored", _at_once),
+    "every change counts as acknowledged by the standby": (ReplicationSender, "acknowledged", _at_once),
+    "the standby acknowledges what it does not store": (Replica, "_execute", _nothing),
+    "data of an earlier active appliance is accepted": (PassiveControl, "_accepts", lambda *_given: True),
+    "an appliance serves longer than its lease": (LeaseWatch, "_left", lambda _watch: 1000.0),
+    "an ended lease ends nothing": (LeaseWatch, "ended", lambda _watch: None),
+    "a promise not to claim is not kept": (
+        ApplianceLease, "is_active", lambda lease, now: lease.held is not None and now < lease.valid_until,
+    ),
+    "the robot's firewall stays as it is": (witness.LeaseFirewall, "admit", _nothing),
+    "the witness grants before the expiry": (witness, "EXPIRY", 0.1),
+}  # fmt: skip
+
+
 @contextlib.contextmanager
 def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
     """Replace an existing attribute during the block."""
@@ -117,10 +140,11 @@ def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
 
 def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
     """Return the first seed whose history breaks a promise with a faulty product, and the promise."""
-    with instead_of(*MUTANTS[mutant]):
+    kind = World if mutant in MUTANTS else PairWorld
+    with instead_of(*(MUTANTS | PAIR_MUTANTS)[mutant]):
         for seed in seeds:
             try:
-                run(seed)
+                run(seed, kind=kind)
             except (AssertionError, KeyError) as error:
                 return seed, str(error)
     return None
@@ -129,7 +153,7 @@ def first_broken(mutant: str, seeds: Sequence[int]) -> tuple[int, str] | None:
 def main(arguments: list[str]) -> None:
     """Run the command line."""
     number, *words = arguments
-    for mutant in MUTANTS:
+    for mutant in MUTANTS | PAIR_MUTANTS:
         if all(word in mutant for word in words):
             found = first_broken(mutant, range(int(number)))
             sys.stdout.write(

@@ -36,13 +36,20 @@ class Network:
     """The servers by their addresses, and the pairs of hosts that are cut off from each other."""
 
     def __init__(self, loop: WorldLoop) -> None:
-        self._loop = loop
+        self.loop = loop
         self._random: Random = loop.random
         self._servers: dict[Address, _Served] = {}
         self.cut: set[frozenset[str]] = set()
+        self.route: Callable[[Address], Address | None] = lambda address: (
+            address
+        )  # a translation of addresses
         self._port = 50_000
         self.flaky: Address | None = None  # a server whose connections break off now and then
         self._open: dict[asyncio.Future[bytes], Process] = {}
+
+    def reaches(self, source: str, target: str) -> bool:
+        """Whether packets of a host reach another one."""
+        return frozenset((source, target)) not in self.cut
 
     def free_port(self) -> int:
         """Return a port that no process has."""
@@ -67,21 +74,23 @@ class Network:
 
     async def exchange(self, address: Address, body: bytes, seconds: float, source: str) -> bytes:
         """Return the answer to a request. Raises `OSError` and `TimeoutError`, as the product's client does."""
-        future: asyncio.Future[bytes] = self._loop.create_future()
+        future: asyncio.Future[bytes] = self.loop.create_future()
         self._later(self._arrive, address, body, source, future)
         try:
             async with asyncio.timeout(seconds):
                 return await future
         except TimeoutError:
-            if frozenset((address[0], source)) in self.cut:
+            if not self.reaches(source, address[0]):
                 raise UnreachedError(f"{address[0]} cannot be reached") from None
             raise
         finally:
             self._open.pop(future, None)
 
     def _arrive(self, address: Address, body: bytes, source: str, future: asyncio.Future[bytes]) -> None:
-        if frozenset((address[0], source)) in self.cut:
+        there = self.route(address)
+        if there is None or not self.reaches(source, there[0]):
             return
+        address = there
         served = self._servers.get(address)
         if served is None or not served.process.alive or self._breaks(address):
             self._later(self._fail, future, ConnectionRefusedError(111, "Connection refused"))
@@ -101,7 +110,7 @@ class Network:
         except ConnectionError as error:
             self._later(self._fail, future, error)
             return
-        if frozenset((peer.text, peer.local)) not in self.cut:
+        if self.reaches(peer.local, peer.text):
             self._later(self._finish, future, given)
 
     def _finish(self, future: asyncio.Future[bytes], given: bytes) -> None:
@@ -113,7 +122,7 @@ class Network:
             future.set_exception(error)
 
     def _later(self, act: Callable[..., None], *given: Any) -> None:
-        self._loop.outside.call(self._random.choice(_SECONDS), act, *given)
+        self.loop.outside.call(self._random.choice(_SECONDS), act, *given)
 
 
 @dataclass(eq=False)

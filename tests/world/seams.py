@@ -16,25 +16,34 @@ from typing import Any
 from appliance.audit import log_database, log_writer
 from appliance.audit.log import AuditLog
 from appliance.base import clock
+from appliance.channel import child_process
 from appliance.control import (
     assembly,
     foundation,
     listener_limits,
     open_audit,
     passive,
+    replication,
     supervisor_link,
     supervisor_messages,
+    takeover_check,
 )
 from appliance.control import process as control_process
 from appliance.master import rosmaster
 from appliance.master.endpoints import node_ports
 from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal
 from appliance.rpc.xmlrpc_client import XmlRpcClient
+from appliance.standby import process as lease_process
+from appliance.standby import replica
+from appliance.standby.replication_frames import ReplicationError
+from appliance.standby.replication_receiver import ReplicationReceiver
+from appliance.standby.replication_sender import ReplicationSender
 from appliance.store import ahead, writer_thread
 from appliance.store.state_file import StateStore
 from tests.world import disk
 from tests.world.loop import present_process
 from tests.world.network import Network
+from tests.world.streams import Streams
 
 
 class Socket:
@@ -103,6 +112,12 @@ def _assemble(base: Any) -> Any:
     return parts
 
 
+@contextlib.contextmanager
+def _listening(address: tuple[str, int], **_options: Any) -> Iterator[Socket]:
+    """Return a listening socket for the replication."""
+    yield Socket(*address)
+
+
 async def _forever() -> None:
     """Do nothing, in place of work that measures this process."""
     await asyncio.get_running_loop().create_future()
@@ -113,8 +128,24 @@ def _handle(descriptor: Any = None, *_given: Any, **named: Any) -> Any:
     return named.get("fileno", descriptor)
 
 
+class _Listener:
+    """`ReplicationListener`, over the world's connections."""
+
+    def __init__(self, streams: Streams, sender: ReplicationSender, _context: object) -> None:
+        self._streams = streams
+        self._sender = sender
+
+    async def run(self, listening: Socket) -> None:
+        """Send to the standby that connected last, until cancelled."""
+        await self._streams.serve(listening.address[1], self._serve)
+
+    async def _serve(self, reader: Any, writer: Any) -> None:
+        with contextlib.suppress(ReplicationError):
+            await self._sender.serve(reader, writer)
+
+
 @contextlib.contextmanager
-def joined(network: Network, random: Random) -> Iterator[None]:
+def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]:
     """Join the product to a world."""
 
     async def exchange(client: Any, request: bytes, seconds: float) -> bytes:
@@ -126,6 +157,15 @@ def joined(network: Network, random: Random) -> Iterator[None]:
         return Socket(host, port or network.free_port())
 
     files, databases = disk.files()
+
+    async def follow_at(address: str, port: int, _context: object, receiver: ReplicationReceiver) -> None:
+        try:
+            end = await streams.connect(address, port)
+        except OSError as error:
+            raise ReplicationError(str(error)) from error
+        await receiver.follow(end.reader, end)  # type: ignore[arg-type]  # it has what the link uses
+
+    datagrams = SimpleNamespace(socket=streams.socket, AF_INET=0, SOCK_DGRAM=0)
     sockets = SimpleNamespace(socket=_handle)
     replaced: list[tuple[Any, str, Any]] = [
         (secrets, "_sysrand", random),
@@ -144,8 +184,22 @@ def joined(network: Network, random: Random) -> Iterator[None]:
         (passive, "AdminServer", _AdminServer),
         (control_process, "assemble", _assemble),
         (control_process, "return_spare_memory", _forever),
+        (supervisor_link, "os", SimpleNamespace(close=_handle)),
+        (child_process, "os", SimpleNamespace(close=_handle)),
         (supervisor_link, "socket", sockets),
         (supervisor_link, "Channel", _handle),
+        (lease_process, "socket", datagrams),
+        (lease_process, "Channel", _handle),
+        (child_process, "socket", sockets),
+        (child_process, "Channel", _handle),
+        (replica, "Database", disk.WorldDatabase),
+        (replica, "sqlite3", databases),
+        (passive, "follow_at", follow_at),
+        (passive, "replication_context", _handle),
+        (takeover_check, "replication_context", _handle),
+        (replication, "replication_context", _handle),
+        (replication, "ReplicationListener", partial(_Listener, streams)),
+        (replication, "socket", SimpleNamespace(create_server=_listening)),
         (supervisor_messages, "socket", sockets),
         (supervisor_messages, "Channel", _handle),
     ]

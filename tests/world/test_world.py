@@ -4,36 +4,51 @@ import os
 
 import pytest
 
-from tests.world.mutants import MUTANTS, first_broken
-from tests.world.world import run
+from tests.world.mutants import MUTANTS, PAIR_MUTANTS, first_broken
+from tests.world.pair import PairWorld
+from tests.world.world import World, run
 
-_SEEDS = 6000 if os.environ.get("TESTS_EXAMPLES") == "all" else 200
-_IN_ONE_CASE = 50
+_ALL = os.environ.get("TESTS_EXAMPLES") == "all"
+_SEEDS, _PAIR_SEEDS = (3000, 500) if _ALL else (200, 20)
+_IN_ONE_CASE = 20
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("first", range(0, _SEEDS, _IN_ONE_CASE))
-def test_no_history_breaks_a_promise(first: int) -> None:
+def test_no_history_of_an_appliance_breaks_a_promise(first: int) -> None:
     """Each of these seeds is a history of faults."""
+    _run(first, World, "")
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("first", range(0, _PAIR_SEEDS, _IN_ONE_CASE))
+def test_no_history_of_two_appliances_breaks_a_promise(first: int) -> None:
+    """Each of these seeds is a history of crashes, cuts and takeovers."""
+    _run(first, PairWorld, "--pair ")
+
+
+def _run(first: int, kind: type[World], option: str) -> None:
     for seed in range(first, first + _IN_ONE_CASE):
         try:
-            run(seed)
+            run(seed, kind=kind)
         except AssertionError as error:
-            error.add_note(f"replay it with: python -m tests.world --seed {seed}")
+            error.add_note(f"replay it with: python -m tests.world {option}--seed {seed}")
             raise
 
 
-def test_a_seed_gives_the_same_history_again() -> None:
+@pytest.mark.parametrize("kind", [World, PairWorld])
+def test_a_seed_gives_the_same_history_again(kind: type[World]) -> None:
     """A finding can be repeated."""
     traces: list[list[str]] = [[], []]
     for trace in traces:
-        run(7, trace.append)
+        run(7, trace.append, kind)
     assert traces[0] == traces[1]
     assert len(traces[0]) > 10
 
 
 @pytest.mark.nightly
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize("mutant", MUTANTS)
-def test_each_fault_of_the_product_is_found(mutant: str) -> None:
+@pytest.mark.parametrize("fault", MUTANTS | PAIR_MUTANTS)
+def test_each_fault_of_the_product_is_found(fault: str) -> None:
     """A fault that no seed finds shows what the world does not see."""
-    assert first_broken(mutant, range(1000)) is not None
+    assert first_broken(fault, range(1000)) is not None

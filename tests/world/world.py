@@ -7,7 +7,8 @@
 4. No acknowledged change is lost: after a restart of control, the last acknowledged policy is in force, and
    acknowledged parameters have their values.
 5. The chain of the audit log verifies at the end, over all lives of control.
-6. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are connected
+6. A restart of control interrupts no connection that the policy allows.
+7. Once faults have ended, `rosmaster` has exactly the registrations of the registry, and live subscribers are connected
    to exactly the live publishers that the policy allows.
 """
 
@@ -21,20 +22,21 @@ from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import structlog
 
 from appliance.audit.verification import verify
 from appliance.channel import admin, messages
 from appliance.control.assembly import Parts
-from appliance.master.graph.registry import Kind
+from appliance.master.graph.registry import Kind, Life
 from roswire.parameter_tree import standing_at
 from tests.world import seams
 from tests.world.appliance import MASTER_PORT, ROSMASTER_PORT, Appliance, Connection
 from tests.world.loop import BrokenPromiseError, Machine, Process, WorldLoop
 from tests.world.network import Network
 from tests.world.ros import Node, Subscription
+from tests.world.streams import Streams
 
 HOSTS = ("10.0.0.1", "10.0.0.2", "10.0.0.3")
 APPLIANCE = "10.0.0.100"
@@ -84,20 +86,22 @@ POLICIES = {
     "/a is subscribed to by 2 and 3": Policy(use={"/a": f"{HOSTS[1]} {HOSTS[2]}"}),
     "/b is nobody's": Policy({"/b": ""}, {"/b": ""}),
 }
-_SETTLES = 150.0  # seconds
-_PAUSES = (0.0, 0.001, 0.05, 0.5, 3.0, 30.0)
 _AGAIN_SECONDS = 0.5
 _ORDER_SECONDS = (0.0, 0.001, 0.01)
 
 
 class World:
-    """The whole state of one history."""
+    """The whole state of one history. `pauses` are the seconds between two events, `settles` those after the last."""
+
+    pauses: tuple[float, ...] = (0.0, 0.001, 0.05, 0.5, 3.0, 30.0)
+    settles = 150.0
 
     def __init__(self, seed: int, folder: Path, say: Callable[[str], object]) -> None:
         self.random = Random(seed)  # noqa: S311  histories, no secrets
         self.loop = WorldLoop(self.random)
         self.loop.set_exception_handler(self._fault)
         self.network = Network(self.loop)
+        self.streams = Streams(self.network)
         self._say = say
         self.errors: list[Exception] = []
         self.processes: list[Process] = []
@@ -111,11 +115,25 @@ class World:
         self.parameters: dict[str, set[int | None]] = {key: {None} for key in KEYS}
         self._setting = {key: Setting() for key in KEYS}
         self.strict = self.random.random() < 0.5
-        self.appliance = Appliance(
-            self, self.machines[APPLIANCE], folder / "appliance", "strict" if self.strict else "batched"
-        )
-        self.appliance.policy.write_text(POLICIES["open"].text, encoding="utf-8")
-        self._granted: set[tuple[str, str, str]] = set()
+        self.appliances = self._make_appliances(folder)
+        self.appliance = self.appliances[0]
+        for appliance in self.appliances:
+            appliance.policy.write_text(POLICIES["open"].text, encoding="utf-8")
+
+    def _make_appliances(self, folder: Path) -> list[Appliance]:
+        return [Appliance(self, self.machines[APPLIANCE], folder / "appliance", self.durability)]
+
+    @property
+    def durability(self) -> Literal["strict", "batched"]:
+        """Return the durability of the audit log in this history."""
+        return "strict" if self.strict else "batched"
+
+    def start(self) -> None:
+        """Start the appliance."""
+        self.appliance.start()
+
+    def activated(self, appliance: Appliance, epoch: int) -> None:
+        """Learn that one of two appliances has become active."""
 
     # --- services for the models ---
 
@@ -201,10 +219,16 @@ class World:
             self.fail(f"{call} {resource} by {name} of {host} passed without a decision in the log")
 
     def _recorded(self, condition: str, *values: str) -> bool:
-        path = self.appliance.state / "control" / "audit.db"
-        with contextlib.closing(sqlite3.connect(path)) as connection:
-            query = f"SELECT count(*) FROM record WHERE {condition}"  # noqa: S608  fixed texts
-            return bool(connection.execute(query, values).fetchone()[0])
+        query = f"SELECT count(*) FROM record WHERE {condition}"  # noqa: S608  fixed texts
+        for path in self._logs():
+            with contextlib.closing(sqlite3.connect(path)) as connection:
+                if connection.execute(query, values).fetchone()[0]:
+                    return True
+        return False
+
+    def _logs(self) -> list[Path]:
+        paths = [appliance.state / "control" / "audit.db" for appliance in self.appliances]
+        return [path for path in paths if path.exists()]
 
     def sees(self, node: Node, uris: list[str]) -> None:
         """Assert that nodes get ports of the appliance only: others would bypass it."""
@@ -250,11 +274,35 @@ class World:
     def check(self) -> None:
         """Assert that the relay has only what a policy allows that may be in force."""
         relay = self.appliance.relay
+        if not relay.process.alive:
+            return
         for connection in relay.connections:
             self.carries(connection)
         for grant in relay.grants():
             if not any(POLICIES[one].may_use(grant.topic, grant.host) for one in self.possible):
                 self.fail(f"the relay has {grant}, which no policy allows")
+
+    def interrupted(self, connection: Connection) -> None:
+        """Assert that a restart of control ends no connection that all policies allow which may be in force."""
+        parts = self.appliance.parts
+        publisher = parts and parts.core.registry.by_key(connection.key)
+        if not publisher or publisher.life is not Life.LIVE or connection.kind != "topic":
+            return
+        host, topic = str(publisher.host), connection.resource
+        subscribed = any(
+            node.alive
+            and not node.superseded
+            and self._is_of(connection, node)
+            and topic in node.subscribes
+            and ("registerSubscriber", topic) not in node.calling
+            for node in self.nodes
+        )
+        allowed = all(
+            POLICIES[one].may_publish(topic, host) and POLICIES[one].may_use(topic, connection.host)
+            for one in self.possible
+        )
+        if subscribed and allowed and (Kind.PUBLICATION, topic) in publisher.registrations:
+            self.fail(f"a restart of control interrupts {connection}")
 
     def control_ready(self, _appliance: Appliance) -> None:
         """Learn which policy is in force, and assert that no acknowledged one was lost."""
@@ -293,6 +341,8 @@ class World:
         process.ends.append(lambda: self.loop.outside.call(1.0, answered, None))
         process.start(carry_out())
         answer = await future
+        if answer is not None and answer.trouble in ("standby", "failed"):  # an appliance without the lease
+            return None
         if answer is not None and not answer.ok:
             self.fail(f"{request} is rejected: {answer.error}")
         return None if answer is None else answer.body
@@ -313,7 +363,12 @@ class World:
             self.say(f"policy: {name} is in force, {answer.revoked} revoked")
             self.possible = {name}
             self.check()
-        while answer is None and len(self.possible) > 1:  # control was killed: it has the policy, or not
+        else:
+            await self.find_out()
+
+    async def find_out(self) -> None:
+        """Learn which policy is in force, after a kill of control during a reload."""
+        while len(self.possible) > 1:
             await asyncio.sleep(_AGAIN_SECONDS)
             await self._learn()
 
@@ -441,17 +496,15 @@ class World:
 
     async def run(self) -> None:
         """Run the history to its end, and check the promises."""
-        self.appliance.start_control()
-        usual = (self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter)
-        faults: tuple[Callable[[], None], ...] = (
-            self.dies, self.hangs, self.is_cut_off, self.reloads, self.rosmaster_dies, self.rosmaster_breaks_off,
-            self.relay_dies, self.control_dies,
+        self.start()
+        usual = (
+            self.starts, self.starts, self.changes_its_mind, self.uses_service, self.sets_parameter, self.reloads,
         )  # fmt: skip
         # Few kinds of faults in a history, but often: so they meet one another more often than if all were mixed.
-        faults = tuple(self.random.sample(faults, self.random.randint(1, 4)))
+        faults = self.random.sample(self.faults(), self.random.randint(1, 4))
         for _ in range(self.random.randrange(6, 24)):
             self.random.choice(self.random.choice((usual, faults)))()
-            await self.passes(self.random.choice(_PAUSES))
+            await self.passes(self.random.choice(self.pauses))
         self.say("no faults any more")
         self.network.cut.clear()
         self.network.flaky = None
@@ -459,8 +512,19 @@ class World:
             process.doom = None
         for node in self.nodes:
             node.answers = True
-        await self.passes(_SETTLES)
+        await self.passes(self.settles)
+        await self.settled()
         self.quiet()
+
+    def faults(self) -> list[Callable[[], None]]:
+        """Return the kinds of faults."""
+        return [
+            self.dies, self.hangs, self.is_cut_off, self.rosmaster_dies, self.rosmaster_breaks_off,
+            self.relay_dies, self.control_dies,
+        ]  # fmt: skip
+
+    async def settled(self) -> None:
+        """Do what must be done before the last check."""
 
     async def passes(self, seconds: float) -> None:
         """Let time pass, and check the promises in between."""
@@ -545,23 +609,30 @@ class World:
 
     def check_chain(self) -> None:
         """Assert that the audit log of all lives of control verifies."""
-        found = verify(self.appliance.state / "control" / "audit.db")
-        if found.findings:
-            raise BrokenPromiseError(f"the audit log does not verify: {found.findings}")
+        for path in self._logs():
+            found = verify(path)
+            if found.findings:
+                raise BrokenPromiseError(f"the audit log does not verify: {found.findings}")
 
 
-def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
-    """Run one history. Raises `BrokenPromiseError`."""
+def _dropped(_logger: object, _level: str, _event: MutableMapping[str, Any]) -> NoReturn:
+    raise structlog.DropEvent
+
+
+def run(
+    seed: int, say: Callable[[str], object] = lambda _line: None, kind: "type[World] | None" = None
+) -> None:
+    """Run one history of a world of this kind (None: one appliance). Raises `BrokenPromiseError`."""
     shared = Path("/dev/shm")
     folder = Path(tempfile.mkdtemp(prefix="world-", dir=shared if shared.is_dir() else None))
     before = structlog.get_config()
-    world = World(seed, folder, say)
+    world = (kind or World)(seed, folder, say)
     structlog.configure(
         processors=[world.logged], wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG)
     )
     asyncio.set_event_loop(world.loop)
     try:
-        with seams.joined(world.network, world.random):
+        with seams.joined(world.network, world.streams, world.random):
             world.loop.run_until_complete(world.loop.outside.start(world.run()))
             for process in world.processes:
                 process.kill()
@@ -569,7 +640,8 @@ def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
         if world.errors:
             raise world.errors[0]
     finally:
+        structlog.configure(processors=[_dropped])
+        world.loop.discard()
         structlog.configure(**before)
         asyncio.set_event_loop(None)
-        world.loop.discard()
         shutil.rmtree(folder)

@@ -1,0 +1,78 @@
+"""The robot's computer: the product's witness and its firewall rules, on a disk that keeps the lease."""
+
+import re
+from typing import TYPE_CHECKING
+
+from appliance.base import clock
+from appliance.standby import witness
+from tests.world.loop import Machine, Process
+from tests.world.network import Address
+from tests.world.streams import DatagramSocket, Streams
+
+if TYPE_CHECKING:
+    from tests.world.pair import PairWorld
+
+PORT = 7411
+
+
+class Robot:
+    """One computer, with one process `witness` at a time."""
+
+    def __init__(self, world: "PairWorld", machine: Machine, settings: witness.WitnessSettings) -> None:
+        self._world = world
+        self._machine = machine
+        self._settings = settings
+        self._record = witness.LeaseRecord(1, "", tuple(sorted(settings.appliances)), "")
+        self._rules = ""
+        self._firewall = witness.LeaseFirewall(settings, "nft", self._nft)
+        self._firewall.admit("")
+        self.process: Process
+        self.start()
+
+    def start(self) -> None:
+        """Start the witness."""
+        self.process = self._world.process("witness", self._machine)
+        self.process.run(self._serve, self._world.streams)
+
+    def restart(self) -> None:
+        """Kill the witness; it starts again at once, with its stored lease."""
+        self.process.kill()
+        self.start()
+
+    def _serve(self, streams: Streams) -> None:
+        keeper = witness.Witness(
+            record=self._record,
+            save=self._save,
+            admit=self._firewall.admit,
+            boot="boot",
+            clock=clock.since_boot,
+        )
+        nonce = f"{self._world.random.getrandbits(64):x}"
+        gate = witness.WitnessGate(keeper, self._settings.appliances, nonce)
+        sock = DatagramSocket(streams)
+        sock.bind(("", PORT))
+
+        def answer() -> None:
+            datagram, source = sock.recvfrom(witness.LONGEST + 1)
+            given = gate.answer(datagram, source[0])
+            if given is not None:
+                sock.sendto(given, source)
+
+        sock.readable = answer
+
+    def _save(self, record: witness.LeaseRecord) -> None:
+        self._record = record
+
+    def _nft(self, command: list[str], text: str) -> str:
+        if command[1] == "-f":
+            self._rules = text
+        return self._rules
+
+    def admits(self, address: str) -> bool:
+        """Whether the robot accepts packets of an appliance."""
+        return f"ip saddr {address} drop" not in self._rules
+
+    def translated(self, address: Address) -> Address | None:
+        """Return where packets to the fixed address go; None: nowhere."""
+        found = re.search(r"dnat to (\S+)", self._rules)
+        return (found[1].rstrip(";"), address[1]) if found else None
