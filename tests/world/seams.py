@@ -192,7 +192,6 @@ def joined(network: Network, streams: Streams, random: Random) -> Iterator[None]
         (lease_process, "Channel", _handle),
         (child_process, "socket", sockets),
         (child_process, "Channel", _handle),
-        (replica, "Database", disk.WorldDatabase),
         (replica, "sqlite3", databases),
         (passive, "follow_at", follow_at),
         (passive, "replication_context", _handle),
