@@ -127,6 +127,20 @@ PAIR_MUTANTS: dict[str, tuple[Any, str, Any]] = {
 }  # fmt: skip
 
 
+NOT_SEEN = {
+    "a reload takes back no grant",
+    "a call that began under the old policy is not decided again",
+    "the relay keeps what was not stated again",
+    "a revoked grant is kept in the store",
+    "data of an earlier active appliance is accepted",
+    "an appliance serves longer than its lease",
+    "a promise not to claim is not kept",
+    "the robot's firewall stays as it is",
+    "the witness grants before the expiry",
+}
+"""Faults that 200 seeds (60 of two appliances) did not find, or that were not searched for yet."""
+
+
 @contextlib.contextmanager
 def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
     """Replace an existing attribute during the block."""
