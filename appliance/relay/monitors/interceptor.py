@@ -35,7 +35,7 @@ from appliance.relay.monitors.observation_points import NOWHERE, ObservationPoin
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, dropped, refusal
 from appliance.relay.monitors.shadow import ShadowMonitors
-from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, start_outcome, state_left
+from appliance.relay.monitors.state_keeper import LEAVING, StateKeeper, continued, start_outcome, state_left
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace
 from appliance.relay.monitors.time_budget import TimeBudget
 from appliance.relay.report import Reporter
@@ -151,7 +151,10 @@ class Interceptor:
             return
         result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._shadow_observer.asks)
-        before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
+        before, first = self.monitors, self._stated is None or bool(self.blocked)
+        if before is None and first:
+            self.offset += continued(message, self._keeper, self.now())
+        now = self.now()
         if before is None:
             outcome = start_outcome(result, message, self._keeper, now, restarted=first and message.restarted)
         else:

@@ -6,6 +6,8 @@ Invariants:
 - Unchanged state is not written.
 - A state is reused only if it was written since the machine started, or before an orderly end of the appliance. It is
   not reused if the machine's clock was set after it was written. A state that is not reused is `lost`, with the reason.
+- The times in a state are ages: after a takeover, the clock of monitors continues where the other appliance stopped it
+  (`continued`), so a difference between the clocks of the machines neither shortens nor extends any bound.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
-_AHEAD = "the clock of the other appliance is ahead of this machine's"
 LEAVING = "the other appliance takes over"
 """Why a relay drops all messages whose appliance hands over."""
 
@@ -40,7 +41,10 @@ class _GroupHead(msgspec.Struct, array_like=True):
 
 
 class _Head(msgspec.Struct, array_like=True):
-    """The head of a memory: boot id, offset of the clock and time of writing (ns), heads of the groups."""
+    """The head of a memory: boot id, offset of the clock and time of writing (ns), heads of the groups.
+
+    `shift` is the part of `offset` that comes from a takeover.
+    """
 
     boot: str
     offset: int
@@ -48,6 +52,7 @@ class _Head(msgspec.Struct, array_like=True):
     groups: list[_GroupHead]
     lost: str = ""
     """Why no monitor's state is kept; empty if states are kept."""
+    shift: int = 0
 
 
 @dataclass(slots=True)
@@ -84,11 +89,13 @@ class StateKeeper:
         self._left = [own] if _has_head(own) else [*earlier]
         self._entries: list[_Entry] = []
         self._by_channel: dict[str, _Entry] = {}
+        self.shift = 0
+        """What a takeover added to the clock of monitors, in nanoseconds; `continued` sets it."""
 
     @property
     def offset(self) -> int:
         """Return the difference between the clock of monitors and the machine's monotonic clock, in nanoseconds."""
-        return self._given.offset
+        return self._given.offset + self.shift
 
     # --- state that an earlier process left ---
 
@@ -105,6 +112,11 @@ class StateKeeper:
                 found.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
         return found if heads or found.lost else None
 
+    def kept_shift(self) -> int:
+        """Return the shift with which the newest kept state was written, less the present one."""
+        heads = [head for head, _sections in self._readable(RecoveredState())]
+        return max(heads, key=lambda head: head.written).shift - self.shift if heads else 0
+
     def _readable(self, found: RecoveredState) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
         for memory in self._left:
             try:
@@ -118,7 +130,7 @@ class StateKeeper:
         """Return why a state cannot be used again; empty if it can."""
         given = self._given
         if head.boot == given.boot:
-            set_by = abs(head.offset - given.offset)
+            set_by = abs(head.offset - head.shift - given.offset)
             return (
                 "" if set_by <= _STEP else "the machine's clock was changed while the appliance was stopped"
             )
@@ -131,9 +143,12 @@ class StateKeeper:
     # --- kept state ---
 
     def content(self) -> bytes:
-        """Return the kept states for `received_states` of another appliance."""
+        """Return the kept states for `received_states` of another appliance, with the present time."""
         kept = read(self._own)
-        return b"" if kept is None else _CONTENT.encode(kept)
+        if kept is None:
+            return b""
+        head = msgspec.structs.replace(_HEADS.decode(kept.head), written=self.offset + clock.now_ns())
+        return _CONTENT.encode(kept._replace(head=msgspec.msgpack.encode(head)))
 
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these monitors from now on."""
@@ -221,13 +236,31 @@ class StateKeeper:
             groups.append(_GroupHead(entry.group.names, msgspec.Raw(entry.group.layout)))
             if entry.parts:
                 groups += [_GroupHead([name], _NO_CELLS) for name in entry.group.part_names]
-        head = _Head(self._given.boot, self.offset, self.offset + clock.now_ns(), groups, lost)
+        written = self.offset + clock.now_ns()
+        head = _Head(self._given.boot, self.offset, written, groups, lost, self.shift)
         return msgspec.msgpack.encode(head)
 
 
 def state_left(number: int, keeper: StateKeeper | None) -> StateLeft:
     """Return the answer to `StateWanted` with this number."""
     return StateLeft(number, b"" if keeper is None else keeper.content())
+
+
+def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
+    """Return what to add to the clock of monitors (`now`) before their first start; the keeper also gets it.
+
+    After a takeover, the clock continues where the relays of the other appliance stopped it. A relay that replaces
+    another one continues the clock of that one.
+    """
+    shift = 0
+    if message.left and not message.lost:
+        times = [head.written for _content, head in _left(message.left, RecoveredState())]
+        shift = max(times) - now if times else 0
+    elif keeper is not None and not message.lost:
+        shift = keeper.kept_shift()
+    if keeper is not None:
+        keeper.shift += shift
+    return shift
 
 
 def start_outcome(
@@ -241,13 +274,13 @@ def start_outcome(
     """Start the first monitors of a relay, with the state of an earlier process or of the other appliance if any.
 
     After a takeover, `message` has the other appliance's states, or the reason why they are lost. `restarted`: this
-    relay replaces one that died. `now` is the machine's time (ns).
+    relay replaces one that died. `now` is the time of monitors (ns), `continued`.
     """
     left = keeper.recovered() if keeper is not None else None
     if message.lost:
         left = RecoveredState(lost={"": message.lost})
     elif message.left:
-        left = received_states(message.left, now)
+        left = received_states(message.left)
     elif keeper is None and restarted:
         left = RecoveredState(lost={"": _NO_MEMORY})
     if left is None:
@@ -255,25 +288,27 @@ def start_outcome(
     return monitors.recover(left.groups, left.lost, now, restarted=restarted)
 
 
-def received_states(contents: Sequence[bytes], now: int) -> RecoveredState:
-    """Return the states that the relays of another appliance left (`StateKeeper.content`).
-
-    `now` is this machine's time (ns). States that were written later are lost, because the clocks differ.
-    """
+def received_states(contents: Sequence[bytes]) -> RecoveredState:
+    """Return the states that the relays of another appliance left (`StateKeeper.content`)."""
     found = RecoveredState()
+    for kept, head in _left(contents, found):
+        if head.lost:
+            found.lost[""] = head.lost
+            continue
+        for group, section in zip(head.groups, kept.sections, strict=False):
+            found.groups.append((group.monitors, bytes(group.cells), *section))
+    return found
+
+
+def _left(contents: Sequence[bytes], found: RecoveredState) -> Iterator[tuple[StoredState, _Head]]:
     for content in filter(None, contents):
         try:
             kept = _CONTENTS.decode(content)
             head = _HEADS.decode(kept.head)
         except ValueError as error:
             found.lost[""] = f"{_UNREADABLE}: {error}"
-            continue
-        if head.lost or head.written > now + _STEP:
-            found.lost[""] = head.lost or _AHEAD
-            continue
-        for group, section in zip(head.groups, kept.sections, strict=False):
-            found.groups.append((group.monitors, bytes(group.cells), *section))
-    return found
+        else:
+            yield kept, head
 
 
 def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
