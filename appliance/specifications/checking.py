@@ -19,6 +19,7 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
+_ERROR = ": error: "  # a finding of this severity; the others are warnings
 _LONGEST = 32 << 20  # bytes: half of what a channel carries
 
 
@@ -125,7 +126,7 @@ def _good(files: Mapping[str, str], texts: Mapping[str, str]) -> tuple[set[str],
             contents({file: files[file] for file in files if file in {*good, *more}}, texts, load=True)
         except SpecificationsRefusedError as error:
             if len(more) == 1:
-                errors[more[0]] = error.findings[0]
+                errors[more[0]] = next((one for one in error.findings if _ERROR in one), error.findings[0])
                 return good
             half = len(more) // 2
             return grown(grown(good, more[:half]), more[half:])
