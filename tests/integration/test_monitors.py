@@ -294,6 +294,24 @@ def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, 
     assert len(appliance.rosrv("monitor", "list", "--json").stdout.splitlines()) == 1
 
 
+def test_a_file_with_an_error_does_not_keep_the_robot_without_a_master(tmp_path: Path) -> None:
+    """The others come into force; its monitor holds its topics until a corrected file is loaded, over restarts."""
+    broken = "broken() { event e() /held std_msgs/String '{}' { if (lost) { return; } } }"
+    with Appliance(monitors={"words": WORDS, "broken": broken}, options=("--api", "off")) as running:
+        for _ in range(2):
+            why = eventually(lambda: monitor(running, "broken")["why_held"], running.story)
+            assert "unknown variable `lost`" in why
+            assert monitor(running, "words")["held"] is False
+            assert "rosrv monitor resume broken" in running.rosrv("status", check=False).stdout
+            assert running.recorded(event="monitor not built")[-1]["resource"] == "broken"
+            assert running.stop() == 0
+            running.start()
+        fixed = tmp_path / "broken.rv"
+        fixed.write_text(broken.replace("lost", "false"))
+        running.rosrv("monitor", "load", str(fixed))
+        assert monitor(running, "broken")["held"] is False
+
+
 def test_a_start_with_an_invalid_file_fails_with_its_place() -> None:
     """The appliance does not start without its monitors."""
     monitors = {"words": WORDS, "broken": "broken() { event }"}
