@@ -300,7 +300,7 @@ def test_a_file_with_an_error_does_not_keep_the_robot_without_a_master(tmp_path:
     with Appliance(monitors={"words": WORDS, "broken": broken}, options=("--api", "off")) as running:
         for _ in range(2):
             why = eventually(lambda: monitor(running, "broken")["why_held"], running.story)
-            assert "unknown variable `lost`" in why
+            assert "unknown variable `lost`" in str(why)
             assert monitor(running, "words")["held"] is False
             assert "rosrv monitor resume broken" in running.rosrv("status", check=False).stdout
             assert running.recorded(event="monitor not built")[-1]["resource"] == "broken"
