@@ -64,6 +64,7 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJS
 def main() -> None:
     """Run the command. Errors are one line on standard error, with exit status 2."""
     os.umask(0o077)
+    configure_log()
     try:
         app()
     except _ERRORS as error:
@@ -102,9 +103,7 @@ def serve_collector(config: Config = _DEFAULT) -> None:
 
     Example: rosrv-fleet serve --config fleet.yaml
     """
-    found = load_config(config)
-    configure_log()
-    serve(make_collector(found))
+    serve(make_collector(load_config(config)))
 
 
 @robot_app.command("invite")
@@ -132,7 +131,7 @@ def invite_robots(
     collector, authority = url_of(found), authority_of(found.certificate)
     receipt_key = make_receipt_key(found.data).read_text(encoding="ascii")
     invitations = Invitations(found.data / "invitations")
-    enrolled = Robots(found.data / "robots").all()
+    enrolled = Robots(found.data / "robots").known()
     for name in names:
         own = group or (enrolled[name].group if name in enrolled else "")
         pending, token = invitations.add(name, group, hours * 3600.0)
@@ -205,15 +204,17 @@ def remove_robot(name: Name, config: Config = _DEFAULT) -> None:
 
 @robot_app.command("list")
 def list_robots(config: Config = _DEFAULT, *, as_json: Json = False) -> None:
-    """List the robots with their groups and certificates.
+    """List the robots with their groups and certificates. Exit status 1 if the file of a robot is unreadable.
 
     Example: rosrv-fleet robot list
     """
-    for robot in _robots(config)[0].all().values():
+    robots, _invitations = _robots(config)
+    for robot in robots.known().values():
         state = "enrolled" if robot.removed is None else "removed"
         fields = {"name": robot.name, "state": state, "group": robot.group}
         fields |= {"key": robot.key, "certificate": robot.fingerprint}
         typer.echo(json.dumps(fields) if as_json else "  ".join(word or "-" for word in fields.values()))
+    raise typer.Exit(1 if robots.unreadable else 0)
 
 
 def _robots(config: Path) -> tuple[Robots, Invitations]:
@@ -333,9 +334,9 @@ def verify(
     """
     found = load_config(config)
     robots = Robots(found.data / "robots")
-    chosen = list(robots.all().values()) if robot is None else [robots.named(robot)]
+    chosen = list(robots.known().values()) if robot is None else [robots.named(robot)]
     store = SegmentStore(found.data, found.limits.reserve_bytes)
-    complete = True
+    complete = robot is not None or not robots.unreadable
     for one in chosen:
         proofs = prove(store, one, found.limits.segment_bytes)
         for proof in proofs:
@@ -365,7 +366,7 @@ def _print_proof(proof: LogProof, *, as_json: bool) -> None:
 def reindex(config: Config = _DEFAULT) -> None:
     """Rebuild the index from the stored segments. The collector may run; searches are incomplete until the end.
 
-    Exit status 1 if a segment cannot be indexed; all others are.
+    Exit status 1 if a segment cannot be indexed or the file of a robot is unreadable; all others are indexed.
 
     Example: rosrv-fleet reindex
     """
@@ -383,9 +384,10 @@ def reindex(config: Config = _DEFAULT) -> None:
 
 
 def _index_all(collector: Collector) -> tuple[int, int]:
-    """Index all segments; return the number of indexed ones, and of those that the index cannot have."""
-    indexed = damaged = 0
-    for robot in collector.robots.all().values():
+    """Index all segments; return the number of indexed ones, and of robots and segments that cannot be indexed."""
+    robots = collector.robots.known().values()
+    indexed, damaged = 0, len(collector.robots.unreadable)
+    for robot in robots:
         for log in collector.store.logs(robot.name):
             for place in collector.store.segments(robot.name, log):
                 try:

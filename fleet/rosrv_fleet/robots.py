@@ -119,7 +119,7 @@ class Robots:
         return next(iter(self.unreadable.values()), None)
 
     def all(self) -> dict[str, Robot]:
-        """Return the robots by name. Raises `EnrolmentError` for an unreadable file."""
+        """Return the robots by name. Raises `EnrolmentError` for an unreadable file: for what needs every robot."""
         known = self.known()
         if self.trouble is not None:
             raise EnrolmentError(self.trouble)
@@ -178,13 +178,13 @@ class Robots:
                 raise EnrolmentError(
                     f"{name} is already enrolled; for a new certificate: rosrv-fleet robot renew {name}"
                 )
-            robot = _new_robot(name, key, certificate, group)
+            robot = self._unique(_new_robot(name, key, certificate, group))
             return self._keep(robot, "robot add", f"{group} certificate {robot.fingerprint}".strip())
 
     def renew(self, name: str, certificate: bytes) -> Robot:
         """Replace a robot's certificate (PEM); a removed robot may connect again. Raises `EnrolmentError`."""
         with changing(self._folder):
-            robot = _renewed(self.named(name), certificate)
+            robot = self._unique(_renewed(self.named(name), certificate))
             return self._keep(robot, "robot renew", f"certificate {robot.fingerprint}")
 
     def move(self, name: str, group: str) -> Robot:
@@ -213,7 +213,7 @@ class Robots:
             return self._joined(_moved(renewed, group) if group else renewed)
 
     def _joined(self, robot: Robot) -> Robot:
-        return self._keep(robot, "robot join", f"certificate {robot.fingerprint}")
+        return self._keep(self._unique(robot), "robot join", f"certificate {robot.fingerprint}")
 
     def remove(self, name: str) -> None:
         """Reject a robot's connections from now on; its segments stay. Raises `EnrolmentError` and `OSError`."""
@@ -229,13 +229,17 @@ class Robots:
             raise EnrolmentError(f"{name!a} is not enrolled; list the robots: rosrv-fleet robot list")
         return robot
 
-    def _keep(self, robot: Robot, act: str, detail: str = "") -> Robot:
+    def _unique(self, robot: Robot) -> Robot:
+        """Return the robot. Raises `EnrolmentError` if another one has its certificate or key, or is unreadable."""
         others = (one for one in self.all().values() if one.name != robot.name and one.removed is None)
         for other in others:
             if other.fingerprint == robot.fingerprint:
                 raise EnrolmentError(f"{other.name} has this certificate; each robot needs its own")
             if other.key == robot.key:
                 raise EnrolmentError(f"{other.name} has this log key; each robot needs its own")
+        return robot
+
+    def _keep(self, robot: Robot, act: str, detail: str = "") -> Robot:
         with recorded(self._folder.parent, act, robot.name, detail):
             write_whole(self._folder / f"{robot.name}.json", msgspec.json.encode(robot), 0o600)
         with self._lock:
@@ -297,10 +301,19 @@ def _log_key(pem: bytes) -> str:
 
 
 def _certificate(pem: bytes) -> str:
+    """Return a certificate (PEM) if all that the collector reads of it later can be read.
+
+    A certificate is parsed only where it is read, and TLS has another parser: what passes here must fail nowhere else.
+    """
     try:
-        return x509.load_pem_x509_certificate(pem).public_bytes(Encoding.PEM).decode("ascii")
-    except ValueError as error:
-        raise EnrolmentError(f"--certificate: not a certificate in PEM: {error}") from error
+        found = x509.load_pem_x509_certificate(pem)
+        found.not_valid_before_utc.timestamp()
+        found.not_valid_after_utc.timestamp()
+        text = found.public_bytes(Encoding.PEM).decode("ascii")
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_verify_locations(cadata=text)
+    except (ValueError, x509.InvalidVersion, ssl.SSLError) as error:
+        raise EnrolmentError(f"--certificate: not a valid certificate in PEM: {error}") from error
+    return text
 
 
 def require_own_signature(pem: bytes) -> None:
@@ -311,7 +324,7 @@ def require_own_signature(pem: bytes) -> None:
     certificate = x509.load_pem_x509_certificate(_certificate(pem).encode())
     try:
         certificate.verify_directly_issued_by(certificate)
-    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm):
+    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm, x509.InvalidVersion):
         raise EnrolmentError("the certificate is not signed with its own key") from None
 
 

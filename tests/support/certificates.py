@@ -2,14 +2,15 @@
 
 import datetime
 import ipaddress
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 from cryptography.x509.oid import NameOID
 
 
@@ -56,3 +57,22 @@ def make_certificates(
     key = folder / "peer.key"
     key.write_bytes(keys["peer"].private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
     return Certificates(ca, certificate, key)
+
+
+def own_certificate_until(end: bytes) -> bytes:
+    """Return a certificate (PEM) that is its own authority; `end` is the DER of the end of its validity, any bytes."""
+    key = ed25519.Ed25519PrivateKey.generate()
+    algorithm = _der(0x30, bytes.fromhex("06032b6570"))
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "own")]).public_bytes()
+    public = key.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    validity = _der(0x30, b"\x17\x0d260101000000Z", end)
+    signed = _der(0x30, bytes.fromhex("a003020102020101"), algorithm, name, validity, name, public)
+    return ssl.DER_cert_to_PEM_cert(
+        _der(0x30, signed, algorithm, _der(0x03, b"\0", key.sign(signed)))
+    ).encode()
+
+
+def _der(tag: int, *parts: bytes) -> bytes:
+    body = b"".join(parts)
+    size = bytes([len(body)]) if len(body) < 128 else bytes([0x81, len(body)])
+    return bytes([tag]) + size + body

@@ -85,7 +85,9 @@ def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceC
             if not verifier.findings:
                 about = msgspec.convert(verifier.manifest, _Manifest)
     except _OtherKeyError as error:
-        owners = (one.name for one in Robots(config.data / "robots").all().values() if one.key == str(error))
+        owners = (
+            one.name for one in Robots(config.data / "robots").known().values() if one.key == str(error)
+        )
         owner = next(owners, None)
         whose = f"that of {owner}; use --robot {owner}" if owner else f"{error}, which no robot has"
         raise EvidenceError(f"{robot.name} has the key {robot.key}, the bundle {whose}") from None

@@ -8,11 +8,13 @@ from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, Protocol
 
 import msgspec
+import structlog
 from psycopg import Connection
 
 from rosrv_fleet.robots import RobotGroup
 from rosrv_fleet.rollouts.machine import BundleRollout, RobotSeen
 
+_log = structlog.get_logger()
 _LOCK_GROUP = "SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))"
 
 
@@ -57,13 +59,18 @@ class RolloutStore:
             connection.execute(query, (name, *group, document))
 
     def reports(self) -> dict[str, StoredReport]:
-        """Return the last report of every robot that ever sent one."""
+        """Return the last report of every robot that ever sent one. One that is unreadable is as if never sent."""
         query = "SELECT name, site, robot_group, report::text FROM bundle_robot"
+        found = {}
         with self._database.writing() as connection:
-            return {
-                name: StoredReport(RobotGroup(site, group), msgspec.json.decode(report, type=RobotSeen))
-                for name, site, group, report in connection.execute(query)
-            }
+            for name, site, group, report in connection.execute(query):
+                try:
+                    seen = msgspec.json.decode(report, type=RobotSeen)
+                except ValueError as error:
+                    _log.error("the stored report of a robot is unreadable", robot=name, reason=str(error))
+                    continue
+                found[name] = StoredReport(RobotGroup(site, group), seen)
+        return found
 
     # --- rollouts ---
 

@@ -9,15 +9,22 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
 from rosrv_fleet.cli import app, robot_app, token_app
+from rosrv_fleet.collector import Collector
+from rosrv_fleet.health import FleetHealth, health_of
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots
+from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots, require_own_signature
+from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
 
@@ -25,7 +32,7 @@ from appliance.audit.signatures import write_public_key
 from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
 from appliance.signing.own_certificate import make_own_certificate
-from tests.support.certificates import make_certificates
+from tests.support.certificates import make_certificates, own_certificate_until
 from tests.support.enrolled_robots import enrolled_robots
 from tests.support.sources import ROOT
 from tests.support.unreadable_folders import make_unreadable
@@ -328,13 +335,74 @@ def test_a_damaged_file_affects_no_other_robot(word: str, damaged: str, tmp_path
     assert Robots(tmp_path / "robots").known() == {"arm2": before["arm2"]}
     assert robots.trouble is not None
     assert str(file) in robots.trouble
-    for change in (robots.remove, partial(robots.move, group="site-a/arms")):
-        with pytest.raises(EnrolmentError, match="repair it"):
-            change("arm2")
+    with pytest.raises(EnrolmentError, match="repair it"):  # perhaps arm1 has this certificate
+        robots.renew("arm2", make_own_certificate("arm2", 1)[1])
+    before["arm2"] = robots.move("arm2", "site-a/arms")
     with pytest.raises(EnrolmentError, match="repair it"):
         Robots(tmp_path / "robots").named("arm1")
     file.write_text(whole)
     with using(VirtualClock(now=now() + 2)):  # it reads the folder again after a second
         assert robots.known() == before
     assert robots.trouble is None
-    robots.remove("arm2")
+
+
+def test_a_damaged_file_delays_no_revocation(data: Path) -> None:
+    """A robot can be removed while the file of another one is unreadable, and `robot list` shows all others."""
+    enrolled_robots(data, "arm1", "arm2")
+    (data / "robots" / "arm1.json").write_text("{")
+    _run(data, "robot", "remove", "arm2")
+    listed = CliRunner().invoke(app, ["robot", "list", "--config", str(data.parent / "fleet.yaml")])
+    assert listed.exit_code == 1
+    assert "arm2  removed" in listed.stdout
+
+
+_NO_TIMES = [b"\x18\x0f00000101000000Z", b"\x18\x0f20260101000099Z", b"\x17\x0d261301000000Z"]
+
+
+@pytest.mark.parametrize("until", _NO_TIMES, ids=["year 0", "second 99", "month 13"])
+def test_a_certificate_without_a_time_is_refused(until: bytes, tmp_path: Path) -> None:
+    """A robot cannot join with a certificate whose end cannot be read, though it is well-formed and signed."""
+    certificate = own_certificate_until(until)
+    key, _ = _files(tmp_path, "arm1")
+    with pytest.raises(EnrolmentError, match="not a valid certificate"):
+        require_own_signature(certificate)
+    with pytest.raises(EnrolmentError, match="not a valid certificate"):
+        Robots(tmp_path / "robots").join("arm1", key.read_bytes(), certificate, "")
+    assert Robots(tmp_path / "robots").all() == {}
+    require_own_signature(own_certificate_until(b"\x18\x0f99991231235959Z"))
+
+
+def test_a_stored_certificate_without_a_time_hides_no_robot(tmp_path: Path) -> None:
+    """If an earlier version enrolled a robot with such a certificate, health has all others, and names its file."""
+    before = enrolled_robots(tmp_path, "arm1", "arm2").all()
+    bad = msgspec.structs.replace(before["arm1"], certificate=own_certificate_until(_NO_TIMES[0]).decode())
+    write_whole(tmp_path / "robots" / "arm1.json", msgspec.json.encode(bad), 0o600)
+    found = _health(tmp_path)
+    assert [robot.name for robot in found.robots] == ["arm2"]
+    assert found.trouble is not None
+    assert "arm1.json" in found.trouble
+
+
+def test_whatever_certificate_is_accepted_can_be_shown(tmp_path: Path) -> None:
+    """A certificate with any one byte changed is refused, or TLS, health and the list can read it."""
+    whole = ssl.PEM_cert_to_DER_cert(make_own_certificate("arm1", 1)[1].decode())
+    key, _ = (file.read_bytes() for file in _files(tmp_path, "arm1"))
+    robots, accepted = Robots(tmp_path / "robots"), 0
+    for place in range(len(whole)):
+        changed = whole[:place] + bytes([whole[place] ^ 0x21]) + whole[place + 1 :]
+        with suppress(EnrolmentError):
+            robots.join("arm1", key, ssl.DER_cert_to_PEM_cert(changed).encode(), "")
+            accepted += 1
+    (robot,) = _health(tmp_path).robots
+    assert robot.name == "arm1"
+    assert 0 < accepted < len(whole)
+
+
+def _health(data: Path) -> FleetHealth:
+    """Return the health of a collector with the robots of a data folder, whose index is up."""
+    up = SimpleNamespace(trouble=None)
+    parts = SimpleNamespace(
+        store=SegmentStore(data, 0), robots=Robots(data / "robots"), indexer=up, pruner=up,
+        config=SimpleNamespace(silent_seconds=60.0),
+    )  # fmt: skip
+    return health_of(cast(Collector, parts))
