@@ -1,19 +1,43 @@
-"""Compare the robot's health before and after a change: denials, monitors, processes."""
+"""Compare the robot's health before and after a change: denials, monitors, processes.
 
-from collections.abc import Sequence
+A host can make any number of denials, and the host from which a change takes a right has a reason to. So all denials of
+the robot's own nodes count, but of every other host a few, and of all of them together little more than the number
+that needs attention: it takes several hosts, and they can hide no denial of the robot's.
+"""
+
+import ipaddress
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Self
 
 from appliance.channel.answers.status import MinuteState, ProcessInfo
 from appliance.control.monitor_states import monitors_status
+from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.telemetry.metrics import Meter
 
 _MORE_OFTEN = 3  # a change may not make denials this many times as frequent
 _ATTENTION_AT = MinuteState(0, {}).attention_at
+_OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
+
+
+def counted_denials(by_host: Mapping[str, int], policy: Policy) -> int:
+    """Return how many denials count. `by_host` has those of unknown hosts together, under an empty name.
+
+    Addresses that the policy names as one network count as one host.
+    """
+    own, others = 0, Counter[str]()
+    for host, number in by_host.items():
+        address = ipaddress.ip_address(host) if host else None
+        if address is not None and any(address in network for network in policy.robot):
+            own += number
+        else:
+            others["" if address is None else policy.alike(address)] += number
+    return own + min(_OF_OTHER_HOSTS, sum(min(_OF_ONE_HOST, number) for number in others.values()))
 
 
 class RobotHealth(NamedTuple):
-    """The denials of the last minute, the monitors that fail or hold topics, and the processes that keep ending."""
+    """The denials of the last minute that count, monitors that fail or hold topics, processes that keep ending."""
 
     denials: int
     failing: frozenset[str]
@@ -21,11 +45,13 @@ class RobotHealth(NamedTuple):
     rejected: tuple[str, ...] = ()  # why relays reject the specifications in force
 
     @classmethod
-    def of(cls, meter: Meter, monitors: SpecificationManager, processes: Sequence[ProcessInfo]) -> Self:
+    def of(
+        cls, meter: Meter, policy: Policy, monitors: SpecificationManager, processes: Sequence[ProcessInfo]
+    ) -> Self:
         """Return the present health."""
         state = monitors_status(monitors)
         return cls(
-            sum(meter.denied.counts().values()),
+            counted_denials(meter.denied_hosts.counts(), policy),
             frozenset([*state.failing, *state.held]),
             frozenset(process.role for process in processes if process.failing),
             tuple(state.refused),

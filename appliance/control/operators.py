@@ -93,7 +93,9 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         hosts=hosts,
         store=base.store,
         trail=trail,
-        health=lambda: RobotHealth.of(trail.meter, parts.monitors, base.lifeline.surroundings.processes),
+        health=lambda: RobotHealth.of(
+            trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes
+        ),
     )
     looks = Queries(
         parts,

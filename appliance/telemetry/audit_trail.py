@@ -102,6 +102,7 @@ class AuditTrail:
         now = clock.wall_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._recordings("decision", word, severity, asker.host, now)
+        unknown = self._marked(asker.host, word, detail)
         record = AuditRecord(
             id=self._ids.next(),
             time=now,
@@ -116,11 +117,12 @@ class AuditTrail:
             revision=self.revision,
             reason=decision.reason,
             duration_us=(clock.now_ns() - asker.arrived) // 1000,
-            unknown=self._marked(asker.host, word, detail),
+            unknown=unknown,
             detail=detail,
             folds=reads and word == "allow",
         )
-        self.meter.decided(category, word, (clock.now_ns() - asker.arrived) / 1e9)
+        seconds = (clock.now_ns() - asker.arrived) / 1e9
+        self.meter.decided(category, word, seconds, "" if unknown else asker.host)
         return self._log.record(record)
 
     def happened(

@@ -192,7 +192,8 @@ class Histogram:
 class Meter:
     """The counters of RVMaster's events since its start, and of the last minute.
 
-    `denied` has the denials by category, `dropped` the messages that monitors dropped by monitor.
+    `denied` has the denials by category, `denied_hosts` by host (unknown hosts together, as ""), `dropped` the messages
+    that monitors dropped by monitor.
     """
 
     def __init__(self) -> None:
@@ -200,13 +201,15 @@ class Meter:
         self.decision_seconds = Histogram()
         self.calls: dict[str, Histogram] = {}
         self.denied = LastMinute()
+        self.denied_hosts = LastMinute()
         self.dropped = LastMinute()
 
-    def decided(self, category: str, outcome: str, seconds: float) -> None:
-        """Count a decision."""
+    def decided(self, category: str, outcome: str, seconds: float, host: str) -> None:
+        """Count a decision about a host; unknown hosts are one, without a name."""
         self.decisions[category, outcome] += 1
         if outcome == "deny":
             self.denied.add(category)
+            self.denied_hosts.add(host)
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Severity
-from appliance.base.clock import wall_ns
+from appliance.base import clock
 from appliance.configuration.settings import RecorderRules
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
@@ -22,7 +22,7 @@ class Log:
     """An audit log that cannot be written."""
 
     def __init__(self) -> None:
-        self.ids = IdSource(clock=wall_ns)
+        self.ids = IdSource(clock=clock.wall_ns)
         self.failed: str | None = "/var/lib/rosrv/control/audit.db: database or disk is full"
         self.records: list[Any] = []
         self.budget = Budget(lambda host: QuotaClass.UNKNOWN if host == UNKNOWN else QuotaClass.NAMED)

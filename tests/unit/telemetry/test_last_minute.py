@@ -35,5 +35,5 @@ def test_only_denials_count_as_denied() -> None:
     """Allowed requests do not count as denials; requests that an audit-only policy would deny do not count either."""
     meter = Meter()
     for outcome in ("deny", "allow", "would deny", "deny"):
-        meter.decided("publish", outcome, 0.001)
+        meter.decided("publish", outcome, 0.001, "10.0.0.1")
     assert meter.denied.counts() == {"publish": 2}

@@ -1,0 +1,71 @@
+"""Tests of the health by which a bundle is judged: no host but the robot itself can spoil it, or hide an illness."""
+
+import ipaddress
+
+import pytest
+
+from appliance.audit.budget import Budget
+from appliance.control.bundle_health import RobotHealth, counted_denials
+from appliance.policy.model import Decision
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import QuotaClass
+from appliance.telemetry.audit_trail import Asker, AuditTrail
+from tests.unit.telemetry.test_audit_trail import Log
+
+ROBOT = "192.168.1.10"
+_POLICY = compile_policy(
+    "[Publishers]\ndefault = robot 10.0.0.0/24 10.1.0.1 10.1.0.2 10.1.0.3 10.1.0.4 10.1.0.5\n",
+    file="policy.ini",
+    robot=[ipaddress.ip_address(ROBOT)],
+)
+_NONE = RobotHealth(0, frozenset(), frozenset())
+
+
+@pytest.mark.parametrize(
+    ("denied", "why"),
+    [
+        ({"10.0.0.66": 40}, ""),
+        ({"10.0.0.66": 1_000_000, "": 1_000_000}, ""),
+        ({f"10.0.0.{number}": 40 for number in range(1, 255)}, ""),
+        ({f"10.1.0.{number}": 40 for number in range(1, 4)}, ""),
+        ({f"10.1.0.{number}": 40 for number in range(1, 5)}, "12 denials"),
+        ({ROBOT: 10}, ""),
+        ({ROBOT: 11}, "11 denials"),
+    ],
+    ids=[
+        "guest",
+        "guest and unknown hosts",
+        "one network",
+        "three hosts",
+        "four hosts",
+        "calm robot",
+        "robot",
+    ],
+)
+def test_only_the_robot_or_several_hosts_spoil_a_trial(denied: dict[str, int], why: str) -> None:
+    """Denials of one host, of one network or of unknown hosts do not count as illness, however many there are."""
+    health = _NONE._replace(denials=counted_denials(denied, _POLICY))
+    assert health.worse_than(_NONE).startswith(why)
+    assert bool(health.worse_than(_NONE)) == bool(why)
+
+
+def test_other_hosts_hide_no_illness_of_the_robot() -> None:
+    """However many denials all other hosts make before a trial, 37 denials of the robot's nodes end it."""
+    noise = {"": 10**6} | {f"10.1.0.{number}": 10**6 for number in range(1, 6)}
+    before = _NONE._replace(denials=counted_denials(noise, _POLICY))
+    assert _NONE._replace(denials=counted_denials({ROBOT: 37}, _POLICY)).worse_than(before)
+
+
+def test_denials_are_counted_by_host() -> None:
+    """The trail counts each denial for its host, all unknown hosts together, and no granted call."""
+    log = Log()
+    log.budget = Budget(lambda host: QuotaClass.UNKNOWN if host.startswith("203.") else QuotaClass.NAMED)
+    trail = AuditTrail(log, strict=True, deny_when_failed=False, recordings=lambda *_: {})  # type: ignore[arg-type]  # stands for the log
+    for host, allowed in (
+        (ROBOT, True),
+        ("10.0.0.66", False),
+        ("203.0.113.1", False),
+        ("203.0.113.2", False),
+    ):
+        trail.decided(Asker(host, "/n", 0), "c", "publish", "/t", Decision(allowed, None, "why"))
+    assert trail.meter.denied_hosts.counts() == {"10.0.0.66": 1, "": 2}
