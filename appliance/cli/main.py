@@ -138,6 +138,7 @@ VERBS: dict[str, Verb | Group] = {
         {
             "join": Verb("standby.membership_verbs:join"),
             "leave": Verb("standby.membership_verbs:leave"),
+            "repair": Verb("standby.membership_verbs:repair"),
             "status": Verb("standby.live_verbs:status"),
             "promote": Verb("standby.live_verbs:promote"),
         },

@@ -11,7 +11,9 @@ This module reads no clock and no socket. Its owner passes the time with each me
 3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
    off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
-5. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
+5. Only the witness makes epochs. An active appliance believes no other one that claims a later epoch: by 1 and 2 there
+   is none. A passive appliance believes it until the witness answers, and nobody who claims an epoch beyond `FARTHEST`.
+6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
    It waits for the standby again before it asks the witness to add it.
 """
 
@@ -25,6 +27,7 @@ RENEW_SECONDS = 0.3
 CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted
 CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different speeds
 SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
+FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
 _MOST_PENDING = 16
 
 Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
@@ -110,6 +113,10 @@ class ApplianceLease:
         self._next_removal = now
         self._expired = False
         self._last_add = 0
+        self._witnessed = epoch  # the greatest epoch of the witness
+        self._rumoured = (
+            0  # requests up to this number were sent before the other appliance claimed the epoch
+        )
         # A switchover: requests and promises up to these numbers no longer make this appliance active.
         self._switching_until: float | None = None
         self._released = False
@@ -142,6 +149,10 @@ class ApplianceLease:
         """Whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
         if epoch < self.epoch or epoch == self.held:
             return False
+        if epoch - self.epoch > FARTHEST:
+            return False
+        if epoch > self.epoch:
+            self._rumoured = self._sequence
         self._learn(epoch)
         return True
 
@@ -178,8 +189,19 @@ class ApplianceLease:
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
         """Take an answer of the witness to a request of this process."""
         self.refusal = answer.reason
+        if self.epoch and answer.epoch - self.epoch > FARTHEST:
+            self.refusal = (
+                f"the witness has epoch {answer.epoch}, this appliance {self.epoch}: if an operator chose that of the"
+                " witness, stop this appliance and run `rosrv standby repair`"
+            )
+            return ()
+        if answer.epoch < self.epoch and request.sequence > self._rumoured:
+            self.epoch = max(
+                answer.epoch, self._witnessed
+            )  # what the other appliance claimed was never granted
         if answer.epoch < self.epoch:
             return ()
+        self._witnessed = answer.epoch
         self._expired = answer.expired
         if answer.holder != self._name or not answer.ok:
             self._learn(
@@ -204,6 +226,8 @@ class ApplianceLease:
         """Take a message of the other appliance."""
         match message:
             case PromiseRequest():
+                if self.is_active(now):
+                    return ()
                 if not self.follow(message.epoch) or self._expired:
                     return ()
                 self._promised_until = max(self._promised_until, now + EXPIRY)

@@ -2,7 +2,7 @@
 
 The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
 the supervisor. If no further extension arrives, the supervisor ends the processes that serve the robot. So the
-appliance also becomes passive if this process hangs or dies. The greatest epoch is on the disk before it is used.
+appliance also becomes passive if this process hangs or dies. The epoch is on the disk before it is used.
 
 This appliance claims only while its control is present. If control is away for long, the other appliance takes over.
 The control of a standby also withdraws its presence while it could not serve (`control/takeover_check.py`).
@@ -131,7 +131,7 @@ class LeaseProcess:
     def _after(self, due: Outgoing) -> None:
         """Store the epoch, send what is due, and report the state."""
         epoch = self._lease.epoch
-        if epoch > self._stored:
+        if epoch != self._stored:
             write_whole(self._epoch_file, f"{epoch}\n".encode(), 0o600)
             self._stored = epoch
         for message in due:
@@ -250,5 +250,5 @@ def stored_epoch(path: Path) -> int:
     except FileNotFoundError:
         return 0
     if not text.isdecimal() or int(text) > HIGHEST:
-        raise ValueError(f"{path} does not contain an epoch; restore it from a backup, or join again")
+        raise ValueError(f"{path} does not contain an epoch: rosrv standby repair")
     return int(text)

@@ -1,4 +1,4 @@
-"""`rosrv standby join|leave`: make an appliance one of two, or a single one. Both work without a running appliance."""
+"""`rosrv standby join|leave|repair`: make an appliance one of two, or a single one, without a running appliance."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,9 @@ from appliance.standby.membership import (
     path_of,
     save_membership,
 )
-from rosmop.tool.terminal import say
+from appliance.standby.process import EPOCH
+from appliance.supervisor.state_directory import StateDirectory
+from rosmop.tool.terminal import printable, say
 
 _VERB = "rosrv standby"
 _Address = Annotated[str | None, typer.Option(metavar="ADDRESS", show_default=False)]
@@ -148,3 +150,30 @@ def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     say(
         f"On {membership.other} ({membership.other_address}): stop it, then rosrv standby leave, or rosrv purge"
     )
+
+
+def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
+    """Forget the epoch that this appliance has stored: at its next start it takes that of the witness. Stop it first.
+
+    For a pair whose witness reports a smaller epoch although its disk was not restored. Run it on both appliances. Exit
+    status: 0 done, 1 the appliance runs, 2 it is not one of two.
+
+    Example: rosrv standby repair
+    """
+    if not path_of(state).exists():
+        raise usage_error(f"{state} is not the state of one of two appliances", _VERB)
+    directory = StateDirectory(state)
+    file = state / "lease" / EPOCH
+    try:
+        epoch = file.read_text("ascii", "replace").strip()[:32] if file.exists() else ""
+        file.unlink(missing_ok=True)
+    except OSError as error:
+        raise usage_error(f"{file} cannot be removed: {error.strerror}; run this as root", _VERB) from None
+    finally:
+        directory.close()
+    if as_json:
+        say_json({"forgotten": epoch})
+    else:
+        say(
+            f"Epoch {printable(epoch) or 'none'} is forgotten: start the appliance, then rosrv standby status."
+        )

@@ -51,7 +51,7 @@ MUTANTS = {
         "self._promised_until = now\n        self._promised_to:", 4, ("witness link", "crash"),
     ),
     "R3: an older epoch gets promises, and its data is stored": Mutant(
-        lease, "if epoch < self.epoch or epoch == self.held:", "if epoch == self.held:", 439,
+        lease, "if epoch < self.epoch or epoch == self.held:", "if epoch == self.held:", 671,
         ("bad link", "crash of the active"),
     ),
     "R3: promises go on after the expiry": Mutant(

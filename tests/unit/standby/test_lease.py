@@ -4,6 +4,7 @@ import pytest
 
 from appliance.standby.lease import (
     CONFIDENCE,
+    FARTHEST,
     ApplianceLease,
     ClaimPromise,
     LeaseError,
@@ -13,7 +14,7 @@ from appliance.standby.lease import (
     WitnessAnswer,
     WitnessRequest,
 )
-from appliance.standby.witness import EXPIRY
+from appliance.standby.witness import EXPIRY, HIGHEST
 from appliance.standby.witness_link import WitnessChannel
 from tests.unit.standby.test_witness import KEYS, Robot
 
@@ -154,13 +155,56 @@ def test_it_promises_nothing_after_the_lease_has_expired() -> None:
 
 
 def test_it_promises_nothing_to_an_older_epoch() -> None:
-    """A newer epoch ends its own."""
+    """A newer epoch ends its own, once it is no longer active."""
     lease = active_lease()
     assert list(lease.lease.received(lease.now, PromiseRequest(1, "theirs", 1))) == []
     assert lease.active()
     assert not lease.lease.follow(1) and not lease.lease.follow(2), "data of an older epoch, or of its own"
+    lease.later(CONFIDENCE)
     assert list(lease.lease.received(lease.now, PromiseRequest(3, "theirs", 1))) != []
     assert not lease.active() and lease.lease.epoch == 3
+
+
+@pytest.mark.parametrize("epoch", [3, 2 + FARTHEST, HIGHEST])
+def test_an_active_appliance_believes_no_later_epoch(epoch: int) -> None:
+    """Only one appliance is active: a datagram with a later epoch is forged, ends no service and is not stored."""
+    lease = active_lease()
+    assert not lease.lease.received(lease.now, PromiseRequest(epoch, "theirs", 1))
+    assert lease.active() and lease.lease.epoch == 2
+    lease.answered(lease.later(0.3).request("renew"))
+    assert lease.later(CONFIDENCE - 0.01).active()
+
+
+def test_a_passive_appliance_believes_the_witness_more() -> None:
+    """An epoch that the other appliance claimed counts until the witness answers a later request with a smaller one."""
+    lease = Lease(epoch=2)
+    look = lease.request("look")
+    assert lease.lease.follow(3) and not lease.lease.follow(2)
+    lease.answered(look, holder="b")
+    assert lease.lease.epoch == 3, "the answer may be older than the epoch"
+    lease.answered(lease.later(0.3).request("look"), holder="b")
+    assert lease.lease.epoch == 2 and lease.lease.follow(2)
+
+
+def test_a_claimed_epoch_lets_no_restored_witness_in() -> None:
+    """After a claim was undone, an epoch below the witness's own greatest one is still ignored."""
+    lease = Lease(epoch=5)
+    assert lease.lease.follow(6)
+    lease.answered(lease.request("look"), epoch=4)
+    assert lease.lease.epoch == 5
+
+
+def test_an_epoch_that_jumps_is_not_believed() -> None:
+    """Neither of the other appliance, nor of the witness; then the reason names the remedy, after which it is."""
+    lease = Lease(epoch=7)
+    assert not lease.lease.follow(8 + FARTHEST)
+    assert lease.lease.follow(7 + FARTHEST)
+    lease = Lease(epoch=7)
+    lease.answered(lease.request("look"), epoch=8 + FARTHEST, holder="b")
+    assert lease.lease.epoch == 7 and "rosrv standby repair" in lease.lease.refusal
+    repaired = Lease(epoch=0)
+    repaired.answered(repaired.request("look"), epoch=8 + FARTHEST, holder="b")
+    assert repaired.lease.epoch == 8 + FARTHEST
 
 
 def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
