@@ -57,7 +57,7 @@ def main() -> None:
     measure("  xmlrpc.client", lambda: dumps((STATE,), methodresponse=True).encode())
     measure("resolve a global name", lambda: names.resolve("/chatter", "/talker"))
     measure("resolve a private name", lambda: names.resolve("~state", "/ns/talker"))
-    measure("check a caller_id", lambda: names.check_caller_id("/ns/talker"))
+    measure("check a caller_id", lambda: names.canonical_caller_id("/ns/talker"))
     measure("read a node URI", lambda: parse_node_uri("http://10.0.0.1:4567/"))
     measure("read a connection header", lambda: HeaderParser().feed(header))
     measure("write a connection header", lambda: encode_header(HEADER))

@@ -9,7 +9,8 @@ Invariants:
 2. A returned name is canonical: it starts with `/`, has no empty segment, and resolves to itself.
 3. Two different returned names mean different things to `rosmaster` and look different: ASCII only, no control
    characters. Only slashes are normalised.
-4. `rosmaster` never resolves a `caller_id`, so it must already be canonical.
+4. `rosmaster` never resolves a `caller_id`, but rospy and roscpp fold the slashes of a node's name before they send
+   it, and other client libraries do not (rosgo sends `//name`). So this side folds them, and passes on only the result.
 """
 
 import re
@@ -60,21 +61,17 @@ def resolve_parameter(name: str, caller_id: str) -> str:
     return _resolve(name, caller_id, _PARAMETER)
 
 
-def check_caller_id(caller_id: str) -> str:
-    """Return `caller_id` unchanged; raises `InvalidNameError` unless it is a canonical global name."""
-    if len(caller_id) > MAX_NAME_LENGTH or _CANONICAL.match(caller_id) is None:
-        raise InvalidNameError(
-            f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
-            f"with letters, digits and '_', no '//', no '/' at the end, at most {MAX_NAME_LENGTH} characters"
-        )
-    return caller_id
+def canonical_caller_id(caller_id: str) -> str:
+    """Return the canonical form of a node's name (`/a/b` for `//a//b/`), as rospy and roscpp make it.
+
+    Raises `InvalidNameError` for any other text, such as a relative name.
+    """
+    return _canonical_id(caller_id, _CANONICAL)
 
 
-def check_tool_id(caller_id: str) -> str:
-    """Check the id of a caller that need not be a node, such as `/rosparam-4711`."""
-    if len(caller_id) > MAX_NAME_LENGTH or _TOOL.match(caller_id) is None:
-        return check_caller_id(caller_id)
-    return caller_id
+def canonical_tool_id(caller_id: str) -> str:
+    """Return the canonical name of a caller that need not be a node, such as `/rosparam-4711`."""
+    return _canonical_id(caller_id, _TOOL)
 
 
 def is_global_name(name: str) -> bool:
@@ -114,7 +111,7 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
         resolved = name
     else:
         if caller_id:
-            check_tool_id(caller_id)
+            caller_id = canonical_tool_id(caller_id)
         resolved = f"{caller_id}/{name[1:]}" if first == "~" else namespace(caller_id) + name
         if len(resolved) > MAX_NAME_LENGTH or grammar.match(resolved) is None:
             raise InvalidNameError(
@@ -123,6 +120,19 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
     if "//" in resolved:
         resolved = _SLASHES.sub("/", resolved)
     return resolved.rstrip("/") or "/"
+
+
+def _canonical_id(caller_id: str, grammar: re.Pattern[str]) -> str:
+    if len(caller_id) <= MAX_NAME_LENGTH:
+        if grammar.match(caller_id) is not None:
+            return caller_id
+        folded = _SLASHES.sub("/", caller_id).removesuffix("/")
+        if grammar.match(folded) is not None:
+            return folded
+    raise InvalidNameError(
+        f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
+        f"with letters, digits and '_', at most {MAX_NAME_LENGTH} characters"
+    )
 
 
 def _refusal(name: str, grammar: re.Pattern[str]) -> str:

@@ -126,9 +126,9 @@ class Conversation:
         call = self._call(host, name, method, rest)
         answer = await self.parts.ask(*call, host="127.0.0.1" if own else host, own=own)
         self._names |= {
-            node.key: name
+            node.key: "".join([node.name, *name.partition(":")[1:]])
             for node in self.parts.registry.all()
-            if node.key not in self._names and node.name == call[1]
+            if node.key not in self._names
         }
         assert isinstance(answer, list)
         if method in _QUESTIONS and answer[0] == 1:

@@ -4,7 +4,8 @@
 that carries out the call. mypy checks that the parameters of the method fit the row.
 
 Before a decision, each parameter is converted to its canonical value: a name is resolved as in the ROS master, a URI
-is parsed. An invalid value raises a `PeerError` that names the parameter, as the ROS master's validators do.
+is parsed. The caller's name becomes canonical, too, because some client libraries send `//name`. An invalid value
+raises a `PeerError` that names the parameter, as the ROS master's validators do.
 """
 
 import enum
@@ -19,7 +20,7 @@ from appliance.policy.model import Category, Decision, Request, text_for_caller
 from appliance.policy.rights import request_of
 from roswire import names
 from roswire.errors import InvalidNameError, PeerError, ProtocolError
-from roswire.names import check_caller_id, check_tool_id
+from roswire.names import canonical_caller_id, canonical_tool_id
 from roswire.uris import parse_node_uri, parse_service_uri
 from roswire.xmlrpc import Value
 
@@ -278,9 +279,9 @@ class RosCall(Generic[S]):
         if not isinstance(caller_id, str):
             raise ProtocolError("caller_id must be a string")
         if self.identity is Identity.NODE:
-            check_caller_id(caller_id)
+            caller_id = canonical_caller_id(caller_id)
         elif caller_id or self.verb not in {CallVerb.READ, CallVerb.CONNECT}:
-            check_tool_id(caller_id)
+            caller_id = canonical_tool_id(caller_id)
         arguments = canonicalise(self.method.parameters, caller_id, given)
         return Attempt(caller.as_named(caller_id), self, arguments)
 

@@ -11,7 +11,7 @@ from appliance.channel.messages.relay_link import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
 from appliance.relay.grant_table import GrantTable
 from roswire.errors import InvalidNameError
-from roswire.names import check_tool_id
+from roswire.names import canonical_tool_id
 
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 
@@ -34,7 +34,7 @@ def flaw(fields: Mapping[str, str], rest: bytes) -> str:
                 if field not in fields:
                     return f"Missing required '{field}' field"
             try:
-                check_tool_id(fields["callerid"])
+                canonical_tool_id(fields["callerid"])
             except InvalidNameError as error:
                 return str(error)
             if kind == "topic" and rest:

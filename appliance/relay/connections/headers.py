@@ -6,6 +6,9 @@ dropped, because no rule decides on them.
 
 from collections.abc import Mapping
 
+from roswire.errors import InvalidNameError
+from roswire.names import canonical_tool_id
+
 _OF_CLIENT = ("md5sum", "type", "tcp_nodelay", "request_type", "response_type")
 _SWITCHES = ("persistent", "probe")
 _OF_SERVICE = ("md5sum", "type", "request_type", "response_type")
@@ -21,6 +24,14 @@ _LONGEST = 1024
 def kept(fields: Mapping[str, str]) -> dict[str, str]:
     """Return the fields of a peer's header that are kept while it is connected."""
     return _known(fields, _OF_PEER)
+
+
+def canonical(fields: dict[str, str]) -> dict[str, str]:
+    """Return a peer's header with the canonical form of its name, under which control has granted what it asks for."""
+    try:
+        return {**fields, "callerid": canonical_tool_id(fields.get("callerid", ""))}
+    except InvalidNameError:
+        return fields  # admission refuses it, with the reason
 
 
 def too_long(fields: Mapping[str, str]) -> str:

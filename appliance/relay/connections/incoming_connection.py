@@ -11,6 +11,7 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
+from appliance.relay.connections.headers import canonical
 from appliance.relay.connections.pending_connections import PendingConnections
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import EventLoop
@@ -92,7 +93,7 @@ class IncomingConnection:
             self._failed(self, f"its header cannot be read: {error}")
             return
         if fields is not None:
-            self.fields, self.rest = fields, self._parser.rest
+            self.fields, self.rest = canonical(fields), self._parser.rest
             self._introduced(self)
 
     def _late(self) -> None:

@@ -135,9 +135,9 @@ def test_refusal_names_the_character_and_its_place() -> None:
         names.resolve("/" + "a" * 2000, "/talker")
 
 
-@pytest.mark.parametrize("caller_id", ["talker", "//talker", "/talker/", "/", "~a", "/a b", "/\u0430"])
+@pytest.mark.parametrize("caller_id", ["talker", "/", "~a", "/a b", "/\u0430"])
 def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
-    """A caller_id that is not canonical can only resolve global names."""
+    """A caller_id that is not a global name can only resolve global names."""
     for name in ("chatter", "~chatter"):
         with pytest.raises(InvalidNameError):
             names.resolve(name, caller_id)
@@ -146,15 +146,15 @@ def test_relative_names_need_a_valid_caller(caller_id: str) -> None:
 
 def test_tools_with_a_hyphen_resolve_what_is_a_name() -> None:
     """`/rosparam-4711` may use relative names; only a parameter may keep the hyphen."""
-    assert names.check_tool_id("/rosparam-4711") == "/rosparam-4711"
+    assert names.canonical_tool_id("/rosparam-4711") == "/rosparam-4711"
     assert names.resolve("chatter", "/rosparam-4711") == "/chatter"
     assert names.resolve_parameter("~a", "/rosparam-4711") == "/rosparam-4711/a"
     for caller_id in ("/rosparam-4711", "/a-b/tool"):
         with pytest.raises(InvalidNameError, match=r"character .* is '-'"):
             names.resolve("~a" if caller_id != "/a-b/tool" else "a", caller_id)
-    for caller_id in ("", "/", "tool-1", "/tool 1", "/tool-1/", "//tool-1", "/t-\u0430", "/" + "a-" * 600):
+    for caller_id in ("", "/", "tool-1", "/tool 1", "/t-\u0430", "/" + "a-" * 600):
         with pytest.raises(InvalidNameError):
-            names.check_tool_id(caller_id)
+            names.canonical_tool_id(caller_id)
 
 
 def test_a_name_may_not_grow_too_long() -> None:
@@ -212,17 +212,30 @@ def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
 @pytest.mark.parametrize("caller_id", ["/a", "/a/b", "/rostopic_4_1699999999999", "/_a", "/1"])
 def test_caller_id_is_returned_unchanged(caller_id: str) -> None:
     """A canonical global name is returned as it is."""
-    assert names.check_caller_id(caller_id) is caller_id
+    assert names.canonical_caller_id(caller_id) is caller_id
 
 
 @pytest.mark.parametrize(
-    "caller_id", ["", "/", "a", "~a", "//a", "/a//b", "/a/", "/a\n", "/a b", "/\u0430", "/" + "a" * 1024]
+    "caller_id",
+    ["", "/", "//", "a", "~a", "a//b", "/a\n", "/a/\n", "/a b", "//a-b", "/\u0430", "/" + "a" * 1024],
 )
-def test_caller_id_must_be_canonical(caller_id: str) -> None:
-    """rosmaster uses a caller_id unchanged, so one with another spelling is refused."""
+def test_caller_id_must_be_a_global_name(caller_id: str) -> None:
+    """Nothing else has a canonical form."""
     with pytest.raises(InvalidNameError, match="caller_id"):
-        names.check_caller_id(caller_id)
+        names.canonical_caller_id(caller_id)
     assert not names.is_global_name(caller_id)
+
+
+@pytest.mark.parametrize(
+    ("caller_id", "canonical"),
+    [("//a", "/a"), ("/ns//a", "/ns/a"), ("/a/", "/a"), ("///ns///a//", "/ns/a"), ("/" * 1000 + "a", "/a")],
+)
+def test_caller_id_is_folded_as_by_rospy_and_roscpp(caller_id: str, canonical: str) -> None:
+    """rosgo sends `//name`, where rospy and roscpp would send `/name`; relative names resolve against that one."""
+    assert names.canonical_caller_id(caller_id) == names.canonical_tool_id(caller_id) == canonical
+    assert names.resolve("x", caller_id) == names.resolve("x", canonical)
+    assert names.resolve("~x", caller_id) == f"{canonical}/x"
+    assert names.canonical_tool_id("//rosparam-4711/") == "/rosparam-4711"
 
 
 def test_namespace_and_join_are_inverse() -> None:

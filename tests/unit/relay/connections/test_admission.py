@@ -11,6 +11,7 @@ from appliance.channel.messages import (
     ServicePlaced,
 )
 from appliance.relay.connections.admission import asked_for, bound_name, flaw, missing
+from appliance.relay.connections.headers import canonical
 from appliance.relay.grant_table import GrantTable
 
 TOPIC = {"topic": "/chatter", "md5sum": "*", "callerid": "/listener"}
@@ -57,11 +58,18 @@ def test_the_reason_says_what_is_missing_until_nothing_is() -> None:
 
 
 @pytest.mark.parametrize("kind", [TOPIC, SERVICE])
-@pytest.mark.parametrize("name", ["", "listener", "/a\nb", "//a", "/a/", "/" + "a" * 2000, "/é"])
+@pytest.mark.parametrize("name", ["", "listener", "/", "/a\nb", "/" + "a" * 2000, "/é"])
 def test_an_invalid_callerid_is_refused(kind: dict[str, str], name: str) -> None:
     """A peer must send a global name before the relay looks up or sends anything."""
     assert "caller_id" in flaw(kind | {"callerid": name}, b"")
     assert flaw(kind | {"callerid": "/rosservice-4711"}, b"") == ""
+
+
+def test_a_peer_has_the_canonical_form_of_its_name() -> None:
+    """A grant has the canonical name; rosgo's peers send `//name`. An invalid name stays as it is, to be refused."""
+    assert canonical(TOPIC | {"callerid": "//listener/"}) == TOPIC | {"callerid": "/listener"}
+    assert canonical(SERVICE | {"callerid": "listener"}) == SERVICE | {"callerid": "listener"}
+    assert canonical({"topic": "/chatter"}) == {"topic": "/chatter"}
 
 
 def test_a_client_calls_under_the_name_of_its_lookup() -> None:
