@@ -17,6 +17,7 @@ from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
+from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.own_topic import OwnTopicPublisher
@@ -235,11 +236,27 @@ class DataPlane:
             relayed.monitor(None, wanted=True)
         else:
             publisher = PublisherConnection(
-                self._context, relayed, lambda header: self.interceptor.objection(topic, header)
+                self._context,
+                relayed,
+                Introductions(lambda: self._claims(relayed), lambda: self._registered_type(key, topic)),
+                lambda header: self.interceptor.objection(topic, header),
             )
             relayed.upstream = publisher
             self._attach_monitors(relayed)
         self.topics[key, topic] = (relayed, publisher)
+
+    def _claims(self, relayed: RelayedTopic) -> Iterator[Mapping[str, str]]:
+        """Yield the types that a topic may have: by its publisher's last header, specifications, subscribers."""
+        if relayed.header is not None:
+            yield relayed.header
+        yield self.interceptor.claim_of(relayed.topic)
+        for member in relayed.members:
+            if isinstance(member, Subscriber):
+                yield member.fields
+
+    def _registered_type(self, key: str, topic: str) -> str:
+        publication = self._table.publication(key, topic)
+        return "" if publication is None else publication.type
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
         relayed, _publisher = self.topics[message.key, message.topic]

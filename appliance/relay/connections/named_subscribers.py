@@ -8,6 +8,7 @@ names of a host get such a connection. The relay opens it after it has begun to 
 gets everything that the publisher sends from then on.
 """
 
+from collections.abc import Mapping
 from functools import partial
 
 from appliance.relay.context import RelayContext
@@ -34,12 +35,13 @@ class NamedSubscribers:
         self._host = host
         self._wanted: frozenset[str] = frozenset()
         self._address: tuple[str, int] | None = None
+        self._accepted: Mapping[str, str] = {}
         self._streams: dict[str, BufferedSocket] = {}
         self._retry: LoopTimer | None = None
 
-    def update(self, names: frozenset[str], address: tuple[str, int]) -> None:
-        """Set the subscribers that are served now, and the address of the publisher."""
-        self._wanted, self._address = names, address
+    def update(self, names: frozenset[str], address: tuple[str, int], accepted: Mapping[str, str]) -> None:
+        """Set the subscribers that are served now, the publisher's address, and the type that it has accepted."""
+        self._wanted, self._address, self._accepted = names, address, accepted
         for name in [stream for stream in self._streams if stream not in names]:
             self._streams.pop(name).close()
         self._open_missing()
@@ -74,7 +76,7 @@ class NamedSubscribers:
             )
 
     def _connected(self, name: str) -> None:
-        fields = {"callerid": name, "topic": self._topic, "type": "*", "md5sum": "*", "tcp_nodelay": "1"}
+        fields = {"callerid": name, "topic": self._topic, **self._accepted, "tcp_nodelay": "1"}
         self._streams[name].send(encode_header(fields))
 
     def _received(self, name: str, data: bytes) -> None:

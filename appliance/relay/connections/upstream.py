@@ -4,6 +4,9 @@
       ^               |                          |                        |                  |
       +---linger------+------ refused, failed, lost: wait (doubling), then ask again --------+
 
+A publisher that turns the relay's header away is asked again at once with another header, while there is one
+(`introductions`).
+
 A `PublisherConnection` tries again while the topic is wanted. The wait doubles after each failure, including a
 publisher that sends its header and then closes the connection or breaks the protocol. A connection that flowed for more
 than `retry_longest` seconds resets the wait.
@@ -16,6 +19,7 @@ from collections.abc import Callable
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay_link import Violation
 from appliance.relay.connections.headers import size_of
+from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.named_subscribers import NamedSubscribers, looks_for_names
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.context import RelayContext
@@ -38,6 +42,7 @@ class PublisherConnection(Upstream):
         self,
         context: RelayContext,
         topic: RelayedTopic,
+        introductions: Introductions,
         objection: Callable[[dict[str, str]], str] = lambda _header: "",
     ) -> None:
         self._loop = context.loop
@@ -77,6 +82,8 @@ class PublisherConnection(Upstream):
         self._address = ("", 0)
         self._header: dict[str, str] = {}
         self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
+        self._introductions = introductions
+        self._introduced = False  # whether this connection was sent the header
         self._objection = objection
         self._objected = ""
 
@@ -119,6 +126,7 @@ class PublisherConnection(Upstream):
             self._lose(f"cannot connect to {host}:{port}: {error}")
             return
         self._parser = HeaderParser(self._limits.header_bytes)
+        self._introduced = False
         self._stream = BufferedSocket(
             self._loop,
             sock,
@@ -178,24 +186,24 @@ class PublisherConnection(Upstream):
 
     def _show(self, names: frozenset[str]) -> None:
         self._announcing = None
-        self._named_subscribers.update(names, self._address)
+        self._named_subscribers.update(names, self._address, self._introductions.fields)
 
     def _connected(self) -> None:
         fields = {
             "callerid": _CALLER_ID,
             "topic": self._topic.topic,
-            "type": "*",
-            "md5sum": "*",
+            **self._introductions.fields,
             "tcp_nodelay": "1",
         }
         if self._stream is not None:
+            self._introduced = True
             self._stream.send(encode_header(fields))
 
     def _header_received(self, data: bytes) -> None:
         if self._stream is None:
             return
         if not data:
-            self._lose("the publisher closed the connection before its header")
+            self._turned_away("the publisher closed the connection before its header")
             return
         try:
             header = self._parser.feed(data)
@@ -205,6 +213,9 @@ class PublisherConnection(Upstream):
         if header is None:
             return
         size = size_of(header)
+        if "error" in header:
+            self._turned_away(f"the publisher says: {header['error']}", "connection refused")
+            return
         refusal = _refusal(header) or self._no_room(size)
         if refusal is not None:
             self._lose(*refusal)
@@ -254,6 +265,7 @@ class PublisherConnection(Upstream):
         self._stream = None
         self._socket = sock
         self._objected = ""
+        self._introductions.accepted()
         self._flowing = self._clock()
         self._set_timer(0, None)
         self._loop.watch(sock.fileno(), READ, self._ready, self._payer, self._pumped)
@@ -395,7 +407,16 @@ class PublisherConnection(Upstream):
             self._take(count)
 
     def _broken(self, reason: str) -> None:
-        self._lose(f"no connection to the publisher: {reason}")
+        lose = self._turned_away if self._introduced else self._lose
+        lose(f"no connection to the publisher: {reason}")
+
+    def _turned_away(self, reason: str, violation: Violation = "") -> None:
+        """Ask again with another header; lose the publisher if it has turned all of them away."""
+        if self._introductions.refused():
+            self._drop_connection()
+            self.ask()
+        else:
+            self._lose(reason, violation)
 
     def _late(self, reason: str) -> Callable[[], None]:
         return lambda: self._lose(f"{reason} within {self._limits.connect_seconds:g} s")
@@ -449,8 +470,6 @@ class PublisherConnection(Upstream):
 
 def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
     """Return why a publisher's header is rejected, and the kind of violation."""
-    if "error" in header:
-        return f"the publisher says: {header['error']}", "connection refused"
     missing = [field for field in ("type", "md5sum") if field not in header]
     if missing:
         return f"the publisher's header lacks the field {missing[0]}", "malformed"

@@ -272,13 +272,17 @@ class Interceptor:
         """Return the connection header, without names, for a topic that monitors publish; None for other topics."""
         if self.monitors is None or topic not in self.monitors.publications:
             return None
-        name = self.monitors.publications[topic]
-        return {
-            "type": name,
-            "md5sum": self.monitors.md5sum(name),
-            "message_definition": self.monitors.definitions.full_text(name),
-            "latching": "0",
-        }
+        return {**self._claim(self.monitors, self.monitors.publications[topic]), "latching": "0"}
+
+    def claim_of(self, topic: str) -> dict[str, str]:
+        """Return the type of a topic by the specifications, with md5sum and definition; empty if they name none."""
+        name = self.monitors.type_of(topic, shadowed=True) if self.monitors is not None else None
+        return {} if self.monitors is None or name is None else self._claim(self.monitors, name)
+
+    @staticmethod
+    def _claim(monitors: MonitorSet, name: str) -> dict[str, str]:
+        definition = monitors.definitions.full_text(name)
+        return {"type": name, "md5sum": monitors.md5sum(name), "message_definition": definition}
 
     # --- kept state ---
 

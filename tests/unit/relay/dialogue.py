@@ -4,7 +4,7 @@ Steps (`Dialogue.say`): a word with `=` is an equal field, a word with `~` a fie
 
     listener asks callerid=/x | client calls            a peer connects with a header
     talker publishes latching=1 | server serves         a peer accepts the relay's connection and answers with a header
-    server accepts                                      the same without an answer
+    server accepts | talker accepts-relay               the same without an answer
     talker sends one two*3 | talker pushes x^9000       frames (`x^9000` is nine thousand times x); `pushes` if large
     client sends hex:01 | server sends reply:hex:01     a frame of these bytes, the reply of a service
     x sends-header callerid=/x | talker sends-half one  a header of these fields alone, the first half of a frame
@@ -37,7 +37,7 @@ from typing import Any, ClassVar
 from appliance.channel import messages
 from appliance.channel.messages import Message
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
-from tests.unit.relay.world import ASK, CALL, HEADER, Peer, World
+from tests.unit.relay.world import ASK, CALL, HEADER, LOOPBACK, Peer, World
 
 
 class Dialogue:
@@ -97,6 +97,12 @@ class Dialogue:
 
     def _peer_accepts(self, who: str) -> None:
         self.peers[who] = self.world.accept(self.world.service)
+
+    def _peer_accepts_relay(self, who: str) -> None:
+        self.world.hears(messages.UpstreamWanted)
+        where = self.world.publisher.getsockname()[1]
+        self.world.state(messages.UpstreamFound("k", "/chatter", LOOPBACK, where))
+        self.peers[who] = self.world.accept(self.world.publisher)
 
     def _peer_serves(self, who: str, *words: str) -> None:
         self._peer_accepts(who)

@@ -250,7 +250,8 @@ def test_a_publisher_that_cannot_be_reached_is_asked_for_again(world: World) -> 
     silent = world.accept(world.publisher)
     assert "no answer" in world.hears(UpstreamLost).reason
     world.ends(silent)
-    world.upstream({"error": "not a publisher of it" + 2000 * "!"})
+    for md5sum in ("*", ASK["md5sum"], "*"):
+        world.upstream({"error": "not a publisher of it" + 2000 * "!"}, md5sum)
     refused = world.hears(UpstreamLost)
     assert "not a publisher of it" in refused.reason
     assert (len(refused.reason), refused.violation) == (1000, "connection refused")

@@ -259,13 +259,13 @@ class World:
         self.until(ended)
         return bytes(peer.data)
 
-    def upstream(self, header: dict[str, str] = HEADER) -> Peer:
+    def upstream(self, header: dict[str, str] = HEADER, md5sum: str = "*") -> Peer:
         """Answer the relay's request for the publisher with this header; return the connection."""
         self.hears(UpstreamWanted, key="k", topic="/chatter")
         self.state(UpstreamFound("k", "/chatter", LOOPBACK, self.publisher.getsockname()[1]))
         peer = self.accept(self.publisher)
         asked = self.gets_header(peer)
-        assert (asked["topic"], asked["md5sum"], asked["callerid"]) == ("/chatter", "*", "/rosrv")
+        assert (asked["topic"], asked["md5sum"], asked["callerid"]) == ("/chatter", md5sum, "/rosrv")
         peer.send(encode_header(header))
         return peer
 

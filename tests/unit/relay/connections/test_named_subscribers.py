@@ -18,6 +18,7 @@ from appliance.relay.transport.memory import RelayMemory
 from roswire.tcpros import HeaderParser
 
 TOPIC = "/fibonacci/goal"
+ACCEPTED = {"type": "a/FibonacciActionGoal", "md5sum": "*"}
 
 
 @pytest.fixture
@@ -96,12 +97,12 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
 ) -> None:
     """Each name has one connection. When a subscriber leaves, its connection closes and the others stay."""
     address = publisher.getsockname()
-    presences.update(frozenset({"/one", "/other"}), address)
+    presences.update(frozenset({"/one", "/other"}), address, ACCEPTED)
     seen = dict(
         sorted((header["callerid"], sock) for sock, header in (accept(loop, publisher) for _ in "ab"))
     )
     assert list(seen) == ["/one", "/other"]
-    presences.update(frozenset({"/other"}), address)
+    presences.update(frozenset({"/other"}), address, ACCEPTED)
     turn_until(loop, lambda: ended(seen["/one"]))
     assert not ended(seen["/other"])
     for sock in seen.values():
@@ -113,7 +114,7 @@ def test_a_presence_that_breaks_is_made_again(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
     """If the publisher closes the connection, it is opened again under the same name."""
-    presences.update(frozenset({"/one"}), publisher.getsockname())
+    presences.update(frozenset({"/one"}), publisher.getsockname(), ACCEPTED)
     first, _header = accept(loop, publisher)
     first.close()
     second, header = accept(loop, publisher)

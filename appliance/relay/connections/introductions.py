@@ -1,0 +1,58 @@
+"""The header with which the relay introduces itself to a publisher: any type first, then those that may be meant.
+
+The relay passes on any type, so it asks for `type=*`, `md5sum=*`. rospy and roscpp accept that; rosgo, roslibrust up to
+0.9 and many nodes written by hand accept only their own type and md5sum, and some demand a `message_definition`. They
+refuse with an error header, or just close the connection. The relay then introduces itself again, at once, with each
+claim that it knows. The first accepted header is used for all later connections to the publisher.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from itertools import islice
+
+_ANY = "*"
+_MOST = 8  # claims that one publisher is asked with; subscribers choose them
+
+
+class Introductions:
+    """The header fields for the next connection to one publisher.
+
+    `claims` returns known fields `type`, `md5sum` and `message_definition`, the most likely ones first; `registered`
+    returns the type that the publisher has registered, which replaces an unknown one.
+    """
+
+    def __init__(
+        self, claims: Callable[[], Iterable[Mapping[str, str]]], registered: Callable[[], str]
+    ) -> None:
+        self._claims = claims
+        self._registered = registered
+        self._refused: set[tuple[str, str, bool]] = set()
+        self.fields: Mapping[str, str] = {"type": _ANY, "md5sum": _ANY}
+
+    def refused(self) -> bool:
+        """Choose the next fields; return False if all are refused, after which the first ones are next again."""
+        self._refused.add(_key(self.fields))
+        named = (claim for claim in self._claims() if _named(claim, "md5sum"))
+        for claim in (*islice(named, _MOST), {}):
+            fields = {
+                "type": _named(claim, "type") or self._registered() or _ANY,
+                "md5sum": _named(claim, "md5sum") or _ANY,
+                "message_definition": claim.get("message_definition", ""),
+            }
+            if _key(fields) not in self._refused:
+                self.fields = fields
+                return True
+        self._refused.clear()
+        self.fields = {"type": _ANY, "md5sum": _ANY}
+        return False
+
+    def accepted(self) -> None:
+        """Keep these fields for later connections."""
+        self._refused.clear()
+
+
+def _named(claim: Mapping[str, str], field: str) -> str:
+    return claim.get(field, "").replace(_ANY, "")
+
+
+def _key(fields: Mapping[str, str]) -> tuple[str, str, bool]:
+    return fields["type"], fields["md5sum"], "message_definition" in fields
