@@ -213,12 +213,10 @@ class PublisherConnection(Upstream):
         if header is None:
             return
         size = size_of(header)
-        if "error" in header:
-            self._turned_away(f"the publisher says: {header['error']}", "connection refused")
-            return
         refusal = _refusal(header) or self._no_room(size)
         if refusal is not None:
-            self._lose(*refusal)
+            end = self._turned_away if "error" in header else self._lose
+            end(*refusal)
             return
         reason = self._objection(header)
         if reason:
@@ -470,6 +468,8 @@ class PublisherConnection(Upstream):
 
 def _refusal(header: dict[str, str]) -> tuple[str, Violation] | None:
     """Return why a publisher's header is rejected, and the kind of violation."""
+    if "error" in header:
+        return f"the publisher says: {header['error']}", "connection refused"
     missing = [field for field in ("type", "md5sum") if field not in header]
     if missing:
         return f"the publisher's header lacks the field {missing[0]}", "malformed"
