@@ -96,6 +96,15 @@ def namespace(name: str) -> str:
     return name[: name.rstrip("/").rfind("/") + 1] or "/"
 
 
+def searched(key: str, caller_id: str) -> list[str]:
+    """Return the parameters that `searchParam` tries, in order: in the caller's namespaces, from its own upwards."""
+    if key.startswith("/"):
+        return [resolve_parameter(key, caller_id)]
+    levels = [part for part in caller_id.split("/") if part]
+    rest = [part for part in key.split("/") if part]
+    return ["/" + "/".join(levels[:depth] + rest) for depth in range(len(levels), -1, -1)]
+
+
 def join(namespace: str, name: str) -> str:
     """Return `name` in `namespace`. A global or private name stays unchanged."""
     if name.startswith(("/", "~")) or not namespace:

@@ -154,6 +154,7 @@ async def make_foundation(
         robot=robot_addresses(settings, pair.membership.witness if pair is not None else None),
         hosts=lambda: tunnels().addresses,
         blocks=lambda: blocks.reasons,
+        live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,

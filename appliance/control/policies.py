@@ -9,7 +9,7 @@ change is answered once it is on disk and the relays have carried it out: revoke
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -34,6 +34,7 @@ from appliance.control.policy_gate import (
 )
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import PolicyContext
+from appliance.policy.live_rights import LiveRight, deprived
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
@@ -43,6 +44,7 @@ from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
+_SHOWN_NODES = 3
 
 
 class PolicyCases(NamedTuple):
@@ -79,6 +81,7 @@ class Policies(Revisions[RevisionRow]):
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
         blocks: Callable[[], Mapping[Address, str]],
+        live: Callable[[], Iterable[LiveRight]],
         changed: Callable[[Policy, Policy], int],
         carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
@@ -86,7 +89,8 @@ class Policies(Revisions[RevisionRow]):
         """Prepare; `start` brings a policy into force.
 
         `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
-        returns the blocked hosts (`Policy.blocks`); the owner calls `blocks_changed` when they change.
+        returns the blocked hosts (`Policy.blocks`); the owner calls `blocks_changed` when they change. `live()` returns
+        the live rights of all hosts.
         `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
         waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
         """
@@ -97,6 +101,7 @@ class Policies(Revisions[RevisionRow]):
         self._robot = robot
         self._hosts = hosts
         self._blocks = blocks
+        self._live = live
         self._changed = changed
         self._carried_out = carried_out
         self._site_keys = site_keys
@@ -328,6 +333,7 @@ class Policies(Revisions[RevisionRow]):
         self.file_refused = ""
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
+        lost = [] if self._current is None else _losses(policy, self._live())
         self._put_in_force(row, within)
         revoked = self._enforce(policy)
         self._trail.happened(
@@ -338,18 +344,32 @@ class Policies(Revisions[RevisionRow]):
             sha256=fingerprint(policy.text),
             signed_by=signer(self._site_keys, policy.text, signature),
             revoked=revoked,
-            warnings=[str(warning) for warning in policy.warnings][:100],
+            warnings=[*lost, *map(str, policy.warnings)][:100],
         )
-        return self._loaded(before, revoked)
+        return self._loaded(before, revoked, lost)
 
     def _enforce(self, policy: Policy) -> int:
         before, self._current = self._current, replace(policy, blocks=dict(self._blocks()))
         self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, self._current)
 
-    def _loaded(self, before: int, revoked: int) -> Loaded:
-        warnings = [str(warning) for warning in self.current.warnings]
+    def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
+        warnings = [*lost, *map(str, self.current.warnings)]
         return Loaded(self.revision, before, warnings, revoked, self.confirm_by)
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who=UNCONFIRMED)
+
+
+def _losses(policy: Policy, live: Iterable[LiveRight]) -> list[str]:
+    """Return a warning for each host with nodes that keeps none of its rights under this policy."""
+    return [
+        f"warning: {host} has nodes ({_some(nodes)}) and loses all its rights: if that is a mistake, "
+        "`rosrv policy rollback` and name the host in the policy"
+        for host, nodes in deprived(policy, live).items()
+    ]
+
+
+def _some(names: Collection[str]) -> str:
+    more = f" and {len(names) - _SHOWN_NODES} more" if len(names) > _SHOWN_NODES else ""
+    return ", ".join(sorted(names)[:_SHOWN_NODES]) + more

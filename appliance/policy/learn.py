@@ -1,10 +1,12 @@
 """Learn a least-privilege policy from the recorded decisions of a robot.
 
 Run the robot with `audit-only = all`, then learn from the recorded decisions. Each used right is granted to the hosts
-that used it; nothing else is granted. Two keys are wider than observed, because the next run needs them:
+that used it; nothing else is granted. Three keys are wider than observed, because the next run needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
-2. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
+2. `searchParam` needs the right to find every parameter that it tries, whether it is found or not: the next run may
+   have it, and a search without that right is denied.
+3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
    right on every parameter in it. So a host that may access a namespace may also access narrower keys in it.
 
 The result is written for engineers: every line names the nodes that used the right, and how often. Hosts that occur
@@ -22,7 +24,7 @@ from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS
-from roswire.names import is_global_name
+from roswire.names import is_global_name, searched
 
 # The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
 _ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
@@ -75,11 +77,22 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
     return LearnedPolicy("".join(_text(_needful(rights), robot)), requests, left_out)
 
 
+def covered(given: Network, places: Iterable[Network]) -> bool:
+    """Whether all addresses of a network are among these places."""
+    # mypy does not see that both are of one version.
+    return any(given.version == place.version and given.subnet_of(place) for place in places)  # type: ignore[arg-type]
+
+
 def _needed(observation: Observation) -> Iterator[Request]:
     """Yield every right that this request needs. Raises `BadWordError` if no rule can grant the request."""
     for right in rights_of_call(observation.request, observation.call, observation.key or None):
         check_resource(right.request.category, right.request.resource)
         yield right.request
+    if observation.call == "searchParam":
+        request = observation.request
+        for name in searched(observation.key, request.caller_id):
+            check_resource(Category.READ, name)
+            yield Request(request.host, request.caller_id, Category.READ, name)
 
 
 def _key(request: Request) -> str:

@@ -67,6 +67,21 @@ def may_keep(policy: Policy, live: LiveRight) -> Decision:
     return decide(policy, rights_to_keep(request, live.call, live.resource, namespace=live.namespace))
 
 
+def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
+    """Return the hosts that have live rights and keep none of them under a policy, with the names of their nodes."""
+    lost: dict[Address, set[str]] = {}
+    kept: set[Address] = set()
+    for live in things:
+        if live.host in kept:
+            continue
+        if may_keep(policy, live).allowed:
+            kept.add(live.host)
+            lost.pop(live.host, None)
+        else:
+            lost.setdefault(live.host, set()).add(live.caller_id)
+    return lost
+
+
 def endings(policy: Policy, things: Iterable[LiveRight]) -> list[Ending]:
     """Return the live rights that the policy would end, without repetitions."""
     decided = ((live, may_keep(policy, live)) for live in things)

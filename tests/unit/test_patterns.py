@@ -202,8 +202,15 @@ def test_a_scalar_is_short(tag: str) -> None:
         XmlRpcDocument(body.encode(), XmlRpcLimits(), "methodCall")
 
 
-@pytest.mark.parametrize("check", [names.canonical_caller_id, names.canonical_tool_id, partial(names.resolve, caller_id="/a"),
-                                   partial(names.resolve_parameter, caller_id="/a")])  # fmt: skip
+@pytest.mark.parametrize(
+    "check",
+    [
+        names.canonical_caller_id,
+        names.canonical_tool_id,
+        partial(names.resolve, caller_id="/a"),
+        partial(names.resolve_parameter, caller_id="/a"),
+    ],
+)
 def test_a_name_is_measured_before_it_is_matched(
     check: Callable[[str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,8 +16,9 @@ from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
-from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
-from appliance.policy.learn import LearnedPolicy, Observation, learn
+from appliance.cli.policy.policy_input import Robot, networks_of, request_of, running_robot, usage_error
+from appliance.policy.host_sets import Network
+from appliance.policy.learn import LearnedPolicy, Observation, covered, learn
 from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
@@ -41,16 +42,18 @@ def learn_policy(
 ) -> None:
     """Write a policy that grants the requests in the audit log and no others.
 
-    Run the robot with `audit-only = all` below [Options] first. Exit status 1 if the log has no requests.
+    Run the robot with `audit-only = all` below [Options] first. Exit status 1 if the log has no requests. An address
+    given with --robot that is not the robot of the running appliance (`rosrv policy show`) is written as an address.
 
-    Example: rosrv policy learn --state /var/lib/rosrv --robot 192.168.1.10 --output learned.ini
+    Example: rosrv policy learn --state /var/lib/rosrv --output learned.ini
     """
-    learned = learn(_observations(appliance, since), networks_of(robot))
+    members = _members(appliance, networks_of(robot))
+    learned = learn(_observations(appliance, since), members)
     if not learned.requests:
         start = f" since {since}" if since is not None else ""
         hint = "run the robot with `audit-only = all` below [Options] first"
         raise refused([f"rosrv: the audit log has no allowed requests{start}: {hint}"])
-    _check(learned, robot)
+    _check(learned, members)
     if output is not None:
         _write(output, learned.text)
     if appliance.as_json:
@@ -81,9 +84,28 @@ def _observations(appliance: Appliance, since: str | None) -> Iterator[Observati
         raise usage_error(str(error)) from error
 
 
-def _check(learned: LearnedPolicy, robot: list[str] | None) -> None:
+def _members(appliance: Appliance, robot: list[Network]) -> list[Network]:
+    """Return the addresses that are the running appliance's group `robot`; report the others, which stay addresses."""
     try:
-        compile_policy(learned.text, file="learned", robot=networks_of(robot))
+        own = running_robot(appliance) if robot else []
+    except NotRunningError:
+        return robot
+    members = [given for given in robot if covered(given, own)]
+    group = ", ".join(map(_shown, own)) or "empty"
+    for other in robot:
+        if other not in members:
+            text = f"rosrv: {_shown(other)} stays an address: the group robot of this appliance is {group}"
+            typer.echo(text, err=True)
+    return members
+
+
+def _shown(place: Network) -> str:
+    return str(place.network_address) if place.num_addresses == 1 else str(place)
+
+
+def _check(learned: LearnedPolicy, robot: list[Network]) -> None:
+    try:
+        compile_policy(learned.text, file="learned", robot=robot)
     except PolicyError as error:
         what = "rosrv: the learned policy is invalid (see above): write rules for these names by hand"
         raise refused([*error.findings, what]) from error

@@ -93,6 +93,12 @@ def policy_in_force(
     return body.text, body.file, known_of(robot, enrolled, known)
 
 
+def running_robot(appliance: Appliance) -> list[Network]:
+    """Return the group `robot` of the running appliance. Raises `NotRunningError`."""
+    body = appliance.ask(PolicyWanted()).given() if appliance.place is None else _over_rest(appliance)
+    return [canonical_network(ipaddress.ip_network(place)) for place in body.robot]
+
+
 def _over_rest(appliance: Appliance) -> PolicyInForce:
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 

@@ -29,7 +29,7 @@ from appliance.policy.model import Address, Decision
 from appliance.rpc.bulk import weigh
 from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.errors import EncodingError, ProtocolError
-from roswire.names import resolve_parameter
+from roswire.names import searched
 from roswire.parameter_tree import names_in, standing_at
 from roswire.xmlrpc import Value
 
@@ -107,7 +107,7 @@ class ParameterCalls:
         """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
         if caller.own or not caller.caller_id:
             return await self.rosmaster.call(_SEARCH, caller.caller_id, key)
-        places = {name: self.rights.to_find(caller, name) for name in _places(key, caller.caller_id)}
+        places = {name: self.rights.to_find(caller, name) for name in searched(key, caller.caller_id)}
         hidden = [name for name, decision in places.items() if not decision.allowed]
         if key.startswith("/") and hidden:
             return [0, self.rights.recorded(caller, _SEARCH, hidden[0], places[hidden[0]]), ""]
@@ -236,15 +236,6 @@ def _is_set(answer: Answer, write: ParameterWrite) -> bool:
     subscriber to that key. The ROS master rejects only a root that is not a namespace.
     """
     return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
-
-
-def _places(key: str, caller_id: str) -> list[str]:
-    """Return the names that the ROS master's search tries, in order."""
-    if key.startswith("/"):
-        return [resolve_parameter(key, caller_id)]
-    namespace = [part for part in caller_id.split("/") if part]
-    rest = [part for part in key.split("/") if part]
-    return ["/" + "/".join(namespace[:depth] + rest) for depth in range(len(namespace), -1, -1)]
 
 
 def _found(answer: Answer) -> str | None:

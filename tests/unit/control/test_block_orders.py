@@ -84,6 +84,7 @@ class Control(ControlParts):
             robot=[ipaddress.ip_network(ROBOT)],
             hosts=dict,
             blocks=lambda: self.blocks.reasons,
+            live=list,
             changed=self.changed,
             carried_out=at_once,
             site_keys=(),

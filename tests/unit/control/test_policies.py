@@ -5,7 +5,7 @@ import contextlib
 import ipaddress
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from appliance.channel.admin import (
 from appliance.control.policies import Policies, RevisionChangedError
 from appliance.control.policy_gate import PolicyRefusedError
 from appliance.policy import judgement
+from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
 from appliance.store.state_file import StateStore
@@ -60,6 +61,7 @@ class Appliance:
         restarted: bool = False,
         hosts: Callable[[], Mapping[str, Address]] = dict,
         blocks: Callable[[], Mapping[Address, str]] = dict,
+        live: Callable[[], Iterable[LiveRight]] = list,
         changed: Callable[[Policy, Policy], int] = lambda _before, _policy: 0,
         site_keys: Sequence[str] = (),
     ) -> Iterator[Policies]:
@@ -73,6 +75,7 @@ class Appliance:
             robot=(),
             hosts=hosts,
             blocks=blocks,
+            live=live,
             changed=changed,
             carried_out=at_once,
             site_keys=site_keys,
@@ -114,6 +117,22 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Pa
 
 
 @pytest.mark.nightly
+async def test_a_reload_warns_of_hosts_that_lose_everything(tmp_path: Path) -> None:
+    """A host whose nodes keep none of their rights is named, with some nodes; one that keeps a right is not."""
+    appliance = Appliance(tmp_path)
+    robot, other = ipaddress.ip_address("192.168.1.10"), ipaddress.ip_address("10.0.0.2")
+    live = [LiveRight(robot, f"/n{number}", "registerPublisher", "/scan") for number in range(5)]
+    live += [LiveRight(other, "/ocu", "registerPublisher", topic) for topic in ("/scan", "/joy")]
+    with appliance.started(live=lambda: live) as policies:
+        assert (await policies.reload(PolicyReload(), "operator")).warnings == []
+        appliance.file.write_text(OPEN.replace("[Publishers]\n", "[Publishers]\n/scan =\n"))
+        loaded = await policies.reload(PolicyReload(), "operator")
+        assert [text for text in loaded.warnings if "loses" in text] == [
+            "warning: 192.168.1.10 has nodes (/n0, /n1, /n2 and 2 more) and loses all its rights: if that is a "
+            "mistake, `rosrv policy rollback` and name the host in the policy"
+        ]
+
+
 async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The note and the record have the author, but a reload by a signal has none; the text is the disk's."""
     with Appliance(tmp_path).started() as policies:

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.policy.commands import COMMANDS
-from appliance.policy.learn import LearnedPolicy, Observation, learn
+from appliance.policy.learn import LearnedPolicy, Observation, covered, learn
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -46,6 +46,36 @@ def test_only_observed_requests_are_granted() -> None:
         Request(host, "/joy", Category.WRITE, "/p"),
     ):
         assert not decide(policy, rights_of(request)).allowed, request
+
+
+def test_a_search_for_a_parameter_may_find_it_the_next_time() -> None:
+    """Every parameter that `searchParam` tries is granted, so that the search under the policy is not denied."""
+    learned = learn([
+        seen("10.0.0.1", Category.COMMAND, "searchParam", node="/arm/driver", call="searchParam", key="tf_prefix")
+    ])  # fmt: skip
+    policy = compiled(learned)
+    host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
+    for name in ("/arm/driver/tf_prefix", "/arm/tf_prefix", "/tf_prefix"):
+        assert policy.decide(Request(host, "/arm/driver", Category.READ, name)).allowed
+        assert not policy.decide(Request(other, "/arm/driver", Category.READ, name)).allowed
+    assert not policy.decide(Request(host, "/arm/driver", Category.READ, "/arm/gain")).allowed
+    assert not policy.decide(Request(host, "/arm/driver", Category.WRITE, "/tf_prefix")).allowed
+
+
+@pytest.mark.parametrize(
+    ("given", "robot", "expected"),
+    [
+        ("172.17.0.1/32", ["172.17.0.1/32"], True),
+        ("192.168.1.10/32", ["172.17.0.1/32"], False),
+        ("192.168.1.10/32", [], False),
+        ("10.0.0.0/30", ["10.0.0.0/24", "fd00::/8"], True),
+        ("10.0.0.0/16", ["10.0.0.0/24"], False),
+        ("::1/128", ["127.0.0.1/32", "::1/128"], True),
+    ],
+)
+def test_only_the_appliances_own_robot_is_its_group(given: str, robot: list[str], expected: bool) -> None:
+    """`robot` means other addresses in another appliance, so no other address may become the group."""
+    assert covered(ipaddress.ip_network(given), map(ipaddress.ip_network, robot)) == expected
 
 
 def test_anonymous_names_become_patterns() -> None:
