@@ -79,8 +79,10 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 def covered(given: Network, places: Iterable[Network]) -> bool:
     """Whether all addresses of a network are among these places."""
-    # mypy does not see that both are of one version.
-    return any(given.version == place.version and given.subnet_of(place) for place in places)  # type: ignore[arg-type]
+    return any(
+        given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
+        for place in places
+    )
 
 
 def _needed(observation: Observation) -> Iterator[Request]:

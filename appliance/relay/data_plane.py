@@ -17,7 +17,6 @@ from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
-from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.listening_ports import ListeningPorts
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.own_topic import OwnTopicPublisher
@@ -238,7 +237,8 @@ class DataPlane:
             publisher = PublisherConnection(
                 self._context,
                 relayed,
-                Introductions(lambda: self._claims(relayed), lambda: self._registered_type(key, topic)),
+                lambda: self._claims(relayed),
+                lambda: self._registered_type(key, topic),
                 lambda header: self.interceptor.objection(topic, header),
             )
             relayed.upstream = publisher

@@ -12,7 +12,7 @@ This module reads no clock and no socket. Its owner passes the time with each me
    off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
 4. An appliance that starts may have given a promise before, so it claims one expiry later.
 5. Only the witness makes epochs. An active appliance believes no other one that claims a later epoch: by 1 and 2 there
-   is none. A passive appliance believes it until the witness answers, and nobody who claims an epoch beyond `FARTHEST`.
+   is none. A passive appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
 6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
    It waits for the standby again before it asks the witness to add it.
 """

@@ -53,7 +53,7 @@ CHAIN = [
 
 def test_a_circle_ends_with_the_order() -> None:
     """Monitors that all listen to their own topic publish a finite tree: each message goes only further back."""
-    monitors = load(CHAIN[0], **dict(zip("yzuvw", CHAIN[1:], strict=True)))  # type: ignore[arg-type]
+    monitors = load(CHAIN[0], **dict(zip("yzuvw", CHAIN[1:], strict=True)))  # type: ignore[arg-type]  # the keys are names
 
     def count(outcome: Outcome) -> int:
         return len(outcome.published) + sum(map(count, outcome.judged.values()))

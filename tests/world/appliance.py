@@ -285,7 +285,7 @@ class Appliance:
         mine.send(messages.SocketsRestored(len(self.sockets), self._announced))
         config = self.state / "config.json"
         self.control.assembled = self._assembled
-        task = self.control.start(run_control(self.settings, its, config))  # type: ignore[arg-type]
+        task = self.control.start(run_control(self.settings, its, config))  # type: ignore[arg-type]  # a link in memory
         task.add_done_callback(self.world.done)
         self._link_relay()
         if self._lease_lifeline is not None and self.lease is not None:

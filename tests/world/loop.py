@@ -169,7 +169,7 @@ class WorldLoop(asyncio.BaseEventLoop):
         process = present_process()
         file.readable = lambda: process.run(act)
 
-    def remove_reader(self, file: Any) -> None:  # type: ignore[override]
+    def remove_reader(self, file: Any) -> None:  # type: ignore[override]  # wider than asyncio's
         """Do not call it any more."""
         file.readable = lambda: None
 
@@ -195,7 +195,7 @@ class WorldLoop(asyncio.BaseEventLoop):
         """Run some callbacks of one process; if none is ready, advance to the next timer."""
         self.steps += 1
         scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]  # asyncio's own
-        ready: deque[asyncio.Handle] = self._ready  # type: ignore[attr-defined]
+        ready: deque[asyncio.Handle] = self._ready  # type: ignore[attr-defined]  # typeshed leaves it out
         if not ready and not self._queues():
             while scheduled and scheduled[0].cancelled():
                 self._drop_timer()
@@ -206,7 +206,7 @@ class WorldLoop(asyncio.BaseEventLoop):
             ready.append(self._drop_timer())
         while ready:
             handle = ready.popleft()
-            process = handle._context.get(_process)  # type: ignore[attr-defined]
+            process = handle._context.get(_process)  # type: ignore[attr-defined]  # typeshed leaves it out
             if process is None:
                 process = self.outside
             if process.alive and not handle.cancelled():
@@ -233,7 +233,7 @@ class WorldLoop(asyncio.BaseEventLoop):
                 process.step()
 
     def _drop_timer(self) -> asyncio.TimerHandle:
-        scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
+        scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]  # typeshed leaves it out
         handle = heapq.heappop(scheduled)
-        handle._scheduled = False  # type: ignore[attr-defined]
+        handle._scheduled = False  # type: ignore[attr-defined]  # typeshed leaves it out
         return handle

@@ -4,7 +4,7 @@
 that carries out the call. mypy checks that the parameters of the method fit the row.
 
 Before a decision, each parameter is converted to its canonical value: a name is resolved as in the ROS master, a URI
-is parsed. The caller's name becomes canonical, too, because some client libraries send `//name`. An invalid value
+is parsed. The caller's name also becomes canonical, because some client libraries send `//name`. An invalid value
 raises a `PeerError` that names the parameter, as the ROS master's validators do.
 """
 

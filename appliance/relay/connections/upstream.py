@@ -14,7 +14,7 @@ than `retry_longest` seconds resets the wait.
 
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay_link import Violation
@@ -42,7 +42,8 @@ class PublisherConnection(Upstream):
         self,
         context: RelayContext,
         topic: RelayedTopic,
-        introductions: Introductions,
+        claims: Callable[[], Iterable[Mapping[str, str]]],
+        registered_type: Callable[[], str],
         objection: Callable[[dict[str, str]], str] = lambda _header: "",
     ) -> None:
         self._loop = context.loop
@@ -82,7 +83,7 @@ class PublisherConnection(Upstream):
         self._address = ("", 0)
         self._header: dict[str, str] = {}
         self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
-        self._introductions = introductions
+        self._introductions = Introductions(claims, registered_type)
         self._introduced = False  # whether this connection was sent the header
         self._objection = objection
         self._objected = ""

@@ -90,7 +90,7 @@ class StateKeeper:
         self._entries: list[_Entry] = []
         self._by_channel: dict[str, _Entry] = {}
         self.shift = 0
-        """What a takeover added to the clock of monitors, in nanoseconds; `continued` sets it."""
+        """The nanoseconds that a takeover added to the clock of monitors; `continued` sets them."""
 
     @property
     def offset(self) -> int:

@@ -29,8 +29,8 @@ def body(
 ) -> Measures:
     """Return a small answer of control."""
     meter = Meter()
-    meter.decided("publish", "deny", 0.0003)
-    meter.decided("publish", "deny", 99.0)
+    meter.decided("publish", "deny", 0.0003, "10.0.0.1")
+    meter.decided("publish", "deny", 99.0, "10.0.0.1")
     meter.called("getPid", 0.002)
     return example(
         Measures,

@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
-from appliance.channel.messages import Message, SpecificationsStated, SpecificationsTaken
+from appliance.channel.messages import Message, SpecificationsTaken
 from appliance.relay.loop import LoopTimer
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.observation_points import NOWHERE
 from rosmop.run.outcomes import Outcome
 from tests.support.stated import stated
@@ -17,10 +16,21 @@ class Timers:
 
     def __init__(self) -> None:
         self.due: list[tuple[float, LoopTimer]] = []
+        self._work: list[Callable[[], None]] = []
 
     def over(self) -> bool:
         """Whether the turn is over: never."""
         return False
+
+    def beside(self, work: Callable[[], Any], done: Callable[[Any], None]) -> "Timers":
+        """Leave the work to `finish`."""
+        self._work.append(lambda: done(work()))
+        return self
+
+    def finish(self) -> None:
+        """Do the work that was left."""
+        while self._work:
+            self._work.pop(0)()
 
     def after(self, seconds: float, callback: Callable[[], None]) -> LoopTimer:
         """Note a timer."""
@@ -49,6 +59,7 @@ class QuietMonitors:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []
         loop: Any = Timers()
+        self._finish = loop.finish
         reporter: Any = self.reports
         self.interceptor = Interceptor(
             loop,
@@ -57,18 +68,12 @@ class QuietMonitors:
             publish=publish or (lambda topic, data: self.published.append((topic, data))),
             changed=lambda _topics: None,
         )
-        self.interceptor._loader = self  # type: ignore[assignment]  # without its thread
-
-    busy = False
-
-    def later(self, message: SpecificationsStated) -> None:
-        """Load at once."""
-        self.interceptor.loaded(message, Loader.load(message, self.interceptor.holder_of))
 
     def load(self, *texts: str, **more: Any) -> SpecificationsTaken:
         """Load these files, and return the relay's answer."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
         self.interceptor.state(stated(1, files, {}, **more))
+        self._finish()
         answer = self.reports.sent[-1]
         assert isinstance(answer, SpecificationsTaken)
         return answer
