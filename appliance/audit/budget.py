@@ -3,7 +3,7 @@
 Each record is charged to its host, and the debt shrinks by `RATE` bytes a second. Only the calls of a host above its
 quota (`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller,
 and the last part of the reserve is kept for the robot and for hosts that the policy names. After a restart no host
-has a registration, so none is required. Unknown hosts are not charged: their denials are folded.
+has a registration, so registrations do not matter. Unknown hosts are not charged: their denials are folded.
 
 Use this module from one thread only; `folded`, `summarised` and `room` may be called from any thread.
 """

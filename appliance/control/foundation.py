@@ -12,7 +12,7 @@ from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.configuration.settings import Settings
 from appliance.control.host_authority import HostAuthority, make_host_authority
-from appliance.control.host_blocks import BlockTable
+from appliance.control.host_blocks import BlockTable, blocks_at_start
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.open_audit import open_audit
 from appliance.control.policies import Policies
@@ -136,7 +136,7 @@ async def make_foundation(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
     replication = make_replication(settings, pair, store)
-    blocks = BlockTable.of(store, settings.state / "control")
+    blocks = blocks_at_start(store, pair, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)

@@ -4,16 +4,18 @@ Invariants:
 
 1. A block is stored before it takes effect, and survives restarts of control and of the appliance.
 2. A block ends by the age clock (`base/age_clock.py`): changes of the system clock neither end nor extend it.
+   After a takeover by another appliance, `stored_times.py` moves the ends to its age clock.
 3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
 """
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
 
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
+from appliance.control.replication import Pair
+from appliance.control.stored_times import adopt_times
 from appliance.policy.model import Address, address_of
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore
@@ -29,13 +31,8 @@ class BlockTable:
         self._store = store
         self._age = age
         self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
-        self._now, self._wall = age() if self._rows else 0, clock.wall()
+        self._now, self._wall, self._seen = age() if self._rows else 0, clock.wall(), clock.since_boot_ns()
         self.reasons: Mapping[Address, str] = self._described()
-
-    @classmethod
-    def of(cls, store: StateStore, directory: Path) -> Self:
-        """Return the stored blocks, with the age clock of this directory."""
-        return cls(store, AgeClock(directory / "age"))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -46,7 +43,11 @@ class BlockTable:
 
     def read_clock(self) -> None:
         """Read the age clock, which may write a file. Only one thread at a time may call this."""
-        self._now, self._wall = self._age(), clock.wall()
+        self._now, self._wall, self._seen = self._age(), clock.wall(), clock.since_boot_ns()
+
+    def age_now(self) -> int:
+        """Return the age clock's time, from the last reading and the time since."""
+        return self._now + clock.since_boot_ns() - self._seen
 
     def until(self, row: HostBlockRow) -> float | None:
         """Return the end of a block by the present system clock, in seconds since the epoch; None: it has no end."""
@@ -91,6 +92,16 @@ class BlockTable:
         note = row.note if len(row.note) <= _NOTE_SHOWN else f"{row.note[: _NOTE_SHOWN - 1]}…"
         about = f": {note}" if note else ""
         return f"blocked by {row.who}{end}{about}; lift it with `rosrv host unblock {row.address}`"
+
+
+def blocks_at_start(store: StateStore, pair: Pair | None, directory: Path) -> BlockTable:
+    """Return the stored blocks, with the age clock of this directory.
+
+    On one of two appliances, first move all times in the state to its clocks.
+    """
+    age = AgeClock(directory / "age")
+    adopt_times(store, pair, age)
+    return BlockTable(store, age)
 
 
 def in_utc(seconds: float) -> str:

@@ -138,6 +138,13 @@ class PassiveControl:
                 _log.error("the copy of the state is not on the disk", reason=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
 
+    @property
+    def away_seconds(self) -> float | None:
+        """Return the seconds since this appliance last followed the active one; None if it never did."""
+        if not self._receiver.followed:
+            return None
+        return 0.0 if self._connected else clock.now() - self._away_since
+
     def _state_presence(self) -> None:
         """Let the lease claim only while this appliance has all data and could serve."""
         if self._complete and self._check.obstacle == "":
@@ -244,6 +251,7 @@ async def until_activated(
     if membership is None:
         return None
     taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
+    away: float | None = None
     if taken_over and not stopping.is_set():
         passive = PassiveControl(settings, membership, lifeline, lease, compiler)
         ended, loop = asyncio.Event(), asyncio.get_running_loop()
@@ -252,10 +260,11 @@ async def until_activated(
             wait.add_done_callback(lambda _task: ended.set())
         try:
             await passive.run(ended)
+            away = passive.away_seconds
         finally:
             for wait in waits:
                 wait.cancel()
         api, tunnels = passive.api, passive.tunnels
     if lifeline.epoch is None:
         return None
-    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels)
+    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels, away)

@@ -39,7 +39,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import signer
-from appliance.store.revisions import Revisions, reloaded_by
+from appliance.store.revisions import LIMITS, Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -95,7 +95,7 @@ class Policies(Revisions[RevisionRow]):
         waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
         """
         nothing = RevisionRow(0, "", "", 0.0, "", "")
-        super().__init__(store, store.revisions, store.save_revision, nothing, "confirm")
+        super().__init__(store, store.revisions, store.save_revision, nothing, LIMITS[0])
         self.file = file
         self._trail = trail
         self._robot = robot

@@ -35,6 +35,7 @@ from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import return_spare_memory
 from appliance.control.standby_orders import begin_epoch, standby_source
+from appliance.control.stored_times import note_times
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.control.takeover_check import STATE_ERRORS
@@ -165,6 +166,10 @@ class _Control:
         }
         if base.replication is not None:
             work["the replication"] = base.replication.run
+            if base.pair is not None:
+                work["the readings of the clocks"] = partial(
+                    note_times, base.store, base.pair, base.blocks.age_now
+                )
             work["the orders of the standby"] = partial(
                 operators.standby.obey, base.replication.switchover_wanted
             )

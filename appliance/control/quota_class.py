@@ -36,7 +36,7 @@ class HostQuotaClass:
     def has_reserve(self, host: str) -> bool:
         """Whether the last part of the audit log's reserve is kept for a host: the robot, or one that the policy names.
 
-        If a policy names only `*`, it is kept for hosts with a registration.
+        A policy that names only `*` keeps it for hosts with a registration.
         """
         try:
             address = address_of(host)

@@ -49,6 +49,7 @@ class Pair(NamedTuple):
 
     `api` is the link to the api, and `tunnels` has the link to the process for charon, if they were opened while this
     appliance stood by. `taken_over`: this process stood by before, so the epoch is new.
+    `away_seconds`: the time since this process last followed the other appliance; None: it did not.
     """
 
     membership: Membership
@@ -57,6 +58,7 @@ class Pair(NamedTuple):
     api: Channel | None
     taken_over: bool
     tunnels: StandbyTunnels
+    away_seconds: float | None = None
 
 
 def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":

@@ -58,7 +58,7 @@ from appliance.specifications.specification_revisions import (
 )
 from appliance.specifications.switches import Switches, require_whole
 from appliance.specifications.timed_disables import LONGEST, TimedDisables
-from appliance.store.revisions import Revisions, reloaded_by
+from appliance.store.revisions import LIMITS, Revisions, reloaded_by
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -145,9 +145,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
 
         `live()` returns the topics published now.
         """
-        super().__init__(
-            store, store.monitor_revisions, store.save_monitor_revision, NOTHING, "confirm monitors"
-        )
+        super().__init__(store, store.monitor_revisions, store.save_monitor_revision, NOTHING, LIMITS[1])
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys

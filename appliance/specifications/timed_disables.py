@@ -38,6 +38,13 @@ class _Return(msgspec.Struct, frozen=True):
     back: Switch
 
 
+def returns_moved(store: StateStore, seconds: float) -> None:
+    """Move the ends of all stored time limits."""
+    kept = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=dict[str, _Return])
+    moved = {name: msgspec.structs.replace(one, until=one.until + seconds) for name, one in kept.items()}
+    store.save_setting(_SETTING, msgspec.json.encode(moved).decode())
+
+
 class TimedDisables:
     """The time limits of monitors; when one ends, `come_back(back)` is called, which calls `end` like every switch."""
 

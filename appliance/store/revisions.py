@@ -18,6 +18,18 @@ _log = structlog.get_logger()
 _AGAIN_SECONDS = 5.0
 
 
+LIMITS = ("confirm", "confirm monitors")
+"""The settings with the time limits of an unconfirmed policy and of unconfirmed specifications."""
+
+
+def limit_moved(text: str, seconds: float) -> str:
+    """Return a stored time limit with another end."""
+    if not text:
+        return text
+    back_to, deadline, *length = text.split()
+    return " ".join([back_to, str(float(deadline) + seconds), *length])
+
+
 def reloaded_by(who: str) -> str:
     """Return the note of a revision that was read again; `DISK`: by a signal to the appliance."""
     return "reloaded from disk" + (f" by {who}" if who != DISK else "")

@@ -287,6 +287,7 @@ WALL_CLOCK = {
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
+        "control/stored_times.py",
         "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
     ],
     "whether the wall clock can be believed, and where it is read": [

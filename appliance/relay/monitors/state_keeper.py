@@ -90,7 +90,7 @@ class StateKeeper:
         self._entries: list[_Entry] = []
         self._by_channel: dict[str, _Entry] = {}
         self.shift = 0
-        """The nanoseconds that a takeover added to the clock of monitors; `continued` sets them."""
+        """The nanoseconds that a takeover added to the clock of monitors; `continued` sets it."""
 
     @property
     def offset(self) -> int:
