@@ -195,7 +195,9 @@ def _make_calls(
         parameters=registration.parameters,
         redecide_for=ends.enforcement.redecide_for,
         large=offload,
-        large_writes=LargeWrites(offload, base.quota_class),
+        large_writes=LargeWrites(
+            offload, base.quota_class, None if base.replication is None else base.replication.stored
+        ),
     )
     pipeline = Pipeline(
         execution,

@@ -219,11 +219,13 @@ class _Control:
             _log.error("the last records of the audit log are not written", reason=unwritten)
 
     async def _save_parameters(self) -> None:
-        dirty = self._base.parameters_dirty
+        dirty, store, mirror = self._base.parameters_dirty, self._base.store, self._parts.core.parameters
         while True:
             await dirty.wait()
             dirty.clear()
-            self._base.store.save_parameters(self._parts.core.parameters.tree)
+            if mirror.unnoted or store.tree_is_due:
+                mirror.unnoted = False
+                store.save_parameters(mirror.tree)
             await asyncio.sleep(_SAVE_SECONDS)
 
 

@@ -39,6 +39,7 @@ _SYNC_SECONDS = 0.1
 _BACKLOG = 8
 _SETTLE_SECONDS = 2.0
 _ANSWER_SECONDS = 5.0
+_LEAST_BYTES_A_SECOND = 20 << 20  # that a standby stores
 _PORT_SECONDS = 1.0  # until the port of the replication is tried again
 
 _log = structlog.get_logger()
@@ -318,7 +319,9 @@ class Replication:
         if self._absent:
             waiting = 0.0
         elif waiting is not None:
+            # A standby that stores a large value is not away: it gets the time that the bytes need.
             waiting = clock.since_boot() - (asyncio.get_running_loop().time() - waiting)
+            waiting += lag.bytes / _LEAST_BYTES_A_SECOND
         report = messages.ReplicationReported(
             permission=self._permission,
             caught_up=lag.caught_up and not self.sender.alone,

@@ -32,7 +32,8 @@ class ParameterMirror:
     be read after a restart.
 
     `changed()` is called at each change. `note(key, value)` is called for each change of one parameter (None: it was
-    deleted). `since` has the changes after `tree`. Changes inside `together()` are saved at its end.
+    deleted); `unnoted` is set by a change of the whole tree, until its owner has stored the tree. `since` has the
+    changes after `tree`. Changes inside `together()` are saved at its end.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class ParameterMirror:
         self.tree = tree
         self.charges = charges
         self.weight = 0
+        self.unnoted = False
         self._changed = changed
         self._note = note
         self.together = together
@@ -94,6 +96,7 @@ class ParameterMirror:
         """Replace the mirror by the ROS master's tree."""
         self.tree = tree
         self._recount(final=True)
+        self.unnoted = True
         self._changed()
 
     def set(self, key: str, value: Value, reserved: "Reservation") -> None:
@@ -106,6 +109,8 @@ class ParameterMirror:
         self.weight += after - before
         if parts:
             self._note(key, value)
+        else:
+            self.unnoted = True
         self._changed()
 
     def delete(self, key: str) -> None:

@@ -118,11 +118,14 @@ PARAMETER_BYTES = QuotaRow(
     ),
 )
 LARGE_WRITES = QuotaRow(
-    thing="large values under way to the ROS master",
+    thing="large values under way to the ROS master and to a standby",
     bounds=Bounds(whole=3, host=1, unknown=1, kept=1),
     at_limit="the value waits for its host's turn; small calls need not wait for it",
     alarm="none: nothing is rejected",
-    shown_by=("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
+    shown_by=(
+        "unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",
+        "unit/rpc/test_bulk.py::test_a_large_value_has_its_turn_until_the_standby_has_it",
+    ),
 )
 MASTER_CHANGES = QuotaRow(
     thing="changes of registrations that wait for the hidden ROS master",

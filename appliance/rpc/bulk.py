@@ -7,7 +7,7 @@ request is a reservation for this memory. At most `AT_ONCE` requests may hold a 
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import ParamSpec, Self, TypeVar
 
 from appliance.policy.model import Address
@@ -80,15 +80,22 @@ class Bulk:
 
 
 class LargeWrites:
-    """Limit the large values that are on their way to the ROS master: one at a time for each host.
+    """Limit the large values that are on their way to the ROS master and to the standby: one at a time for each host.
 
-    The ROS master is one Python process. Many threads that read large values would block its other threads. A call that
-    has its turn waits only for the ROS master.
+    The ROS master is one Python process. Many threads that read large values would block its other threads. The
+    changes of all hosts reach the standby in one order. A call that has its turn waits only for these two; `stored`
+    waits for the standby.
     """
 
-    def __init__(self, enough: int, quota_class: Callable[[Address], QuotaClass]) -> None:
+    def __init__(
+        self,
+        enough: int,
+        quota_class: Callable[[Address], QuotaClass],
+        stored: Callable[[], Awaitable[None]] | None = None,
+    ) -> None:
         self._turns = Turns(LARGE_WRITES.bounds, quota_class)
         self._enough = enough
+        self._stored = stored
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
@@ -99,6 +106,8 @@ class LargeWrites:
         await self._turns.enter(host)
         try:
             yield True
+            if self._stored is not None:
+                await self._stored()
         finally:
             self._turns.leave(host)
 

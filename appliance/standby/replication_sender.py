@@ -5,7 +5,8 @@ them in memory. Otherwise it gets a snapshot: all rows of a copy of the database
 are sent rather than the database file, because the standby must not have to trust a file.
 
 1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
-2. While the standby is away, at most `room` bytes of changes are kept. Changes never wait for the standby; the caller
+2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many, so
+   that it need not take a snapshot for the large values of a few hosts. Changes never wait for the standby; the caller
    decides whether an answer waits (`acknowledged`).
 3. While the appliance answers alone (`answer_alone`), `acknowledged` does not wait. This ends once the standby has all
    changes.
@@ -41,6 +42,7 @@ from appliance.store.changes import ROWS, Put
 from appliance.store.writer_thread import Database, StoreError
 
 _ROOM = 32 << 20
+_LINKED = 4  # times the room, while a standby is connected: more than all large values that may be under way at once
 _BATCH = 1 << 20  # bytes in one frame, but at least one change
 _OVERHEAD = 64 << 10  # bytes of a frame besides the changes
 _CHANGES_UNANSWERED = (
@@ -95,6 +97,7 @@ class ReplicationSender:
         self._switchover_wanted = switchover_wanted
         self._loop = asyncio.get_running_loop()
         self._changed = asyncio.Event()
+        self._room = room
         self._feed = database.follow(self._notice, room)
         self._acknowledged = 0
         self._sent = self._most_sent = 0  # on this link, on all links
@@ -154,12 +157,14 @@ class ReplicationSender:
                 if self.link is earlier:
                     self.link = None
             own = self.link = self._loop.create_task(self._serve(link))
+            self._feed.keep(_LINKED * self._room)
             try:
                 await asyncio.wait([own])
             finally:
                 own.cancel()
                 if self.link is own:
                     self.link = None
+                    self._feed.keep(self._room)
             if own.cancelled():
                 raise ReplicationError(
                     "the standby opened another link, or this appliance is no longer active"

@@ -28,9 +28,14 @@ class ChangeFeed:
         with self._lock:
             self._changes += changes
             self._size += sum(len(change.body) for change in changes)
-            while self._size > self._room and len(self._changes) > 1:
-                self._drop_oldest()
+            self._shrink()
         self._changed()
+
+    def keep(self, room: int) -> None:
+        """Keep at most `room` bytes from now on."""
+        with self._lock:
+            self._room = room
+            self._shrink()
 
     def after(self, number: int, most: int) -> list[Encoded] | None:
         """Return the changes after this number: at most `most` bytes, but at least one change if there is any.
@@ -59,6 +64,10 @@ class ChangeFeed:
     def size(self) -> int:
         """Return the bytes of the changes that are kept."""
         return self._size
+
+    def _shrink(self) -> None:
+        while self._size > self._room and len(self._changes) > 1:
+            self._drop_oldest()
 
     def _drop_oldest(self) -> None:
         self._before, body = self._changes.popleft()

@@ -58,6 +58,8 @@ REVISION_TABLES = frozenset({"policy_revision", "policy_signature", "monitor_rev
 """The tables of the policy and the specifications."""
 
 LARGEST_CHANGE = 64 << 10  # bytes of one parameter whose change is stored at once
+_MOST_NOTED = 10_000  # keys with changes, before the tree replaces them
+_EMPTY = msgspec.msgpack.encode({})
 
 
 class IncarnationRow(NamedTuple):
@@ -134,6 +136,7 @@ class StateStore:
         self.hosts = host_tables.HostTables(self.database)
         self._parameter_changes = 0  # the number of the last change
         self._largest_change: int | None = LARGEST_CHANGE
+        self._noted: dict[str, list[int]] = {}  # the changes of each key since the tree was stored, by number
 
     async def settled(self) -> None:
         """Wait until everything saved so far is on the disk. Raises `StoreError` if it cannot be written."""
@@ -202,10 +205,20 @@ class StateStore:
         self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
         # After a crash, changes that the tree contains may remain: repeated in order, they give the same tree.
         self.database.delete("parameter_change", ("number", "<=", self._parameter_changes), ahead=False)
+        self._noted.clear()
 
     def note_whole_parameters(self) -> None:
-        """Store also large values at once: a standby must have each value before it is answered."""
+        """Store also large values at once: a standby must have each value before it is answered.
+
+        Then the tree is stored rarely (`tree_is_due`). It would be sent to the standby, whichever host had changed
+        whichever part of it; so each change replaces the earlier ones of its key instead.
+        """
         self._largest_change = None
+
+    @property
+    def tree_is_due(self) -> bool:
+        """Whether the tree should be stored after a change that was noted."""
+        return self._largest_change is not None or len(self._noted) > _MOST_NOTED
 
     def note_parameter(self, key: str, value: Any) -> None:
         """Store one change until the next tree is stored: the parameter has this value (None: it was deleted).
@@ -215,6 +228,22 @@ class StateStore:
         data = None if value is None else msgspec.msgpack.encode(value)
         if data is not None and self._largest_change is not None and len(data) > self._largest_change:
             return
+        if self._largest_change is not None:
+            self._put_change(key, data)
+            return
+        with self.database.together():
+            former = self._noted.pop(key, [])
+            for number in former:
+                self.database.delete("parameter_change", number=number)
+            if data is None and former:  # what is replaced may have made the namespaces above
+                self._note_change(key, _EMPTY)
+            self._note_change(key, data)
+
+    def _note_change(self, key: str, data: bytes | None) -> None:
+        self._put_change(key, data)
+        self._noted.setdefault(key, []).append(self._parameter_changes)
+
+    def _put_change(self, key: str, data: bytes | None) -> None:
         self._parameter_changes += 1
         self.database.put("parameter_change", self._parameter_changes, key, data)
 
@@ -223,6 +252,8 @@ class StateStore:
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
         rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
+        for number, key, _data in rows:
+            self._noted.setdefault(key, []).append(number)
         return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
     def parameter_owned(self, key: str, host: str) -> None:

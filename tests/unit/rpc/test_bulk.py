@@ -114,6 +114,30 @@ async def test_large_values_of_a_host_go_one_at_a_time() -> None:
     assert not inside
 
 
+async def test_a_large_value_has_its_turn_until_the_standby_has_it() -> None:
+    """So a host has at most one large value on its way to the standby, behind which all other changes wait."""
+    has_it = asyncio.Event()
+
+    async def stored() -> None:
+        await has_it.wait()
+
+    large, written = LargeWrites(1000, lambda _host: QuotaClass.REGISTERED, stored), list[str]()
+
+    async def write(name: str, host: Any, size: int) -> None:
+        async with large.turn(host, ["x" * size]):
+            written.append(name)
+
+    guest, robot = HOSTS[:2]
+    wanted = (("first", guest, 2000), ("second", guest, 2000), ("small", guest, 10), ("robot", robot, 2000))
+    tasks = [asyncio.create_task(write(*one)) for one in wanted]
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert written == ["first", "small", "robot"]
+    has_it.set()
+    await asyncio.gather(*tasks)
+    assert written[-1] == "second"
+
+
 @pytest.mark.nightly
 async def test_the_work_of_a_thread_is_charged_to_its_host() -> None:
     """A host whose large document was read in a thread is next after the others, as if the loop had read it."""

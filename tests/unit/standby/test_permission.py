@@ -20,6 +20,7 @@ from appliance.control.replication import Replication
 from appliance.standby.membership import Membership
 from appliance.standby.process import LeaseProcess
 from appliance.standby.replication_frames import Stored
+from appliance.standby.replication_sender import ReplicationLag
 from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
@@ -250,3 +251,22 @@ def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.Mo
 
     with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
         asyncio.run(story())
+
+
+def test_a_standby_has_the_time_that_a_large_value_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lease is told of a wait only from the time on at which a living standby would have stored the bytes."""
+
+    async def waits(size: int) -> float:
+        pair.start_control(taken_over=False)
+        now = asyncio.get_running_loop().time()
+        sender: Any = pair.control.sender
+        sender.lag = lambda: ReplicationLag(True, 1, size, now, "")
+        pair.control.report()
+        return float(clock.since_boot() - pair.to_lease[-1].waiting_since)
+
+    machine = VirtualClock()
+    with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
+        assert asyncio.run(waits(100)) == pytest.approx(0.0, abs=1e-3)
+        assert asyncio.run(waits(30 << 20)) == pytest.approx(-1.5, abs=1e-3)

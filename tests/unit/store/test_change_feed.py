@@ -57,3 +57,14 @@ def test_changes_that_the_consumer_has_are_dropped() -> None:
     assert feed.size == 10
     feed.release(1)
     assert numbers(feed.after(2, 100)) == [3]
+
+
+def test_a_consumer_that_is_there_gets_more_room() -> None:
+    """Changes beyond the room are dropped as soon as it has less room again."""
+    feed = ChangeFeed(0, lambda: None, 100)
+    feed.keep(400)
+    feed.add([Encoded(number, b"x" * 100) for number in range(1, 5)])
+    assert feed.size == 400
+    feed.keep(100)
+    assert feed.size == 100
+    assert feed.after(2, 1) is None

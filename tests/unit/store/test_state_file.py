@@ -1,6 +1,8 @@
 """The tables of control's state file."""
 
+import copy
 import os
+import random
 import signal
 import traceback
 from collections.abc import Callable, Sequence
@@ -8,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.policy.model import address_of
 from appliance.store.ahead import Encoded, WriteAhead
 from appliance.store.state_file import (
     LARGEST_CHANGE,
@@ -17,7 +21,10 @@ from appliance.store.state_file import (
     RevisionRow,
     StateStore,
 )
+from roswire.parameter_tree import Tree
+from roswire.xmlrpc import Value
 from tests.support.engines import InlineDatabase
+from tests.support.parameters import mirror, put
 
 
 def incarnation(key: str) -> IncarnationRow:
@@ -211,3 +218,63 @@ def test_a_large_value_is_kept_with_the_tree(tmp_path: Path) -> None:
     again = reopened(tmp_path)
     assert again.parameter_changes() == []
     again.close()
+
+
+def test_a_standby_gets_each_large_value_once(tmp_path: Path) -> None:
+    """Six megabytes that a host sets again and again are sent as often, without the tree, and kept once."""
+    store = reopened(tmp_path)
+    store.note_whole_parameters()
+    feed = store.database.follow(lambda: None, 1 << 30)
+    for number in range(12):
+        store.note_parameter(f"/map{number % 4}", f"{number}" * (6 << 20))
+        assert not store.tree_is_due
+    sent = sum(len(f"{number}") * (6 << 20) for number in range(12))
+    assert sent < feed.size < sent + (64 << 10)
+    assert [key for key, _value in store.parameter_changes()] == ["/map0", "/map1", "/map2", "/map3"]
+    store.close()
+
+
+def test_changes_of_many_keys_end_in_the_tree(tmp_path: Path) -> None:
+    """On one of two appliances, the changes since the tree are bounded, though no tree is stored for a few."""
+    store = reopened(tmp_path)
+    due = [store.tree_is_due]
+    store.note_whole_parameters()
+    for number in range(10_001):
+        due[1:] = [store.tree_is_due]
+        store.note_parameter(f"/key{number}", None)
+    due.append(store.tree_is_due)
+    store.save_parameters({})
+    assert [*due, store.tree_is_due] == [True, False, True, False]
+    store.close()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_replaced_changes_give_the_same_tree(seed: int, tmp_path: Path) -> None:
+    """After any changes, also by several processes, the kept ones lead to the tree that all of them led to."""
+    chance, names = random.Random(seed), ("a", "b", "c")  # noqa: S311  no secret
+    tree: Tree = {"a": {"b": {"c": 1}}, "b": 5}
+    store = reopened(tmp_path)
+    store.save_parameters(copy.deepcopy(tree))
+    for _process in range(3):
+        store.note_whole_parameters()
+        there = _mirror(store)
+        assert there.tree == tree
+        for _ in range(40):
+            key = "/" + "/".join(chance.choices(names, k=chance.randint(1, 3)))
+            if chance.random() < 0.4:
+                there.delete(key)
+            else:
+                values: list[Value] = [chance.randint(0, 9), {"a": chance.randint(0, 9)}, {}]
+                put(there, key, chance.choice(values), address_of("10.0.0.1"))
+        tree = there.tree
+        store.close()
+        store = reopened(tmp_path)
+    assert _mirror(store).tree == tree
+    store.close()
+
+
+def _mirror(store: StateStore) -> ParameterMirror:
+    return mirror(
+        store.load_parameters(), note=store.note_parameter, together=store.database.together,
+        since=store.parameter_changes(),
+    )  # fmt: skip
