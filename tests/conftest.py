@@ -1,4 +1,4 @@
-"""Fixtures of tests with real nodes, each of which ends what it started; what chance may decide; workers and order."""
+"""Fixtures of tests with real nodes, each of which ends what it started; workers and order."""
 
 import contextlib
 import gc
@@ -11,28 +11,17 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from appliance.base import clock
 from appliance.network.namespaces import has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
-from tests.support.determinism import WATCH, may_depend_on_chance
 from tests.support.examples import examples
 from tests.support.nodes import RosSession, has_ros
 from tests.support.own_namespace import own_loopback
 from tests.support.processes import ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.site import Masters, Site
-from tests.support.virtual_clock import VirtualClock
 
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
-_MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
-_TIME = pytest.StashKey[contextlib.ExitStack]()
-_WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, after that of the files
-_NIGHTLY = (
-    "tests/integration/",
-    "tests/system/",
-    "tests/package/",
-)  # real nodes, unless a test is marked `real`
 
 # How long an example takes says what else the machine does, and nothing of the product.
 settings.register_profile("no clock", deadline=None, max_examples=examples(100))
@@ -106,41 +95,6 @@ def ros(request: pytest.FixtureRequest, appliance: Appliance, tmp_path: Path) ->
         yield session
 
 
-def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
-    if may_depend_on_chance(item):
-        return (yield)
-    with WATCH.watching() as found:
-        result = yield
-    if found:  # the product may have caught the error
-        pytest.fail(f"this test {'; '.join(dict.fromkeys(found))}: mark it `nightly`", pytrace=False)
-    return result
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Begin the test's own time, and forbid what chance can decide in its fixtures."""
-    if not may_depend_on_chance(item):
-        item.stash[_TIME] = contextlib.ExitStack()
-        item.stash[_TIME].enter_context(clock.using(VirtualClock(wall=_WALL)))
-    return (yield from _watched(item))
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide in a test."""
-    return (yield from _watched(item))
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, Any, Any]:
-    """Forbid what chance can decide at the end of a test, and end its time."""
-    try:
-        return (yield from _watched(item))
-    finally:
-        if _TIME in item.stash:
-            item.stash[_TIME].close()
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """Add what the nodes and the appliance said to the report of a failure."""
@@ -163,7 +117,6 @@ def pytest_configure(config: pytest.Config) -> None:
     A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
     this port may belong to another worker. It would answer for the dead node, or get its order to shut down.
     """
-    WATCH.install()
     # The collected tests stay in memory: the garbage collector would scan their millions of objects again and again.
     gc.set_threshold(700, 10, 100)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -182,15 +135,8 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return cores + 1 if config.option.numprocesses == "logical" else 2 * cores
 
 
-@pytest.hookimpl(tryfirst=True)  # before -m selects by marker
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with real nodes as nightly, count the real ones, and run the files of tests/long.txt first."""
-    real = [item for item in items if item.get_closest_marker("real")]
-    if len(real) > _MOST_REAL:
-        raise pytest.UsageError(f"{len(real)} cases are marked `real`; the gate runs at most {_MOST_REAL}")
-    for item in items:
-        if item.nodeid.startswith(_NIGHTLY) and not item.get_closest_marker("real"):
-            item.add_marker(pytest.mark.nightly)
+    """Run the files of tests/long.txt first, in the order of the list."""
     names = Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines()
     rank = {name: number for number, name in enumerate(names)}
     items.sort(key=lambda item: rank.get(item.nodeid.partition("::")[0], len(names)))

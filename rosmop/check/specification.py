@@ -131,14 +131,19 @@ def _check_names(shared: CompilationContext, specifications: Sequence[tree.Speci
 
 def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagnostic]:
     """Yield warnings about variables of the same name in specifications that use variables of each other."""
-    for place, names in enumerate(specifications):
-        for other in specifications[:place]:
-            if other.name not in names.uses and names.name not in other.uses:
-                continue
-            for name, variable in names.variables.items():
-                if name in other.variables and not (variable.sliced or other.variables[name].sliced):
-                    text = f"{shown(name)} is also a variable of {other.name}; each has its own"
-                    yield Diagnostic(variable.position, "warning", text)
+    places = {names.name: place for place, names in enumerate(specifications)}
+    pairs = {
+        tuple(sorted((place, places[used])))
+        for place, names in enumerate(specifications)
+        for used in names.uses
+        if used in places
+    }
+    for first, second in sorted(pairs):
+        other, names = specifications[first], specifications[second]
+        for name, variable in names.variables.items():
+            if name in other.variables and not (variable.sliced or other.variables[name].sliced):
+                text = f"{shown(name)} is also a variable of {other.name}; each has its own"
+                yield Diagnostic(variable.position, "warning", text)
 
 
 def _compile(

@@ -181,6 +181,7 @@ def test_the_start_function_of_a_module_is_bounded() -> None:
     assert caught.value.reason == "out of fuel"
 
 
+@pytest.mark.nightly
 def test_other_threads_go_on_while_a_module_is_translated() -> None:
     """Translating a large set takes seconds, in which the compiler's process must answer its supervisor."""
     step = "(local.set 0 (i64.add (i64.mul (local.get 0) (i64.const 3)) (i64.const 7)))"
@@ -292,6 +293,7 @@ def test_calls_and_traps_leave_nothing_behind() -> None:
     assert resident() - before < 4 << 20, "40 bytes for each of 100,000, or 8 KiB for each of 500"
 
 
+@pytest.mark.nightly
 def test_many_machines_need_few_addresses() -> None:
     """Machines reserve as many addresses as their limits need, even in a process with little address space."""
     done = subprocess.run(
@@ -314,6 +316,7 @@ print(len(machines))
     assert (done.stdout, done.stderr) == ("250\n", "")
 
 
+@pytest.mark.nightly
 def test_traps_come_without_signals() -> None:
     """A signal handler installed later, which would end the process, is never called."""
     fails = "".join(f'(func (export "{name}") {TRAPS[name]})' for name in list(TRAPS)[:5])

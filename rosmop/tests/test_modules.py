@@ -79,6 +79,7 @@ def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
     assert encoded_part(part_of(compiled("a"), ["a"], ["a"])) != alone
 
 
+@pytest.mark.nightly
 def test_another_process_makes_the_same_module() -> None:
     """The other process has different string hashes."""
     hashes = {

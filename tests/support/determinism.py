@@ -2,8 +2,8 @@
 
 A test of the gate must not fail by chance, so it uses none of them, unless it is one of the few marked `real`. Tests
 marked `nightly` also use them, and run with `make nightly`. An audit hook of Python sees processes and sockets, in our
-code and in libraries. Threads, pauses and clocks have no hook in Python 3.11, so their functions are replaced; of the
-reads of a clock, only those by our own code count.
+code and in libraries. Threads, processes of multiprocessing, pauses and clocks have no hook in Python 3.11, so their
+functions are replaced; of the reads of a clock, only those by our own code count.
 """
 
 import functools
@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 import pytest
@@ -45,7 +46,11 @@ class Watch:
     def install(self) -> None:
         """Begin to see audit events and clock reads, which `watching` then forbids."""
         sys.addaudithook(self._event)
-        for owner, name, what in ((threading.Thread, "start", "starts a thread"), (time, "sleep", "sleeps")):
+        for owner, name, what in (
+            (threading.Thread, "start", "starts a thread"),
+            (BaseProcess, "start", "starts a process"),
+            (time, "sleep", "sleeps"),
+        ):
             setattr(owner, name, self._forbidding(what, getattr(owner, name)))
         for name in _CLOCKS:
             setattr(time, name, self._clock(name, getattr(time, name)))

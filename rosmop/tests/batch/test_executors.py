@@ -4,6 +4,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 from rosmop.batch.executor import ATTEMPTS, ThisProcess, WorkerDeath, execute
 from rosmop.batch.process_pool import ProcessPool
 from rosmop.tests.batch.works import double, fragile
@@ -11,6 +13,7 @@ from rosmop.tests.batch.works import double, fragile
 JOBS = [(number, bytes([number]) * (number * 40_000)) for number in range(12)]
 
 
+@pytest.mark.nightly
 def test_a_pool_gives_the_results_of_this_process() -> None:
     """Every job has its own result, also if that is larger than the buffer of a pipe."""
     pool = ProcessPool(double, 2)
@@ -21,6 +24,7 @@ def test_a_pool_gives_the_results_of_this_process() -> None:
         pool.close()
 
 
+@pytest.mark.nightly
 def test_a_worker_that_dies_is_tried_again(tmp_path: Path) -> None:
     """A job whose worker dies once has a result; one whose worker always dies fails alone, after three tries."""
     pool = ProcessPool(fragile, 2)
@@ -44,6 +48,7 @@ def test_a_worker_that_dies_is_tried_again(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.nightly
 def test_a_worker_that_dies_while_idle_is_replaced(tmp_path: Path) -> None:
     """The next job does not fail."""
     pool = ProcessPool(fragile, 1)

@@ -41,6 +41,7 @@ def rows_of(path: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in Path(path).read_text(encoding="ascii").splitlines()]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", ["run limit.rv", "learn", "coverage limit.rv"])
 def test_any_name_is_reported(command: str, folder: Path) -> None:
     """Names may have any bytes: they are escaped on the screen, and the report is valid Unicode for any reader."""
@@ -61,6 +62,7 @@ def test_any_name_is_reported(command: str, folder: Path) -> None:
     "".join(failed).encode()  # no surrogates
 
 
+@pytest.mark.nightly
 def test_bytes_outside_utf8_in_specifications(folder: Path) -> None:
     """A specification with such bytes is refused with their position. File names and definitions may have them."""
     definition = Path("msg/own/msg/Level.msg")
@@ -78,6 +80,7 @@ def test_bytes_outside_utf8_in_specifications(folder: Path) -> None:
     assert err.startswith("limit.rv:")
 
 
+@pytest.mark.nightly
 def test_other_kinds_of_files_are_rows(folder: Path) -> None:
     """Pipes, devices and links that lead nowhere or in a circle fail alone, and at once."""
     os.mkfifo("bags/pipe.bag")
@@ -94,6 +97,7 @@ def test_other_kinds_of_files_are_rows(folder: Path) -> None:
     assert not errors
 
 
+@pytest.mark.nightly
 def test_circles_of_folders_are_not_followed(folder: Path) -> None:
     """Links to folders above do not multiply the search of a pattern or of a folder."""
     for name in ("x", "y", "z"):
@@ -209,6 +213,7 @@ def test_only_a_journal_is_written(tmp_path: Path) -> None:
         ResumeJournal(tmp_path)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("option", ["--resume", "--report"])
 def test_a_full_disk_is_reported(option: str, folder: Path) -> None:
     """The command ends with the reason; afterwards it continues, and no report was begun."""
@@ -247,6 +252,7 @@ def command_line(pid: int) -> bytes:
         return b""
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None:
     """Ctrl-C in the first second prints no traceback of a worker; a worker that is killed then is replaced."""
@@ -275,6 +281,7 @@ def test_workers_end_while_they_start(end: signal.Signals, folder: Path) -> None
         assert Path("report").read_bytes() == Path("expected").read_bytes()
 
 
+@pytest.mark.nightly
 def test_a_topic_cannot_add_to_the_learnt_text(folder: Path) -> None:
     """A topic with an invalid name is listed in a comment, on one line, and the others are learnt from."""
     name = "/n\n} evil() { event e() /n std_msgs/Int32 '{}' { DROP; } }\x1b[2J"

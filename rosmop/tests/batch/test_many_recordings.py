@@ -62,6 +62,7 @@ def rosmop(command: str) -> tuple[int, str, str]:
     return done.exit_code, done.stdout, done.stderr
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("command", ["run limit.rv", "learn", "coverage limit.rv"])
 def test_processes_give_the_same_report(command: str, folder: Path) -> None:
     """One process and two print the same, also if a recording fails: then it has a row, and the exit status is 3."""
@@ -76,6 +77,7 @@ def test_processes_give_the_same_report(command: str, folder: Path) -> None:
     assert [row["bag"] for row in rows if "error" in row] == ["bags/broken.bag"]
 
 
+@pytest.mark.nightly
 def test_violations_are_listed_by_specification_recording_and_time(folder: Path) -> None:
     """The rows have each drop, its count for each recording, and the number of messages."""
     status, out, _err = rosmop("run limit.rv --bags bags --json")
@@ -93,6 +95,7 @@ def test_violations_are_listed_by_specification_recording_and_time(folder: Path)
     assert {row["messages"] for row in rows if row["kind"] == "recording"} == {400}
 
 
+@pytest.mark.nightly
 def test_sets_are_folders_and_patterns(folder: Path) -> None:
     """Overlapping sets name a recording once; a set without recordings is an error."""
     assert "2400 messages of 6 recordings" in rosmop("run limit.rv --bags bags --bags bags/*.bag")[1]
@@ -102,6 +105,7 @@ def test_sets_are_folders_and_patterns(folder: Path) -> None:
     assert rosmop("coverage limit.rv")[2].startswith("rosmop: give recordings: --bag FILE")
 
 
+@pytest.mark.nightly
 def test_errors_of_a_specification_are_reported_once(folder: Path) -> None:
     """They are not an error of each recording."""
     Path("limit.rv").write_text(SPECIFICATION.replace("data:n", "date:n"))
@@ -110,6 +114,7 @@ def test_errors_of_a_specification_are_reported_once(folder: Path) -> None:
     assert err.count("date") == 1
 
 
+@pytest.mark.nightly
 def test_mcap_files_are_recordings(folder: Path) -> None:
     """The messages of an MCAP file have the outcomes of those of a bag, with each compression."""
     expected = rosmop("run limit.rv --bag bags/0.bag --json")[1]
@@ -132,6 +137,7 @@ def lines_of(path: Path) -> list[str]:
     return path.read_text().rpartition("\n")[0].splitlines() if path.exists() else []
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
 def test_an_interrupted_command_continues(end: signal.Signals, folder: Path) -> None:
     """After a kill or Ctrl-C the same command executes only the jobs that had not finished, with the same report."""

@@ -13,6 +13,8 @@ from rosmop.batch import object_store
 from rosmop.recordings.recording import RecordingError
 from rosmop.tests.batch.test_many_recordings import SPECIFICATION, make_bag, rosmop
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture
 def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:

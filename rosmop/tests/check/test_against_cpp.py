@@ -19,6 +19,8 @@ from rosmop.tests.acting import act, definitions, message
 from rosmop.tests.examples import examples
 from rosmop.tests.on_module import on_module
 
+pytestmark = pytest.mark.nightly
+
 TYPES = (
     "int8_t", "uint8_t", "int16_t", "uint16_t", "int", "unsigned int", "long", "unsigned long", "float", "double",
     "bool", "char",

@@ -200,6 +200,7 @@ def check(programs: Programs, count: int, directory: Path | None) -> BothWays:
     return fed
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("kind", "taken"), [("numbers", 60), ("vectors", 10), ("others", 10)])
 @pytest.mark.parametrize("seed", range(examples(12)))
 def test_effects_are_in_the_order_of_the_compiler(seed: int, kind: Kind, taken: int, tmp_path: Path) -> None:

@@ -214,6 +214,7 @@ except (FormulaError, RunFaultError) as error:
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("logic", "number"), [(logic, i) for logic, texts in HOSTILE.items() for i in range(len(texts))]
 )

@@ -35,6 +35,7 @@ SHIPPED = {
 }  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_specifications(name: str) -> None:
     """All events that have a module without loops are proved; each other event has a reason."""
@@ -90,6 +91,7 @@ PROVED = {
 }  # fmt: skip
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", PROVED)
 def test_the_language_without_loops_is_proved(name: str) -> None:
     """The proof covers all messages and states, more than any test can try."""
@@ -107,6 +109,7 @@ UNPROVED = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("answer", UNPROVED)
 def test_an_unproved_answer_says_why(answer: str) -> None:
     """The answer is never `equal` without a proof."""
@@ -120,6 +123,7 @@ def test_without_time_nothing_is_proved() -> None:
     assert (found.answer, found.differs) == ("not decided in time", False)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "every", "times"),
     [("fields, variables, a drop", 9, 4), ("output, and what the module leaves", 23, 2)],

@@ -4,7 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from rosmop.tests.batch.test_many_recordings import make_bag
+
+pytestmark = pytest.mark.nightly
 
 PROGRAM = """
 import sys

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+pytestmark = pytest.mark.nightly
+
 FOLDER = Path(__file__).parents[2]
 UNUSED = {"apsw", "numpy"}
 """`rosbags` requires them, but nothing here loads them: the appliance's package and image are without them."""

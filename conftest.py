@@ -1,0 +1,67 @@
+"""The gate's rule for all tests: only those marked `real` or `nightly` may depend on chance (CONTRIBUTING.md)."""
+
+import contextlib
+from collections.abc import Generator
+from typing import Any
+
+import pytest
+
+from appliance.base import clock
+from tests.support.determinism import WATCH, may_depend_on_chance
+from tests.support.virtual_clock import VirtualClock
+
+_MOST_REAL = 100  # if each fails once in 100,000 runs, one gate in a thousand fails by chance
+_TIME = pytest.StashKey[contextlib.ExitStack]()
+_WALL = 1_893_456_000.0  # seconds since the epoch: the same date for each run, after that of the files
+_NIGHTLY = ("tests/integration/", "tests/system/", "tests/package/", "tests/proofs/")  # unless marked `real`
+
+
+def pytest_configure() -> None:
+    """Begin to see what depends on chance."""
+    WATCH.install()
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects by marker
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests with real nodes as nightly, and count the real ones."""
+    real = [item for item in items if item.get_closest_marker("real")]
+    if len(real) > _MOST_REAL:
+        raise pytest.UsageError(f"{len(real)} cases are marked `real`; the gate runs at most {_MOST_REAL}")
+    for item in items:
+        if item.nodeid.startswith(_NIGHTLY) and not item.get_closest_marker("real"):
+            item.add_marker(pytest.mark.nightly)
+
+
+def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
+    if may_depend_on_chance(item):
+        return (yield)
+    with WATCH.watching() as found:
+        result = yield
+    if found:  # the product may have caught the error
+        pytest.fail(f"this test {'; '.join(dict.fromkeys(found))}: mark it `nightly`", pytrace=False)
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Begin the test's own time, and forbid what chance can decide in its fixtures."""
+    if not may_depend_on_chance(item):
+        item.stash[_TIME] = contextlib.ExitStack()
+        item.stash[_TIME].enter_context(clock.using(VirtualClock(wall=_WALL)))
+    return (yield from _watched(item))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Forbid what chance can decide in a test."""
+    return (yield from _watched(item))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Generator[None, Any, Any]:
+    """Forbid what chance can decide at the end of a test, and end its time."""
+    try:
+        return (yield from _watched(item))
+    finally:
+        if _TIME in item.stash:
+            item.stash[_TIME].close()
