@@ -102,6 +102,7 @@ class ListenerLimits:
             keep=keep,
             refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
+            malformed=self.malformed,
         )
 
     def close(self) -> None:
@@ -141,6 +142,10 @@ class ListenerLimits:
     def troubled(self, peer: Peer, reason: str) -> None:
         """Record that a peer exceeded a limit."""
         self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        """Record that a peer sent something that is not a request."""
+        self._trail.happened("malformed", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:
         """Handle the result of the supervisor's probe. `reason` is empty if the ROS master is hidden."""

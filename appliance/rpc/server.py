@@ -99,7 +99,8 @@ class HttpServer:
 
     `refuse(peer)` is called after the head of a request. If it returns a `Refusal`, this function makes the answer from
     the beginning of the body, as far as it arrives in time. Then the connection is closed. Without `keep`, every answer
-    closes the connection. `troubled(peer, reason)` is called for each exceeded limit. The program `first` sends some
+    closes the connection. `troubled(peer, reason)` is called for each exceeded limit, `malformed(peer,
+    reason)` for each request that is not one of HTTP's, or that is not served here. The program `first` sends some
     connections to a second socket; they are accepted in the turn of unknown hosts.
     """
 
@@ -115,6 +116,7 @@ class HttpServer:
     keep: bool = True
     refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - documents the parameter
     troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
+    malformed: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
     _acceptors: list[Acceptor] = field(default_factory=list, init=False)
     _queues: SourceQueues | None = field(default=None, init=False)
@@ -517,7 +519,8 @@ class _Connection(Front, asyncio.BufferedProtocol):
         self._refuse(status, f"{self.peer.text} {what}")
 
     def _refuse(self, status: bytes, why: str) -> None:
-        self.server.troubled(self.peer, why)
+        report = self.server.troubled if exceeds_limit(status) else self.server.malformed
+        report(self.peer, why)
         self._write(status, build_fault(int(status[:3]), why), keep=False, unread=True)
 
     def expire(self) -> None:
@@ -568,3 +571,8 @@ def listen(host: str, port: int) -> socket.socket:
         sock.close()
         raise
     return sock
+
+
+def exceeds_limit(status: bytes) -> bool:
+    """Whether a request with this answer exceeds a limit. Otherwise it is wrong, however small it is."""
+    return status[:3] in (b"413", b"431", b"503")

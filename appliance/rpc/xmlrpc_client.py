@@ -86,6 +86,21 @@ class XmlRpcClient:
         except PeerError as error:
             raise CallFailedError(f"{self._where} answered {method} with nonsense: {error}") from error
 
+    async def refuses(self, seconds: float) -> bool:
+        """Whether the server's address refuses connections. One that is silent for these seconds does not."""
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(seconds):
+                transport, _protocol = await loop.create_connection(
+                    asyncio.Protocol, self.uri.host, self.uri.port
+                )
+        except TimeoutError:
+            return False
+        except OSError:
+            return True
+        transport.close()
+        return False
+
     async def _written(self, method: str, params: tuple[Value, ...]) -> bytes:
         if weigh(list(params), _OFFLOAD) < _OFFLOAD:
             return build_call(method, params)

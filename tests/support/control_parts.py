@@ -221,6 +221,9 @@ class Clients:
         self._asked = incarnation.name
         return self
 
+    async def refuses(self, _seconds: float) -> bool:
+        return self._asked in self.gone
+
     async def call(self, _method: str, *_params: Value) -> Value:
         if self._asked in self.gone:
             raise RefusedError("nobody is there")

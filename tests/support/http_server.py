@@ -143,6 +143,7 @@ class Server:
             first=shares.first,
             refuse=lambda peer: None if refusal is None else self._refuse,
             troubled=self._complain,
+            malformed=self._complain,
         )
         self.complained = asyncio.Event()
         self._refusal = refusal

@@ -37,6 +37,7 @@ from appliance.master.calls.registration import given_up
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
+from appliance.master.reconcile.arrivals import NodeElsewhereError
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness, Probe
 from appliance.policy.model import Address, Category, Decision
@@ -49,7 +50,7 @@ from roswire.xmlrpc import Value
 
 _log = structlog.get_logger()
 _REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
-_FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFailedError)
+_FAILURES = (NoPortError, NodeElsewhereError, LimitReachedError, PeerError, EncodingError, CallFailedError)
 
 
 class ServedRequest(NamedTuple):
@@ -266,6 +267,12 @@ class Execution:
                     call=call.name,
                 )
                 return [0, with_record(str(error), record), call.denial]
+            case NodeElsewhereError():
+                decision = Decision(False, None, str(error))
+                record = self.trail.decided(
+                    caller.asker, call.name, call.category.value, attempt.resource, decision
+                )
+                return [0, self._denial_text(decision, record), call.denial]
             case PeerError():
                 return self._malformed(call, caller, caller.caller_id, error)
             case EncodingError():

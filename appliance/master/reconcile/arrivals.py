@@ -2,6 +2,10 @@
 
 An incarnation with a registering call under way is not evicted. Otherwise, two nodes that arrive at the same time, with
 room for only one, would evict each other forever.
+
+Nodes are called at their caller's address, whatever their API's URI says: a node on a machine with several addresses
+may name another one. multimaster_fkie registers the nodes of other machines, which cannot be called there. So a new
+node whose URI names another host must have its port open, as every node has before it registers.
 """
 
 from dataclasses import dataclass
@@ -15,6 +19,12 @@ from appliance.master.graph.registry import Incarnation, Life, Registry, new_key
 from appliance.master.reconcile.enactor import Enactor
 from appliance.master.reconcile.liveness import Liveness
 from appliance.policy.model import Address
+
+_CONNECT_SECONDS = 1.0
+
+
+class NodeElsewhereError(Exception):
+    """The registered node does not run on the caller's host; the message says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +46,8 @@ class Arrivals:
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
         """Return the calling incarnation. If it is unknown, make and save a new incarnation with its ports.
 
-        Raises `NoPortError`, without any change, if the range of ports is exhausted or control has no descriptors left.
+        Raises `NoPortError`, without any change, if the range of ports is exhausted or control has no descriptors left,
+        and `NodeElsewhereError` if the node runs on another host.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
@@ -53,11 +64,23 @@ class Arrivals:
         incarnation = self._make(caller, api)
         try:
             with EvictionGuard(incarnation):
+                await self._check_place(caller, incarnation)
                 await self.faces.open(incarnation)
-        except NoPortError:
+        except (NoPortError, NodeElsewhereError):
             self.enactor.carry_out(self.graph.forgotten(incarnation))
             raise
         return incarnation
+
+    async def _check_place(self, caller: Caller, incarnation: Incarnation) -> None:
+        """Raise `NodeElsewhereError` if the node's URI names another host, and its port is closed on the caller's."""
+        if caller.own or incarnation.api.host == caller.peer.text:
+            return
+        if await self.liveness.nodes.client(incarnation).refuses(_CONNECT_SECONDS):
+            raise NodeElsewhereError(
+                f"{caller.peer.text} registers {caller.caller_id} at {incarnation.api_text[:80]}, but has no node on "
+                f"port {incarnation.api.port}: a node registers from its own machine; nodes of other masters "
+                "(multimaster_fkie) cannot be registered here: start them with this master's ROS_MASTER_URI"
+            )
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         outer_port, relay_port, *more = self._open_ports(caller.peer.host)

@@ -2,9 +2,12 @@
 
 import asyncio
 import dataclasses
+import ipaddress
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -16,7 +19,7 @@ from appliance.policy.model import Address, address_of
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.rpc.connection_table import ConnectionTable, Stage
-from appliance.rpc.server import HttpRequest, Peer
+from appliance.rpc.server import HttpRequest, Peer, exceeds_limit
 from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import build_call
 from tests.support.engines import open_log
@@ -179,3 +182,28 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
         "10.0.0.1",
         "getPid",
     )
+
+
+@pytest.mark.parametrize(
+    ("status", "event"),
+    [
+        ("400 Bad Request", "malformed"),
+        ("405 Method Not Allowed", "malformed"),
+        ("415 Unsupported Media Type", "malformed"),
+        ("501 Not Implemented", "malformed"),
+        ("413 Content Too Large", "limit exceeded"),
+        ("431 Request Header Fields Too Large", "limit exceeded"),
+        ("503 Service Unavailable", "limit exceeded"),
+    ],
+)
+def test_a_request_that_is_not_http_exceeds_no_limit(status: str, event: str) -> None:
+    """A TCPROS header or a TLS handshake at RVMaster's port is recorded as malformed, whatever its size."""
+    records: list[tuple[str, str]] = []
+    trail = SimpleNamespace(
+        happened=lambda event, reason, **_more: records.append((event, reason)), pause=None, still_owing=None
+    )
+    limits = ListenerLimits(Settings(), cast(Any, trail), cast(Any, None), lambda _host: QuotaClass.NAMED)
+    peer = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
+    report = limits.troubled if exceeds_limit(status.encode()) else limits.malformed
+    report(peer, "10.0.0.9 sent something")
+    assert records == [(event, "10.0.0.9 sent something")]

@@ -88,3 +88,21 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) ->
     assert "all ports are in use" in answers[1][1]
     assert [node.name for node in world.registry.all()] == ["/n0", "/n1", "/n2", "/n10"]
     assert not any(node.calls for node in world.registry.all())
+
+
+async def test_a_node_of_another_machine_is_refused() -> None:
+    """multimaster_fkie registers nodes of other masters: the port is closed on its own host, and it gets the reason."""
+    world = await world_with(SlowFaces())
+    world.clients.gone |= {"/far", "/here"}
+    call = ("/t", "std_msgs/String")
+    answer: Any = await world.ask("registerPublisher", "/far", *call, "http://robot2:4000/")
+    assert answer[0] == 0
+    assert (
+        "10.0.0.5 registers /far at http://robot2:4000/, but has no node on port 4000: a node registers"
+        in answer[1]
+    )
+    assert world.records.events[-1] == ("deny", "/t")
+    assert world.registry.all() == []
+    # A node with another address of its machine in its URI has its port open; the caller's own address is no question.
+    for node, uri in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
+        assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]
