@@ -18,6 +18,7 @@ from appliance.relay.connections.admission import NOTHING, asked_for, bound_name
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
 from appliance.relay.connections.listening_ports import ListeningPorts
+from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.own_topic import OwnTopicPublisher
 from appliance.relay.connections.pending_connections import PendingConnections
@@ -71,6 +72,7 @@ class DataPlane:
             make_room=self._make_connection_room,
         )
         self.topics: dict[tuple[str, str], tuple[RelayedTopic, Upstream]] = {}
+        self._servers = ActionServers()
         self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
         self._own_service = OwnService(loop, self._reporter.send)
@@ -227,6 +229,7 @@ class DataPlane:
             refused=self._reporter.send,
             recorded=self._recorded,
             over=self._loop.over,
+            servers=self._servers.of,
         )
         publisher: Upstream
         if node is not None and node.monitors:
@@ -244,6 +247,10 @@ class DataPlane:
             relayed.upstream = publisher
             self._attach_monitors(relayed)
         self.topics[key, topic] = (relayed, publisher)
+        waiting = self._servers.add(key, topic, name)
+        for other, _publisher in self.topics.values() if waiting else ():
+            if other.topic in waiting:
+                other.announce()
 
     def _claims(self, relayed: RelayedTopic) -> Iterator[Mapping[str, str]]:
         """Yield the types that a topic may have: by its publisher's last header, specifications, subscribers."""
@@ -344,6 +351,7 @@ class DataPlane:
         if (key, topic) not in self.topics:
             return
         relayed, publisher = self.topics.pop((key, topic))
+        self._servers.remove(key, topic)
         if self._own.get(topic) is publisher:
             del self._own[topic]
         publisher.close()  # its remaining subscribers get nothing more

@@ -4,11 +4,11 @@ A publisher sees one connection of the relay for all subscribers. However, an ac
 cancellations, and waits until *its server* subscribes to both (actionlib, `wait_for_server`). The client recognizes the
 server by the `callerid` of the status messages. On these topics the relay opens one more connection to the publisher
 for each served subscriber, with the subscriber's `callerid`. Messages on that connection are discarded. At most sixteen
-names of a host get such a connection. The relay opens it after it has begun to serve the subscriber, so the subscriber
+names of a host get such a connection, the action's server first: it also publishes the action's status. The relay opens it after it has begun to serve the subscriber, so the subscriber
 gets everything that the publisher sends from then on.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 
 from appliance.relay.context import RelayContext
@@ -24,6 +24,33 @@ _RETRY_SECONDS = 1.0
 def looks_for_names(type_name: str) -> bool:
     """Whether a publisher of this type waits for a subscriber with a certain name."""
     return type_name.endswith(_GOAL) or type_name == _CANCEL
+
+
+class ActionServers:
+    """The nodes that publish the status of an action, by action."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, dict[str, str]] = {}
+
+    def add(self, key: str, topic: str, name: str) -> list[str]:
+        """Add a publication; return the topics whose publishers wait for this node."""
+        action, _, last = topic.rpartition("/")
+        if last != "status":
+            return []
+        self._names.setdefault(action, {})[key] = name
+        return [f"{action}/goal", f"{action}/cancel"]
+
+    def remove(self, key: str, topic: str) -> None:
+        """Forget a publication."""
+        action, _, last = topic.rpartition("/")
+        if last == "status" and action in self._names:
+            self._names[action].pop(key, None)
+            if not self._names[action]:
+                del self._names[action]
+
+    def of(self, topic: str) -> Collection[str]:
+        """Return the servers of the action that a topic belongs to."""
+        return self._names.get(topic.rpartition("/")[0], {}).values()
 
 
 class NamedSubscribers:

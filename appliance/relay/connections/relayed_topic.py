@@ -24,7 +24,7 @@ slow subscriber reaches its bounds, its oldest messages are dropped. A slow subs
 publisher is read as long as one subscriber keeps up.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
@@ -141,7 +141,8 @@ class RelayedTopic:
     `fresh`: the publisher has just appeared. `flow` holds the rate limits, and `limited(part, messages, size)` reports
     the messages that they dropped. `make_room(size)` tries to free that many bytes of other hosts, and
     `refused(message)` is called if a latched message is not kept. Once the publisher's quantum is used up (`over()`),
-    the remaining subscribers get the batch in the publisher's next turn, before more data is read.
+    the remaining subscribers get the batch in the publisher's next turn, before more data is read. `servers(topic)`
+    returns the subscribers for which an action's client waits.
     """
 
     def __init__(
@@ -160,7 +161,9 @@ class RelayedTopic:
         refused: Callable[[LatchRefused], None],
         recorded: RecorderRing | None,
         over: Callable[[], bool] = lambda: False,
+        servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
+        self._servers = servers
         self.key = key
         self.topic = topic
         self.host = host
@@ -223,7 +226,7 @@ class RelayedTopic:
         self._served.pop(member, None)
         self._row = None
         self.differs()
-        self._announce()
+        self.announce()
         self._reported = False
         self._forget_header()
         self.relieve()
@@ -332,7 +335,7 @@ class RelayedTopic:
         waiting, self._waiting = self._waiting, {}
         for member in waiting:
             self._serve(member, header)
-        self._announce()
+        self.announce()
         if self._is_wanted and self.upstream is not None:
             self.upstream.connect()
 
@@ -545,7 +548,7 @@ class RelayedTopic:
             return
         self._served[member] = self._row = None
         self.differs()
-        self._announce()
+        self.announce()
         self._reported = False
         if self._latched is not None:
             self._dropped += member.deliver(self._latched)
@@ -579,13 +582,15 @@ class RelayedTopic:
         if not self._connected and not self._served:
             self._header = None
 
-    def _announce(self) -> None:
+    def announce(self) -> None:
+        """Show the publisher its subscribers, if it looks for their names."""
         if self.upstream is not None and self._header is not None:
             self.upstream.announce(self._names, self._header.get("type", ""))
 
     def _names(self) -> frozenset[str]:
         of_host: dict[str, set[str]] = {}
-        for member in self._served:
+        servers = self._servers(self.topic)
+        for member in sorted(self._served, key=lambda member: member.caller_id not in servers):
             names = of_host.setdefault(member.host, set())
             if len(names) < _SEEN_OF_A_HOST:
                 names.add(member.caller_id)

@@ -1,13 +1,14 @@
 """One relayed topic: the story of its publisher and its subscribers."""
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
 from appliance.relay.recorder_ring import RecorderRing
 from appliance.relay.transport.frames import Batch
@@ -114,7 +115,13 @@ class Story:
     """A topic with a clock that a test sets."""
 
     def __init__(
-        self, *, memory: int = 1 << 30, fresh: bool = True, recorded: RecorderRing | None = None
+        self,
+        topic: str = "/chatter",
+        *,
+        memory: int = 1 << 30,
+        fresh: bool = True,
+        recorded: RecorderRing | None = None,
+        servers: Callable[[str], Collection[str]] = lambda _topic: (),
     ) -> None:
         self.now = 100.0
         self.share = share(memory)
@@ -122,7 +129,7 @@ class Story:
         self.limited: list[tuple[str, int, int]] = []
         self.topic = RelayedTopic(
             "k",
-            "/chatter",
+            topic,
             "/talker",
             "10.0.0.1",
             grace=0.05,
@@ -133,6 +140,7 @@ class Story:
             make_room=lambda _size: None,
             refused=self.refused.append,
             recorded=recorded,
+            servers=servers,
         )
         self.upstream = RecordedUpstream()
         self.topic.upstream = self.upstream
@@ -531,6 +539,26 @@ def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
     names, _type = scene.upstream.announced
     assert len(names) == 17
     assert {"/server", "/guest_0"} < set(names)
+
+
+def test_the_server_of_an_action_is_seen_first() -> None:
+    """A client waits for the node that publishes the action's status, behind however many subscribers of its host."""
+    servers = ActionServers()
+    scene = Story("/arm/cancel", servers=servers.of)
+    for number in range(20):
+        scene.topic.join(RecordedMember(caller_id=f"/logger_{number}"))
+    scene.topic.join(RecordedMember(caller_id="/arm_driver"))
+    scene.topic.upstream_opened({"type": "actionlib_msgs/GoalID", "md5sum": "*"})
+    assert "/arm_driver" not in scene.upstream.announced[0]
+    assert servers.add("k", "/arm/scan", "/logger_19") == []
+    assert servers.add("d", "/arm/status", "/arm_driver") == ["/arm/goal", "/arm/cancel"]
+    scene.topic.announce()
+    names, _type = scene.upstream.announced
+    assert len(names) == 16
+    assert "/arm_driver" in names
+    servers.remove("d", "/arm/status")
+    scene.topic.announce()
+    assert "/arm_driver" not in scene.upstream.announced[0]
 
 
 def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
