@@ -1,5 +1,9 @@
 """Make and keep the self-signed certificate of REST; it is made at the first start, in the api's part of the state.
 
+Clients may trust exactly this certificate, so it is replaced only when it ends, or when the configuration gives the
+appliance another name. The name of the machine is in it, but another one does not replace it: by default, a container
+has its id as name, and each recreation makes another id.
+
 The authority for hosts in tunnels does not sign the certificate, because REST also runs without tunnels. Copy
 `certificate.pem` to clients by hand, or let them pin the key's fingerprint, as the kits of hosts do.
 """
@@ -8,6 +12,7 @@ import base64
 import datetime
 import hashlib
 import ipaddress
+import re
 import socket
 import ssl
 from collections.abc import Iterable
@@ -26,12 +31,13 @@ _DAYS = 825
 _RENEW_DAYS = 30
 _TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # an earlier clock is wrong
 _HOST_NAME_LIMIT = 64
+_CONTAINER_ID = re.compile("[0-9a-f]{12}")
 
 
 def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl.SSLContext:
     """Return the server's TLS context with the stored certificate.
 
-    Make a new certificate if none is stored, or if the stored one ends soon or lacks a name. Raises `OSError`,
+    Make a new certificate if none is stored, or if the stored one ends soon or lacks one of `names`. Raises `OSError`,
     `ValueError` and `ssl.SSLError` if the stored files cannot be used.
     """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -55,11 +61,12 @@ def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: dateti
 
 def _make_if_needed(home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
     certificate, key = home / CERTIFICATE, home / KEY
-    wanted = [*dict.fromkeys([*names, "localhost", "127.0.0.1", "::1", socket.gethostname()])]
+    wanted = [*dict.fromkeys([*names, "localhost", "127.0.0.1", "::1"])]
     try:
         if certificate.exists() and key.exists() and _still_good(certificate, wanted, now):
             return False
-        _make(certificate, key, wanted, now)
+        machine = socket.gethostname()
+        _make(certificate, key, wanted if _CONTAINER_ID.fullmatch(machine) else [*wanted, machine], now)
     except ValueError as error:
         raise ValueError(
             f"{home}: {CERTIFICATE} or {KEY} is damaged: restore both from a backup, or remove them: then hosts and"
@@ -87,7 +94,10 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(hours=1))
         .not_valid_after(now + datetime.timedelta(days=_DAYS))
-        .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
+        .add_extension(
+            x509.SubjectAlternativeName([_general_name(name) for name in dict.fromkeys(names)]),
+            critical=False,
+        )
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
         .sign(key, hashes.SHA256())
@@ -106,6 +116,12 @@ def pin_of(home: Path) -> str:
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
     )
     return "sha256//" + base64.b64encode(hashlib.sha256(public).digest()).decode("ascii")
+
+
+def fingerprint_of(home: Path) -> str:
+    """Return the SHA-256 of the certificate, hexadecimal."""
+    certificate = x509.load_pem_x509_certificate((home / CERTIFICATE).read_bytes())
+    return certificate.fingerprint(hashes.SHA256()).hex()
 
 
 def _kept_key(path: Path) -> ec.EllipticCurvePrivateKey:

@@ -75,7 +75,7 @@ class ControlLink:
         self._link = Link(self._received, self._ended)
         self._kept: deque[RestCalled] = deque()
         self._dropped = 0
-        self._pin = ""
+        self._served = RestServed("")
         self.known = False  # whether this link has stated the tokens
 
     @property
@@ -89,15 +89,15 @@ class ControlLink:
         self._link.attach(channel)
         self._tell_pin()
 
-    def state_pin(self, pin: str) -> None:
-        """Send the pin of this server's key to control, now and whenever a new control connects."""
-        self._pin = pin
+    def state_served(self, pin: str, certificate: str) -> None:
+        """Send the pin of this server's key, and the hash of its certificate, to this control and to later ones."""
+        self._served = RestServed(pin, certificate)
         self._tell_pin()
 
     def _tell_pin(self) -> None:
-        if self._pin:
+        if self._served.pin:
             with contextlib.suppress(ChannelFullError):  # this link ends, and the next link gets the pin
-                self._link.send(RestServed(self._pin))
+                self._link.send(self._served)
 
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None

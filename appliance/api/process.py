@@ -22,7 +22,7 @@ import uvloop
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from appliance.api.access import TokenAuthenticator
-from appliance.api.certificate import pin_of, renew, tls_context
+from appliance.api.certificate import fingerprint_of, pin_of, renew, tls_context
 from appliance.api.control import ControlLink
 from appliance.api.etags import ConditionalGet
 from appliance.api.history import SampleHistory, measures_of
@@ -111,7 +111,7 @@ class _Api:
         try:
             context = await asyncio.to_thread(self._context) if self._settings.api_tls else None
             if context is not None:
-                self._control.state_pin(pin_of(self._settings.state / "api"))
+                self._state_served()
             await listener.start(self._socket, context)
         except (OSError, ValueError) as error:
             self._report(messages.Failed(f"REST cannot be served: {error}"))
@@ -143,8 +143,13 @@ class _Api:
             try:
                 if await asyncio.to_thread(renew, context, *self._certified()):
                     _log.warning("REST has a new certificate, of the same key")
+                    self._state_served()
             except (OSError, ValueError) as error:
                 _log.error("the certificate of REST cannot be renewed", reason=str(error))
+
+    def _state_served(self) -> None:
+        home = self._settings.state / "api"
+        self._control.state_served(pin_of(home), fingerprint_of(home))
 
     def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
         address = self._settings.api_address

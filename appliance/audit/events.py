@@ -90,6 +90,8 @@ EVENTS: dict[str, str] = {
     "topic looked into": "Messages of a topic were shown; `detail` has who requested them, and the `seconds` that the"
     " record covers.",
     "rest call": "A REST call was answered; `detail` has the token's name in `who`, the method and the status.",
+    "rest certificate replaced": "REST has another certificate, because the earlier one ended soon or lacked a name;"
+    " `detail` has the SHA-256 of both. Clients that trust exactly the earlier one refuse it.",
     "evidence exported": "An evidence bundle was made; `detail` has who requested it, the hash of its manifest and its"
     " time span.",
     "order refused": "RVMaster rejected an order over REST: no valid token, role or proof; `detail.verb` is the order.",
@@ -167,7 +169,8 @@ SEVERITIES: dict[str, Severity] = {
             "bundle metadata rejected", "bundle refused",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
             "forwarding failed", "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
-            "policy refused", "recording missed", "renewal refused", "specifications refused", "switchover failed",
+            "policy refused", "recording missed", "renewal refused", "rest certificate replaced",
+            "specifications refused", "switchover failed",
             "tunnel refused",
         ),
         Severity.ALARM: (

@@ -17,6 +17,7 @@ from appliance.control.overview import hosts_connected
 from appliance.control.queries import Queries
 from appliance.control.request_methods import request_methods
 from appliance.control.rest import RestLink
+from appliance.control.rest_certificate import RestCertificate
 from appliance.control.standby_orders import StandbyOrders, StandbySource
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.control.token_orders import TokenOrders
@@ -137,6 +138,9 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             tokens,
             trail,
             served=certification.served_by,
+            certified=RestCertificate(
+                base.store, trail, "" if base.pair is None else base.pair.membership.name
+            ).stated,
             require_proof=settings.api_require_proof,
         )
     )

@@ -58,7 +58,8 @@ _MOST_SLOW = 16
 class RestLink:
     """The link to the api.
 
-    `served(pin)` is called with the pin by which hosts recognise the api. `require_proof`: every change needs a signed
+    `served(pin)` is called with the pin by which hosts recognise the api, and `certified(sha256)`
+    with the fingerprint of its certificate. `require_proof`: every change needs a signed
     request, because a bare token is not enough.
     """
 
@@ -69,6 +70,7 @@ class RestLink:
         trail: AuditTrail,
         *,
         served: Callable[[str], None],
+        certified: Callable[[str], None],
         require_proof: bool,
     ) -> None:
         self._administration = administration
@@ -81,7 +83,7 @@ class RestLink:
         self._worker: asyncio.Task[None] | None = None  # the worker of the present link
         self._slow: set[asyncio.Task[None]] = set()
         self._workers: set[asyncio.Task[None]] = set()  # the workers of present and ended links
-        self._served = served
+        self._served, self._certified = served, certified
 
     def attach(self, channel: Channel) -> None:
         """Serve a new api process, and send the usable tokens to it."""
@@ -111,8 +113,9 @@ class RestLink:
                 self._record(message)
             case TokenUsed(token):
                 self._tokens.used(token)
-            case RestServed(pin):
+            case RestServed(pin, certificate):
                 self._served(pin)
+                self._certified(certificate)
             case _:
                 self._link.close()
                 self._lost(f"it sent {type(message).__name__}")

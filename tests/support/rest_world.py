@@ -156,7 +156,8 @@ class RestWorld:
             require_room=lambda: None,
         )
         rest = RestLink(
-            administration, cast(Any, self.tokens), cast(Any, self.trail), served=lambda _pin: None, require_proof=False
+            administration, cast(Any, self.tokens), cast(Any, self.trail),
+            served=lambda _pin: None, certified=lambda _sha256: None, require_proof=False,
         )  # fmt: skip
         rest.attach(self._ends[0])
         self.control.attach(self._ends[1])

@@ -38,6 +38,14 @@ def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
         assert not any("env_file" in one or "secrets" in one for one in services), name
 
 
+def test_each_appliance_has_a_name() -> None:
+    """Without `hostname`, its name is the id of the container, which each upgrade changes."""
+    named = {"compose.yaml": ["appliance"], "compose.standby.yaml": ["a", "b"]}
+    for file, services in named.items():
+        made = yaml.safe_load((ROOT / file).read_text())["services"]
+        assert all(made[service]["hostname"].startswith("rosrv") for service in services)
+
+
 def test_every_process_is_in_the_table_of_rights() -> None:
     """The documentation names each process with its user and capabilities."""
     text = (ROOT / "docs" / "next-to-your-robot.md").read_text()

@@ -97,9 +97,13 @@ class RestCalled(Message):
 
 
 class RestServed(Message):
-    """The api's first message: the pin of its key (`sha256//…`), empty in clear text."""
+    """The api's first message, repeated for a new certificate: the pin of its key (`sha256//…`), empty in clear text.
+
+    `certificate` is the SHA-256 of the certificate.
+    """
 
     pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
+    certificate: Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{64})?$")] = ""
 
 
 ApiLink = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.api.certificate import CERTIFICATE, KEY, pin_of, renew, tls_context
+from appliance.api.certificate import CERTIFICATE, KEY, fingerprint_of, pin_of, renew, tls_context
 
 NOW = datetime.datetime.now(datetime.UTC)
 
@@ -62,6 +62,19 @@ def test_it_is_reused_and_only_its_owner_reads_the_key(tmp_path: Path) -> None:
     tls_context(tmp_path, ["10.1.2.3"], NOW + datetime.timedelta(days=100))
     assert (tmp_path / CERTIFICATE).read_bytes() == first
     assert stat.S_IMODE((tmp_path / KEY).stat().st_mode) == 0o600
+
+
+def test_a_recreated_container_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The id of a container is not in it, and another name of the machine does not replace it."""
+    made = []
+    for name in ("0a1b2c3d4e5f", "f5e4d3c2b1a0", "rosrv", "robot-7"):
+        monkeypatch.setattr(socket, "gethostname", lambda name=name: name)
+        tls_context(tmp_path, ["10.1.2.3"], NOW)
+        made.append(fingerprint_of(tmp_path))
+    assert len(set(made)) == 1
+    assert b"0a1b2c3d4e5f" not in ssl.PEM_cert_to_DER_cert((tmp_path / CERTIFICATE).read_text())
+    tls_context(tmp_path, ["10.1.2.4"], NOW)
+    assert b"robot-7" in ssl.PEM_cert_to_DER_cert((tmp_path / CERTIFICATE).read_text())
 
 
 @pytest.mark.parametrize(("names", "days"), [(["10.1.2.4"], 0), (["10.1.2.3"], 800)])

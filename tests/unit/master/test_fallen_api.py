@@ -43,7 +43,10 @@ class World:
     def begin(self, *, require_proof: bool) -> None:
         """Start control again with the saved tokens."""
         self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # as above
-        self.link = RestLink(self, self.tokens, self, served=print, require_proof=require_proof)  # type: ignore[arg-type]  # as above
+        parts: Any = self
+        self.link = RestLink(
+            parts, self.tokens, parts, served=print, certified=print, require_proof=require_proof
+        )
 
     def token_changed(self) -> None:
         """Send no notification."""
