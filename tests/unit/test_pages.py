@@ -20,6 +20,8 @@ WITH_LINKS = [
 _CODE = re.compile(r"```.*?```|`[^`\n]+`|^ {4,}\S.*$", re.DOTALL | re.MULTILINE)
 _CALL = re.compile(r"(?:^|[`(]|\$ |sudo |bin/|appliance |&& )rosrv ([a-z][^\n`|…]*)", re.MULTILINE)
 
+_ADVICE = re.compile(r"\brosrv ([a-z][a-z-]*(?: [^\n`|…\"'<;()]*)?)")
+
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_page_is_in_the_list_for_readers(page: Path) -> None:
@@ -89,6 +91,29 @@ def test_commands_of_pages_exist(page: Path) -> None:
     groups = {name.split()[0] for name in options}
     calls = [call.strip() for code in _CODE.findall(page.read_text()) for call in _CALL.findall(code)]
     assert [call for call in calls if call not in groups and not _exists(call, options)] == []
+
+
+def test_options_that_the_product_names_exist() -> None:
+    """Advice in errors, in the console and in files of the examples has only options that its command still has."""
+    options = {
+        name: {one for each in verb.params for one in (*each.opts, *each.secondary_opts, "--help")}
+        for name, verb in commands()
+    }
+    files = [*(ROOT / "appliance").rglob("*.py"), *(ROOT / "appliance/api/console/js").rglob("*.js")]
+    files += [
+        *(ROOT / "examples").rglob("*.y*ml"),
+        *(ROOT / "examples").rglob("*.sh"),
+        *ROOT.glob("compose*.yaml"),
+    ]
+    gone, seen = [], 0
+    for file in files:
+        for call in _ADVICE.findall(file.read_text()):
+            name = max((one for one in options if f"{call} ".startswith(f"{one} ")), key=len, default=None)
+            given = set(re.findall(r"(?<=[ \[])--[a-z-]+", call)) if name is not None else set()
+            seen += len(given)
+            gone += [f"{file.name}: {call}"] if name is not None and given - options[name] else []
+    assert gone == []
+    assert seen > 50
 
 
 def _exists(call: str, options: dict[str, set[str]]) -> bool:

@@ -1,5 +1,7 @@
 """The OpenAPI document: units of times and durations, ETags, examples and descriptions."""
 
+import re
+from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
@@ -10,6 +12,7 @@ from appliance.api.contract import EXAMPLES, WORDS, is_described
 from tests.support.asgi import requested
 
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
+CONSOLE = Path(__file__).parents[3] / "appliance" / "api" / "console" / "js"
 _UNITS = ("seconds", "days")
 _IN_NAME = (*_UNITS, "_us", "_per_second", "_seconds")
 _IN_WORDS = (
@@ -152,3 +155,25 @@ def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
         validator = jsonschema_rs.Draft202012Validator(schema | {"components": contract["components"]})
         assert [str(error.message) for error in validator.iter_errors(value)] == [], schema
     assert len(told) > len(EXAMPLES)
+
+
+def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> None:
+    """A field that the console reads from a row of an answer exists: no view waits for one that was removed."""
+    schemas = contract["components"]["schemas"].values()
+    fields = {name for schema in schemas for name in schema.get("properties", {})}
+    texts = [path.read_text() for path in CONSOLE.rglob("*.js")]
+    own = {
+        name for text in texts for name in re.findall(r"\b([a-z]\w*)\b(?=\s*[:,}=])(?<!\.)", _unread(text))
+    }
+    read = {
+        name
+        for text in texts
+        for name in re.findall(r"\b(?:row|one|body)\??\.([a-z][a-z0-9_]*)\b(?!\()", text)
+    }
+    assert {"would_drop", "shadow", "held"} <= read
+    assert sorted(read - fields - own - {"length"}) == []
+
+
+def _unread(text: str) -> str:
+    """Return a text without the members that it reads."""
+    return re.sub(r"\??\.[a-z]\w*", "", text)
