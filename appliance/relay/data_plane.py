@@ -242,6 +242,7 @@ class DataPlane:
                 relayed,
                 lambda: self._claims(relayed),
                 lambda: self._registered_type(key, topic),
+                self._not_all_is_stated,
                 lambda header: self.interceptor.objection(topic, header),
             )
             relayed.upstream = publisher

@@ -64,7 +64,7 @@ class RelayLimits:
     """The longest wait between two tries."""
 
     linger: float = 2.0
-    """How long a publisher's connection is kept after its last subscriber left."""
+    """How long a publisher's connection is kept after its last subscriber left, during a reload or a restart."""
 
     farewell: float = 2.0
     """How long a refused peer may take to read the reason before its connection is closed."""

@@ -4,8 +4,8 @@ A publisher sees one connection of the relay for all subscribers. However, an ac
 cancellations, and waits until *its server* subscribes to both (actionlib, `wait_for_server`). The client recognizes the
 server by the `callerid` of the status messages. On these topics the relay opens one more connection to the publisher
 for each served subscriber, with the subscriber's `callerid`. Messages on that connection are discarded. At most sixteen
-names of a host get such a connection, the action's server first: it also publishes the action's status. The relay opens it after it has begun to serve the subscriber, so the subscriber
-gets everything that the publisher sends from then on.
+names of a host get such a connection, the action's server first: it also publishes the action's status. The relay opens
+it after it has begun to serve the subscriber, so the subscriber gets everything that the publisher sends from then on.
 """
 
 from collections.abc import Collection, Mapping

@@ -2,7 +2,7 @@
 
 A topic has one upstream (the connection to the publisher), subscribers that wait for the publisher's header, and
 subscribers that are served. The upstream stays open while a subscriber, a monitor or a tap (a consumer inside
-the appliance) needs it, and a short time longer.
+the appliance) needs it, and during a reload or a restart a short time longer.
 
 Subscribers stay connected when the upstream is lost. Their publication stays valid until the control process withdraws
 it, which happens when the node is gone. Cutting subscribers would be costly: rospy never reconnects to an address that
@@ -94,7 +94,7 @@ class Upstream:
         """Connect, because the topic is wanted."""
 
     def release(self) -> None:
-        """Close the connection soon, because the topic is no longer wanted."""
+        """Close the connection, because the topic is no longer wanted."""
 
     def pause(self, seconds: float) -> None:
         """Stop reading until `resume`, for at most these seconds."""

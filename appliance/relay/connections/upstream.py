@@ -36,7 +36,10 @@ _REASON = 1000  # most characters of a reported error; a publisher chooses the t
 
 
 class PublisherConnection(Upstream):
-    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: accepted)."""
+    """The upstream of one relayed topic; `objection(header)` returns why a publisher is refused (empty: accepted).
+
+    `unsettled()`: a reload or a restart is under way, after which subscribers return.
+    """
 
     def __init__(
         self,
@@ -44,6 +47,7 @@ class PublisherConnection(Upstream):
         topic: RelayedTopic,
         claims: Callable[[], Iterable[Mapping[str, str]]],
         registered_type: Callable[[], str],
+        unsettled: Callable[[], bool],
         objection: Callable[[dict[str, str]], str] = lambda _header: "",
     ) -> None:
         self._loop = context.loop
@@ -84,6 +88,7 @@ class PublisherConnection(Upstream):
         self._header: dict[str, str] = {}
         self._named_subscribers = NamedSubscribers(context, topic.topic, topic.host)
         self._introductions = Introductions(claims, registered_type)
+        self._unsettled = unsettled
         self._introduced = False  # whether this connection was sent the header
         self._objection = objection
         self._objected = ""
@@ -98,10 +103,14 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def release(self) -> None:
-        """Keep the connection for a short time, for a subscriber that returns at once."""
+        """Close the connection after this turn of the loop, because a lazy publisher has to learn that nobody listens.
+
+        Keep it for a short time while subscribers may return.
+        """
         self._wanted = False
         if self._linger is None:
-            self._linger = self._loop.after(self._limits.linger, self._close_unwanted)
+            seconds = self._limits.linger if self._unsettled() else 0.0
+            self._linger = self._loop.after(seconds, self._close_unwanted)
 
     def ask(self) -> None:
         """Ask control for the publisher's address; repeat the question if no answer comes."""

@@ -53,7 +53,7 @@ from roswire.tcpros import (
 )
 from tests.support.steps import steps
 from tests.unit.relay.dialogue import Dialogue
-from tests.unit.relay.world import ASK, CALL, HEADER, IMPATIENT, LIMITS, LOOPBACK, Peer, World
+from tests.unit.relay.world import ASK, CALL, HEADER, IMPATIENT, LIMITS, LOOPBACK, UNHURRIED, Peer, World
 from tests.unit.transcripts import transcripts
 
 pytestmark = pytest.mark.nightly
@@ -67,7 +67,8 @@ DIALOGUES = transcripts(Path(__file__).with_name("dialogues.txt"))
 @pytest.mark.parametrize("title", DIALOGUES, ids=DIALOGUES)
 def test_dialogue(title: str) -> None:
     """Each step happens, in this order (`dialogue.py` has the steps)."""
-    world = World(IMPATIENT if title.endswith("(impatient)") else LIMITS)
+    limits = {"(impatient)": IMPATIENT, "(unhurried)": UNHURRIED}.get(title.rpartition(" ")[2], LIMITS)
+    world = World(limits)
     try:
         dialogue = Dialogue(world)
         for line in DIALOGUES[title]:

@@ -45,6 +45,8 @@ LIMITS = replace(
 )
 IMPATIENT = replace(LIMITS, header_seconds=0.3, grant_seconds=0.1, connect_seconds=1.0, service_seconds=1.0)
 """For tests of these limits only: a busy machine may take longer for any step."""
+UNHURRIED = replace(LIMITS, linger=3600.0)
+"""For tests that something does not wait for a later subscriber."""
 HEADER = {
     "callerid": "/talker",
     "type": "std_msgs/String",
