@@ -12,7 +12,7 @@ from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.configuration.settings import Settings
 from appliance.control.host_authority import HostAuthority, make_host_authority
-from appliance.control.host_blocks import BlockTable
+from appliance.control.host_blocks import BlockTable, blocks_at_start
 from appliance.control.listener_limits import ListenerLimits
 from appliance.control.open_audit import open_audit
 from appliance.control.policies import Policies
@@ -115,7 +115,16 @@ async def make_foundation(
     signing = SignerRequests(audit)
     receipts = ReceiptFloor(settings)
     held_by = lifeline.log_held()
-    audit.set(open_audit(settings, signing, held_by, lambda host: _class_of(quota_class, host), receipts))
+    audit.set(
+        open_audit(
+            settings,
+            signing,
+            held_by,
+            class_of=lambda host: _class_of(quota_class, host),
+            kept_for=lambda host: bool(quota_class) and quota_class().has_reserve(host),
+            receipts=receipts,
+        )
+    )
     plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
     trail = AuditTrail(
         audit(),
@@ -127,7 +136,7 @@ async def make_foundation(
         settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
     )
     replication = make_replication(settings, pair, store)
-    blocks = BlockTable.of(store, settings.state / "control")
+    blocks = blocks_at_start(store, pair, settings.state / "control")
     # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
@@ -145,7 +154,7 @@ async def make_foundation(
         robot=robot_addresses(settings, pair.membership.witness if pair is not None else None),
         hosts=lambda: tunnels().addresses,
         blocks=lambda: blocks.reasons,
-        live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it gets its value later
+        live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
         changed=lambda before, policy: enforcement().policy_changed(before, policy),
         carried_out=lambda: enforcement().carried_out(),
         site_keys=settings.site_keys,

@@ -4,8 +4,8 @@ Run the robot with `audit-only = all`, then learn from the recorded decisions. E
 that used it; nothing else is granted. Three keys are wider than observed, because the next run needs them:
 
 1. An anonymous node name (`/rostopic_4711_1700000000000`) becomes a pattern (`/rostopic_*`).
-2. `searchParam` needs the right to find every parameter that it tries, found or not: the next run may have it, and a
-   search that may not tell is denied.
+2. `searchParam` needs the right to find every parameter that it tries, whether it is found or not: the next run may
+   have it, and a search without that right is denied.
 3. The key of a parameter becomes the key of its namespace (`/arm` becomes `/arm/**`). A call on a namespace needs the
    right on every parameter in it. So a host that may access a namespace may also access narrower keys in it.
 
@@ -79,8 +79,10 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
 
 def covered(given: Network, places: Iterable[Network]) -> bool:
     """Whether all addresses of a network are among these places."""
-    # mypy does not see that both are of one version.
-    return any(given.version == place.version and given.subnet_of(place) for place in places)  # type: ignore[arg-type]
+    return any(
+        given.version == place.version and given.subnet_of(place)  # type: ignore[arg-type]  # both are of one version
+        for place in places
+    )
 
 
 def _needed(observation: Observation) -> Iterator[Request]:

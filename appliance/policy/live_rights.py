@@ -68,7 +68,7 @@ def may_keep(policy: Policy, live: LiveRight) -> Decision:
 
 
 def deprived(policy: Policy, things: Iterable[LiveRight]) -> dict[Address, set[str]]:
-    """Return the hosts with live rights that may keep none of them under a policy, with their nodes."""
+    """Return the hosts that have live rights and keep none of them under a policy, with the names of their nodes."""
     lost: dict[Address, set[str]] = {}
     kept: set[Address] = set()
     for live in things:

@@ -240,10 +240,10 @@ class DataPlane:
             publisher = PublisherConnection(
                 self._context,
                 relayed,
-                lambda: self._claims(relayed),
-                lambda: self._registered_type(key, topic),
-                self._not_all_is_stated,
-                lambda header: self.interceptor.objection(topic, header),
+                claims=lambda: self._claims(relayed),
+                registered_type=lambda: self._registered_type(key, topic),
+                unsettled=self._not_all_is_stated,
+                objection=lambda header: self.interceptor.objection(topic, header),
             )
             relayed.upstream = publisher
             self._attach_monitors(relayed)

@@ -45,6 +45,7 @@ class PublisherConnection(Upstream):
         self,
         context: RelayContext,
         topic: RelayedTopic,
+        *,
         claims: Callable[[], Iterable[Mapping[str, str]]],
         registered_type: Callable[[], str],
         unsettled: Callable[[], bool],
