@@ -22,7 +22,7 @@ from appliance.control.robot import robot_addresses
 from appliance.control.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.hosts.host_table import HostTable
-from appliance.hosts.hosts_file import BUNDLED_HOSTS, DeclaredHosts
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enforcement
@@ -190,7 +190,8 @@ async def make_foundation(
 
 def make_host_table(settings: Settings, store: StateStore) -> HostTable:
     """Return the table of the hosts in the store, with those that hosts.yaml or a bundle declares."""
-    declared = DeclaredHosts(settings.hosts, store.settings().get(BUNDLED_HOSTS, ""))
+    kept = store.settings()
+    declared = DeclaredHosts(settings.hosts, kept.get(BUNDLED_HOSTS, ""), kept.get(DECLARED_HOSTS, ""))
     return HostTable(store, settings.ipsec.pool, declared)
 
 

@@ -26,7 +26,7 @@ from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment_tokens import LONGEST_SECONDS, MOST
 from appliance.hosts.host_table import LONGEST_DAYS, HostRefusedError
-from appliance.hosts.hosts_file import BUNDLED_HOSTS, DeclaredHostsError
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHostsError
 from appliance.hosts.rest_address import NO_TUNNELS
 from appliance.hosts.self_service import HostSelfService
 from appliance.hosts.view import HostView
@@ -64,6 +64,8 @@ class HostEnrolment:
         self._find_endpoint = find_endpoint
         self._expel = expel
         self._carried_out = carried_out
+        self._kept_text = self._store.settings().get(DECLARED_HOSTS, "")
+        self._keep_text()
 
     # --- queries ---
 
@@ -243,6 +245,7 @@ class HostEnrolment:
         except DeclaredHostsError as error:
             raise HostRefusedError(f"{error}; the previous declaration stays in force") from error
         self._store.save_setting(BUNDLED_HOSTS, self._table.declared.bundled)
+        self._keep_text()
         after = {row.name for row in self._table.admitted()}
         self._table.changed()
         taken = 0
@@ -274,6 +277,13 @@ class HostEnrolment:
             sorted(before - after),
             divergence,
         )
+
+    def _keep_text(self) -> None:
+        """Store the file's valid text, so that a start with an invalid file keeps these declarations."""
+        text = self._table.declared.text
+        if text != self._kept_text:
+            self._store.save_setting(DECLARED_HOSTS, text)
+            self._kept_text = text
 
     def _require_not_enrolled(self, name: str) -> None:
         row = self._table.rows.get(name)

@@ -8,9 +8,11 @@ hosts:
     groups: [operators]     # optional
     tunnel: true            # false: enrolled or not, its tunnel stays closed
 
-An invalid file changes nothing: the previously read hosts stay declared, and the status reports the error.
+An invalid file changes nothing, neither on reload nor at a start: the previously read hosts stay declared, and the
+status reports the error.
 """
 
+import contextlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -27,6 +29,8 @@ from appliance.policy.policy_findings import quoted
 IN_BUNDLE = "hosts.yaml of the bundle"
 BUNDLED_HOSTS = "bundled hosts"
 """The setting of the store that keeps the text of a bundle."""
+DECLARED_HOSTS = "declared hosts"
+"""The setting of the store that keeps the file's last valid text."""
 
 _LARGEST = 1 << 20
 _MOST_GROUPS = 32
@@ -52,18 +56,24 @@ class DeclaredHost:
 class DeclaredHosts:
     """The file's last valid content, or that of a bundle; `error` is the reason if the text is invalid now.
 
-    `bundled` is the text of a bundle; empty: the file is in use.
+    `bundled` is the text of a bundle; empty: the file is in use. `text` is the file's last valid text. At a start it is the
+    stored one, which is used if the file is invalid now.
     """
 
-    def __init__(self, path: Path, bundled: str = "") -> None:
+    def __init__(self, path: Path, bundled: str = "", text: str = "") -> None:
         self.path = path
         self.bundled = bundled
         self.hosts: dict[str, DeclaredHost] = {}
-        self.error = ""
+        self.error, self.text = "", text
         try:
-            self.hosts = parse_declared(bundled, IN_BUNDLE) if bundled else read_declared(path)
+            if bundled:
+                self.hosts = parse_declared(bundled, IN_BUNDLE)
+            else:
+                self.text, self.hosts = _read(path)
         except DeclaredHostsError as error:
             self.error = str(error)
+            with contextlib.suppress(DeclaredHostsError):  # an earlier version read it
+                self.hosts = parse_declared(text, str(path))
 
     @property
     def there(self) -> bool:
@@ -73,7 +83,7 @@ class DeclaredHosts:
     def reload(self) -> None:
         """Read the file again. Raises `DeclaredHostsError`; the earlier content is then kept."""
         try:
-            self.hosts = read_declared(self.path)
+            self.text, self.hosts = _read(self.path)
         except DeclaredHostsError as error:
             self.error = str(error)
             raise
@@ -97,14 +107,18 @@ class DeclaredHosts:
 
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
     """Return the declared hosts by name; none without a file. Raises `DeclaredHostsError`."""
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[str, dict[str, DeclaredHost]]:
     try:
         text = read_given_text(path)
     except FileNotFoundError:
-        return {}
+        return "", {}
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise DeclaredHostsError(f"{path}: cannot be read: {reason}") from error
-    return parse_declared(text, str(path))
+    return text, parse_declared(text, str(path))
 
 
 def parse_declared(text: str, path: str) -> dict[str, DeclaredHost]:

@@ -87,6 +87,21 @@ def test_an_invalid_file_changes_nothing(tmp_path: Path) -> None:
     assert (declared.hosts, declared.error) == ({}, "")
 
 
+def test_an_invalid_file_changes_nothing_at_a_start(tmp_path: Path) -> None:
+    """A tunnel that the last valid file closed stays closed over a restart; a file that is gone declares no host."""
+    path = tmp_path / "hosts.yaml"
+    path.write_text("hosts:\n  - {name: a, tunnel: false}\n")
+    kept = DeclaredHosts(path).text
+    for broken in (b"hosts: 5\n", b"\xff"):
+        path.write_bytes(broken)
+        declared = DeclaredHosts(path, text=kept)
+        assert not declared.wants("a")
+        assert "hosts.yaml" in declared.error
+        assert declared.text == kept
+    path.unlink()
+    assert DeclaredHosts(path, text=kept).wants("a")
+
+
 def test_the_shipped_file_is_read() -> None:
     """ipsec/hosts.yaml declares no host, and its example declares one."""
     path = Path(__file__).parents[3] / "ipsec" / "hosts.yaml"
