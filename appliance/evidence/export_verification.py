@@ -28,7 +28,8 @@ class ExportVerification(msgspec.Struct, kw_only=True):
     """The result of a verification; `ok` if nothing is wrong.
 
     The export has `records` records, from sequence `first` to `last`: `proven` of them lead to a signed checkpoint,
-    `unsealed` come after the last one. `left_out` records between `first` and `last` are not in the export. `logs` are
+    `unsealed` come after the last one. `left_out` records between `first` and `last` are not in the
+    export, which is a finding unless it is an excerpt. `logs` are
     the ids of the logs that the checkpoints name.
     """
 
@@ -44,8 +45,12 @@ class ExportVerification(msgspec.Struct, kw_only=True):
     findings: list[str] = []
 
 
-def verify_export(file: Path, key: bytes) -> ExportVerification:
-    """Verify an export with the raw public key. Raises `ExportUnreadableError`."""
+def verify_export(file: Path, key: bytes, *, excerpt: bool) -> ExportVerification:
+    """Verify an export with the raw public key. Raises `ExportUnreadableError`.
+
+    Only of an `excerpt`, which a filter made, may records be missing in between: nothing in the export tells them from
+    records that were removed later.
+    """
     result = ExportVerification(key=key.hex())
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -62,11 +67,20 @@ def verify_export(file: Path, key: bytes) -> ExportVerification:
         except ValueError as error:
             verifier.findings.append(f"a signature cannot be read: {error}")
     result.findings = verifier.findings
-    result.ok = not result.findings
-    result.proven = sealed if result.ok else 0
+    result.proven = 0 if result.findings else sealed
     result.unsealed = result.records - sealed
     result.left_out = max(0, result.last - result.first + 1 - result.records)
+    result.findings += gaps(result, excerpt=excerpt)
+    result.ok = not result.findings
     return result
+
+
+def gaps(result: ExportVerification, *, excerpt: bool) -> list[str]:
+    """Return a finding if records are missing in an export that is not an excerpt."""
+    if excerpt or not result.left_out:
+        return []
+    where = f"from {result.first} to {result.last}"
+    return [f"{result.left_out} records {where} are missing: if a filter left them out, give --excerpt"]
 
 
 def _store(file: Path, stored: IO[bytes], result: ExportVerification) -> int:

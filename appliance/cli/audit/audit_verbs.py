@@ -143,6 +143,12 @@ def verify(
             "--export", help="Deprecated: verify this output of `rosrv audit export` instead; needs --key"
         ),
     ] = None,
+    excerpt: Annotated[
+        bool,
+        typer.Option(
+            "--excerpt", help="With --export: a filter made it, so records may be missing in between"
+        ),
+    ] = False,
     other: Annotated[
         Path | None,
         typer.Option(
@@ -172,8 +178,11 @@ def verify(
     if export_file is not None and other is not None:
         fail("--export and --other exclude each other: verify the export alone", 2)
     if export_file is not None:
-        _verify_export(export_file, key, copies=checkpoints is not None, as_json_lines=appliance.as_json)
+        copies = checkpoints is not None
+        _verify_export(export_file, key, copies=copies, excerpt=excerpt, as_json_lines=appliance.as_json)
         return
+    if excerpt:
+        fail("--excerpt needs --export: a log is verified as a whole", 2)
     with Errors():
         source = appliance.audit()
         partner = None if other is None else _files(source, other)
@@ -211,7 +220,7 @@ def _print_result(result: _R, printed: Callable[[_R], None], *, as_json_lines: b
         raise typer.Exit(1)
 
 
-def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines: bool) -> None:
+def _verify_export(file: Path, key: Path | None, *, copies: bool, excerpt: bool, as_json_lines: bool) -> None:
     with Errors():
         if key is None or copies:
             fail(
@@ -222,7 +231,7 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
         note(
             "--export is deprecated: use `rosrv evidence export`, and `rosrv evidence verify` for its bundle"
         )
-        result = verify_export(file, read_public_key(key))
+        result = verify_export(file, read_public_key(key), excerpt=excerpt)
         _print_result(result, print_export_verification, as_json_lines=as_json_lines)
 
 

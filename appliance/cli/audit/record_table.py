@@ -119,7 +119,7 @@ def print_export_verification(result: ExportVerification) -> None:
     write(
         "The records are unchanged."
         if result.ok
-        else "The export was tampered with, or belongs to another key."
+        else "The export was tampered with, is an excerpt, or belongs to another key."
     )
 
 

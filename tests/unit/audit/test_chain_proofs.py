@@ -16,7 +16,12 @@ from appliance.audit.record_format import as_json
 from appliance.audit.retention import Retention
 from appliance.audit.search import export
 from appliance.audit.signatures import read_public_key
-from appliance.evidence.export_verification import ExportUnreadableError, ExportVerification, verify_export
+from appliance.evidence.export_verification import (
+    ExportUnreadableError,
+    ExportVerification,
+    gaps,
+    verify_export,
+)
 from tests.support.audit import decision, settle
 from tests.support.engines import ByHand
 from tests.unit.audit.conftest import MakeLog, Notary
@@ -55,10 +60,12 @@ def exported(log: Path, wanted: Filter, page: int = 1000) -> list[dict[str, Any]
     return [json.loads(evidence_line(*one)) for one in evidence(log, wanted, page)]
 
 
-def checked(lines: list[dict[str, Any]], place: Path, key: bytes) -> ExportVerification:
+def checked(
+    lines: list[dict[str, Any]], place: Path, key: bytes, *, excerpt: bool = True
+) -> ExportVerification:
     """Return a reviewer's findings in a file of these lines."""
     place.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    return verify_export(place, key)
+    return verify_export(place, key, excerpt=excerpt)
 
 
 @pytest.mark.nightly
@@ -81,6 +88,31 @@ def test_a_line_is_a_record_with_its_position(log: Path) -> None:
         chain = line.pop("chain")
         assert line == json.loads(as_json(entry))
         assert set(chain) >= {"previous", "hash", "then"}
+
+
+@pytest.mark.parametrize(
+    ("left_out", "excerpt", "found"), [(0, False, 0), (1, False, 1), (1, True, 0), (0, True, 0)]
+)
+def test_a_gap_is_a_finding_unless_it_is_declared(left_out: int, found: int, *, excerpt: bool) -> None:
+    """Nothing in an export tells a record that was removed from one that a filter left out."""
+    result = ExportVerification(key="", records=3 - left_out, first=7, last=9, left_out=left_out)
+    assert (
+        gaps(result, excerpt=excerpt)
+        == ["1 records from 7 to 9 are missing: if a filter left them out, give --excerpt"] * found
+    )
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("excerpt", [False, True])
+def test_only_an_excerpt_may_lack_records(log: Path, public: bytes, tmp_path: Path, *, excerpt: bool) -> None:
+    """What a filter left out looks like what was removed afterwards, so an excerpt is declared."""
+    whole = checked(exported(log, Filter()), tmp_path / "x.ndjson", public, excerpt=excerpt)
+    assert (whole.ok, whole.left_out) == (True, 0)
+    part = checked(exported(log, Filter(decision=("deny",))), tmp_path / "y.ndjson", public, excerpt=excerpt)
+    assert part.left_out > 0
+    assert part.proven > 0
+    assert part.ok is excerpt
+    assert ["--excerpt" in finding for finding in part.findings] == [True] * (not excerpt)
 
 
 def _change(lines: list[dict[str, Any]]) -> None:
@@ -160,11 +192,11 @@ def test_other_files_are_not_valid_exports(tmp_path: Path, public: bytes, text: 
     file.write_text(text)
     if text:
         with pytest.raises(ExportUnreadableError, match=r"x\.ndjson:1"):
-            verify_export(file, public)
+            verify_export(file, public, excerpt=False)
     else:
-        assert not verify_export(file, public).ok
+        assert not verify_export(file, public, excerpt=False).ok
     with pytest.raises(ExportUnreadableError, match="No such file"):
-        verify_export(tmp_path / "missing", public)
+        verify_export(tmp_path / "missing", public, excerpt=False)
 
 
 @pytest.mark.nightly
