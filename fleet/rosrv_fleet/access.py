@@ -12,6 +12,8 @@ from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
 PEER_CERTIFICATE = "peer_certificate"
 """The key in the ASGI scope's `state` with the verified client certificate (DER)."""
+IS_ROBOT = "is_robot"
+"""The key in `state` that says whether this is the certificate of an enrolled robot."""
 COOKIE = "__Host-rosrv-fleet"
 """The console's cookie: sent only over TLS and to this host, and hidden from scripts."""
 
@@ -42,13 +44,19 @@ def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
     return identify
 
 
+def token_of(request: Request) -> str:
+    """Return the token of a request, not verified; empty if it has none."""
+    scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
+    text = bearer if scheme.lower() == "bearer" else request.cookies.get(COOKIE, "")
+    return text.strip()
+
+
 def holder_of(tokens: OperatorTokens, role: FleetRole) -> Callable[[Request], Awaitable[OperatorToken]]:
     """Return the dependency that requires a token with this role; it answers 401 or 403 otherwise."""
 
     async def identify(request: Request) -> OperatorToken:
-        scheme, _, bearer = request.headers.get("authorization", "").partition(" ")
-        text = bearer if scheme.lower() == "bearer" else request.cookies.get(COOKIE, "")
-        holder = tokens.holder(text.strip()) if text else None
+        text = token_of(request)
+        holder = tokens.holder(text) if text else None
         if holder is None:
             raise HTTPException(
                 401,

@@ -2,6 +2,11 @@
 
 A connection is counted from `accept` to `close`, so also during its TLS handshake. It counts for its address (IPv6: its
 /64 network) until a robot's certificate is known, then for the robot. A connection above a limit is closed immediately.
+
+An address is *proven* once a robot or an operator connected from it. All other addresses together get at most half of
+the connections. If they want more, one of the address with most makes room for an address with less; so do they if the
+proven addresses and the robots want more. Handshakes and requests without a robot or an operator also have a share:
+those of all other addresses together, in equal parts, and those of each proven address (`Shares`).
 """
 
 import asyncio
@@ -10,7 +15,7 @@ import errno
 import ipaddress
 import resource
 import socket
-from collections import Counter
+from collections import Counter, OrderedDict
 from typing import Any
 
 import structlog
@@ -21,11 +26,49 @@ from rosrv_fleet.config import Limits
 _OTHER_FILES = 256  # open files that are not connections: uploads, the database, workers
 _LEAST_CONNECTIONS = 64
 _LOG_SECONDS = 60.0
+_MOST_PROVEN = 10_000
+# Handshakes, or requests: of each proven address, behind which there may be many robots, and of all others together.
+_PROVEN_A_SECOND, _PROVEN_AT_ONCE = 200.0, 256.0
+_OTHERS_A_SECOND, _OTHER_AT_ONCE = 50.0, 32.0
 _log = structlog.get_logger()
 
 
 class TooFewFilesError(OSError):
     """The limit of open files is too small to serve."""
+
+
+class Shares:
+    """The rate of something costly that anybody may ask for, by address. Only for one thread."""
+
+    def __init__(self) -> None:
+        # Of each address that has not its whole share: when it last asked, and what was left then.
+        self._left: dict[bool, dict[str, tuple[float, float]]] = {False: {}, True: {}}
+        self._looked = 0.0
+
+    def take(self, owner: str, *, proven: bool) -> bool:
+        """Take one from the share of an address; return False if nothing is left."""
+        now = clock.now()
+        if now - self._looked >= 1.0:
+            self._looked = now
+            self._forget_rested(now)
+        left = self._left_of(owner, now, proven=proven)
+        if len(self._left[proven]) < _MOST_PROVEN or owner in self._left[proven]:
+            self._left[proven][owner] = (now, left - 1.0 if left >= 1.0 else left)
+        return left >= 1.0
+
+    def _left_of(self, owner: str, now: float, *, proven: bool) -> float:
+        there = self._left[proven]
+        rate = _PROVEN_A_SECOND if proven else _OTHERS_A_SECOND / max(1, len(there))
+        most = _PROVEN_AT_ONCE if proven else _OTHER_AT_ONCE
+        at, left = there.get(owner, (now, most))
+        return min(most, left + (now - at) * rate)
+
+    def _forget_rested(self, now: float) -> None:
+        for proven, most in ((False, _OTHER_AT_ONCE), (True, _PROVEN_AT_ONCE)):
+            lefts = {owner: self._left_of(owner, now, proven=proven) for owner in self._left[proven]}
+            for owner, left in lefts.items():
+                if left >= most:
+                    del self._left[proven][owner]
 
 
 class ClientConnections:
@@ -37,29 +80,49 @@ class ClientConnections:
         self._most = permitted_connections(limits.connections)
         self._owners: Counter[str] = Counter()
         self._open: dict[int, CountedSocket] = {}
+        self._others: dict[
+            str, dict[int, CountedSocket]
+        ] = {}  # those of addresses that are not proven, oldest first
+        self._others_open = 0
+        self._proven: OrderedDict[str, None] = OrderedDict()
+        self._handshakes, self._requests = Shares(), Shares()
         self._logged = 0.0
 
     def accepted(self, connection: "CountedSocket", address: str) -> bool:
         """Count a new connection; return False if there are too many."""
         owner = owner_of(address)
-        if len(self._open) >= self._most:
-            return self._refused("all", self._most)
+        proven = owner in self._proven
         if self._owners[owner] >= self._limits.address_connections:
             return self._refused(owner, self._limits.address_connections)
+        if not self._handshakes.take(owner, proven=proven):
+            return self._refused(
+                f"handshakes of {owner}", int(_PROVEN_A_SECOND if proven else _OTHERS_A_SECOND)
+            )
+        full = len(self._open) >= self._most
+        if (full or (not proven and self._others_open >= self._most // 2)) and not self._made_room(
+            owner, proven
+        ):
+            return self._refused("all", self._most)
         self._owners[owner] += 1
         connection.owner = owner
         self._open[connection.fileno()] = connection
+        if not proven:
+            self._others.setdefault(owner, {})[connection.fileno()] = connection
+            self._others_open += 1
         # A client that does not complete the handshake in this time is cut off.
         connection.due = asyncio.get_running_loop().call_later(self._limits.header_seconds, _cut, connection)
         return True
 
     def established(self, number: int, robot: str | None) -> bool:
         """Note that the handshake of a descriptor is complete; return False if the robot has too many connections."""
-        connection = self._open[number]
+        connection = self._open.get(number)
+        if connection is None:  # it made room for another one
+            return False
         if connection.due is not None:
             connection.due.cancel()
         if robot is None:
             return True
+        self.prove(connection.owner)
         owner = f"robot {robot}"
         if self._owners[owner] >= self._limits.robot_connections:
             return self._refused(owner, self._limits.robot_connections)
@@ -68,13 +131,47 @@ class ClientConnections:
         connection.owner = owner
         return True
 
+    def prove(self, owner: str) -> None:
+        """Note that a robot or an operator connected from an address (`owner_of`)."""
+        self._proven[owner] = None
+        self._proven.move_to_end(owner)
+        if len(self._proven) > _MOST_PROVEN:
+            self._proven.popitem(last=False)
+        self._others_open -= len(self._others.pop(owner, ()))
+
+    def may_ask(self, owner: str) -> bool:
+        """Take a request from the share of an address (`owner_of`); return False if nothing is left."""
+        return self._requests.take(owner, proven=owner in self._proven)
+
+    def is_proven(self, owner: str) -> bool:
+        """Whether a robot or an operator connected from an address (`owner_of`)."""
+        return owner in self._proven
+
+    def _made_room(self, owner: str, proven: bool) -> bool:
+        """Close a connection of the address that is not proven and has most; False if this one would have as many."""
+        most = max(self._others, key=lambda one: len(self._others[one]), default=None)
+        if most is None or (not proven and len(self._others[most]) <= len(self._others.get(owner, ())) + 1):
+            return False
+        oldest = next(iter(self._others[most].values()))
+        self.closed(oldest.fileno())
+        _cut(oldest)
+        return True
+
     def closed(self, number: int) -> None:
         """Note that a descriptor is closed."""
         connection = self._open.pop(number, None)
         if connection is not None:
             if connection.due is not None:
                 connection.due.cancel()
+            self._forget(number, connection)
             self._release(connection.owner)
+
+    def _forget(self, number: int, connection: "CountedSocket") -> None:
+        others = self._others.get(connection.owner, {})
+        if others.pop(number, None) is not None:
+            self._others_open -= 1
+            if not others:
+                del self._others[connection.owner]
 
     def _release(self, owner: str) -> None:
         self._owners[owner] -= 1

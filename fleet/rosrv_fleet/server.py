@@ -13,10 +13,11 @@ import structlog
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from rosrv_fleet.access import PEER_CERTIFICATE
+from rosrv_fleet.access import IS_ROBOT, PEER_CERTIFICATE
 from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.connections import ClientConnections, listen
+from rosrv_fleet.door import Door
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.robots import Robot, Robots
 from rosrv_fleet.rollouts.service import BundleService
@@ -70,10 +71,11 @@ def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -
             super().connection_made(transport)
             secured = transport.get_extra_info("ssl_object")
             certificate = None if secured is None else secured.getpeercert(binary_form=True)
-            self.app_state = {**self.app_state, PEER_CERTIFICATE: certificate}
+            robot = tls.owner(certificate)
+            self.app_state = {**self.app_state, PEER_CERTIFICATE: certificate, IS_ROBOT: robot is not None}
             self._wait_for_headers()
             number = transport.get_extra_info("socket").fileno()
-            if number < 0 or not table.established(number, tls.owner(certificate)):
+            if number < 0 or not table.established(number, robot):
                 transport.abort()
 
         def _wait_for_headers(self) -> None:
@@ -146,7 +148,7 @@ def serve(collector: Collector) -> None:
     listener = listen(*config.address, table)
     options: dict[str, Any] = {"log_config": None, "access_log": False, "server_header": False}
     settings = uvicorn.Config(
-        make_app(collector),
+        Door(make_app(collector), table, collector.tokens),
         loop="asyncio",  # the connections are counted by its sockets
         http=_protocol(config.limits.header_seconds, table, tls),
         ws="none",

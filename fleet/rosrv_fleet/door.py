@@ -1,0 +1,38 @@
+"""Answer requests of robots and operators, and of all other clients within the share of their address.
+
+This comes before every route, so a login, a wrong token or the health check costs an address its own share only.
+"""
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from rosrv_fleet.access import IS_ROBOT, token_of
+from rosrv_fleet.connections import ClientConnections, owner_of
+from rosrv_fleet.tokens import OperatorTokens
+
+
+class Door:
+    """The application behind the shares of addresses."""
+
+    def __init__(self, app: ASGIApp, table: ClientConnections, tokens: OperatorTokens) -> None:
+        self._app, self._table, self._tokens = app, table, tokens
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or answer 429. An operator's token proves its address."""
+        if scope["type"] == "http" and not scope.get("state", {}).get(IS_ROBOT):
+            request = Request(scope)
+            owner = owner_of(request.client.host if request.client else "127.0.0.1")
+            token, proven = token_of(request), self._table.is_proven(owner)
+            # Verifying a token costs as much as an answer, so an unproven address pays for it first.
+            paid = not proven and self._table.may_ask(owner)
+            operator = bool(token) and (proven or paid) and self._tokens.holder(token) is not None
+            if operator:
+                self._table.prove(owner)
+            elif not (paid or (proven and self._table.may_ask(owner))):
+                reason = {
+                    "detail": "this address sends too many requests without a valid token or certificate"
+                }
+                await JSONResponse(reason, 429, {"Retry-After": "1"})(scope, receive, send)
+                return
+        await self._app(scope, receive, send)

@@ -1,0 +1,174 @@
+"""Tests of the collector's connections: strangers, however many, leave room for robots and operators."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosrv_fleet import connections
+from rosrv_fleet.access import IS_ROBOT
+from rosrv_fleet.config import Limits
+from rosrv_fleet.connections import ClientConnections, CountedSocket
+from rosrv_fleet.door import Door
+from rosrv_fleet.tokens import FleetRole, OperatorTokens
+
+from tests.support.virtual_clock import let_time_pass
+
+_NUMBERS = count(100)
+
+
+class _Socket(CountedSocket):
+    """A connection without a socket; `cut` once it made room."""
+
+    def __init__(self) -> None:
+        self.number, self.cut = next(_NUMBERS), False
+
+    def fileno(self) -> int:
+        return self.number
+
+    def shutdown(self, _how: int) -> None:
+        self.cut = True
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@pytest.fixture
+def table(monkeypatch: pytest.MonkeyPatch) -> ClientConnections:
+    """Return a table for 400 connections, 64 of an address."""
+    monkeypatch.setattr(connections, "permitted_connections", lambda wanted: wanted)
+    return ClientConnections(Limits(connections=400, address_connections=64))
+
+
+def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_Socket]:
+    """Return which of so many new connections of an address were accepted, opened slowly enough for its share."""
+    accepted = []
+    for _ in range(number):
+        let_time_pass(10.0)
+        one = _Socket()
+        if table.accepted(one, address):
+            accepted.append(one)
+    return accepted
+
+
+def _in_loop(story: Callable[[], None]) -> None:
+    async def run() -> None:
+        story()
+
+    asyncio.run(run())
+
+
+def test_strangers_leave_half_of_the_connections(table: ClientConnections) -> None:
+    """Seventeen addresses that take all they can get, leave half; a new operator and robots get in, and stay."""
+
+    def story() -> None:
+        strangers = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
+        assert sum(not one.cut for one in strangers) == 200
+        (operator,) = _opened(table, "10.0.0.1")
+        table.prove("10.0.0.1")
+        robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
+        assert all(table.established(one.fileno(), f"robot{one.fileno()}") for one in robots)
+        for number in range(17):
+            _opened(table, f"203.0.113.{number}", 64)
+        assert len(robots) == 150
+        assert not any(one.cut for one in (operator, *robots))
+        assert len(_opened(table, "10.0.0.1", 40)) == 40
+
+    _in_loop(story)
+
+
+def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
+    """A stranger with few connections loses none to one with many, and its handshake that lost its place ends."""
+
+    def story() -> None:
+        (early,) = _opened(table, "10.0.0.7")
+        many = [one for number in range(1, 5) for one in _opened(table, f"203.0.113.{number}", 64)]
+        (late,) = _opened(table, "10.0.0.8")
+        assert not early.cut and not late.cut
+        cut = next(one for one in many if one.cut)
+        assert not table.established(cut.fileno(), None)
+        table.closed(cut.fileno())
+        assert table.established(late.fileno(), None)
+
+    _in_loop(story)
+
+
+def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
+    """The counts return to nothing: of strangers, of an address that was proven in between, and of robots."""
+
+    def story() -> None:
+        for _ in range(3):
+            opened = [one for number in range(3) for one in _opened(table, f"203.0.113.{number}", 60)]
+            assert len(opened) == 180
+            assert table.established(opened[0].fileno(), "robot")
+            for one in opened:
+                table.closed(one.fileno())
+        assert len(_opened(table, "198.51.100.1", 64)) == 64
+
+    _in_loop(story)
+
+
+def test_handshakes_of_strangers_have_a_share(table: ClientConnections) -> None:
+    """An address that only shakes hands gets 50 a second, two 25 each; operators and robots are not delayed."""
+
+    def handshakes(seconds: int, *addresses: str) -> int:
+        done = 0
+        for _ in range(seconds * 100):
+            let_time_pass(0.01)
+            for address in addresses:
+                one = _Socket()
+                if table.accepted(one, address):
+                    done += 1
+                    table.closed(one.fileno())
+        return done
+
+    def story() -> None:
+        table.prove("10.0.0.1")
+        assert 500 <= handshakes(10, "203.0.113.1") <= 500 + 33
+        assert 500 <= handshakes(10, "203.0.113.1", "203.0.113.2") <= 500 + 66
+        assert all(table.accepted(_Socket(), "10.0.0.1") for _ in range(60))
+        let_time_pass(60)
+        assert all(table.accepted(_Socket(), "203.0.113.1") for _ in range(32))
+
+    _in_loop(story)
+
+
+async def _status(door: Door, address: str, token: str = "", *, robot: bool = False) -> int:
+    headers = [(b"authorization", f"Bearer {token}".encode())] if token else []
+    scope: Any = {
+        "type": "http", "method": "POST", "path": "/login", "headers": headers, "client": (address, 1),
+        "state": {IS_ROBOT: robot}, "query_string": b"",
+    }  # fmt: skip
+    sent: list[Any] = []
+
+    async def send(message: Any) -> None:
+        sent.append(message)
+
+    await door(scope, lambda: asyncio.sleep(0), send)  # type: ignore[arg-type,return-value]  # nothing is received
+    return int(sent[0]["status"])
+
+
+def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_path: Path) -> None:
+    """Logins, wrong tokens and other requests of strangers are answered 429 beyond it; robots and operators are not."""
+
+    async def app(_scope: Any, _receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": json.dumps({}).encode()})
+
+    tokens = OperatorTokens(tmp_path / "tokens.json")
+    token = tokens.add("alice", FleetRole.VIEWER)
+    door = Door(app, table, tokens)
+
+    async def story() -> None:
+        for word in ("", "wrong"):
+            found = [await _status(door, f"203.0.113.{len(word)}", word) for _ in range(100)]
+            assert found.count(200) == 32 and found.count(429) == 68
+        assert {await _status(door, "10.0.0.1", token) for _ in range(300)} == {200}
+        assert {await _status(door, "203.0.113.0", robot=True) for _ in range(300)} == {200}
+        behind_it = [await _status(door, "10.0.0.1", "wrong") for _ in range(300)]
+        assert behind_it.count(429) > 0
+
+    asyncio.run(story())
