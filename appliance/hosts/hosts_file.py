@@ -56,8 +56,8 @@ class DeclaredHost:
 class DeclaredHosts:
     """The file's last valid content, or that of a bundle; `error` is the reason if the text is invalid now.
 
-    `bundled` is the text of a bundle; empty: the file is in use. `text` is the file's last valid text. At a start it is the
-    stored one, which is used if the file is invalid now.
+    `bundled` is the text of a bundle; empty: the file is in use. `text` is the file's last valid text. At a start it is
+    the stored one, which is used if the file is invalid now.
     """
 
     def __init__(self, path: Path, bundled: str = "", text: str = "") -> None:

@@ -13,7 +13,6 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
-from appliance.quotas.pool import QuotaClass
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
@@ -302,7 +301,7 @@ class DataPlane:
 
     def _holder(self, host: str) -> str:
         """Return the host if it is registered; all other hosts count as one holder, the empty string."""
-        return host if self._table.quota_class(host) is QuotaClass.REGISTERED else ""
+        return host if self._table.is_registered(host) else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
         monitors = self.interceptor.monitors
@@ -406,7 +405,7 @@ class DataPlane:
         if self._pending.make_room(host):
             return True
         pool = self.ports.connected
-        if self._table.quota_class(host) is not QuotaClass.REGISTERED:
+        if not self._table.is_registered(host):
             return False
         largest, most = max(pool.holders(), key=lambda holder: holder[1], default=("", 0))
         if most <= pool.held(host) + 1:

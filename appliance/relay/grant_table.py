@@ -117,6 +117,10 @@ class GrantTable:
         else:
             self._forget(_fact(message))
 
+    def is_registered(self, host: str) -> bool:
+        """Return whether a host has a registration."""
+        return self.quota_class(host) is QuotaClass.REGISTERED
+
     def quota_class(self, host: str) -> QuotaClass:
         """Return the quota class of a host: registered if the host has a node or a grant."""
         return QuotaClass.REGISTERED if host in self._hosts else QuotaClass.UNKNOWN

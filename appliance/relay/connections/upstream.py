@@ -104,7 +104,7 @@ class PublisherConnection(Upstream):
             self.ask()
 
     def release(self) -> None:
-        """Close the connection after this turn of the loop, because a lazy publisher has to learn that nobody listens.
+        """Close the connection after this turn of the loop, because a lazy publisher has to learn that it is unused.
 
         Keep it for a short time while subscribers may return.
         """

@@ -143,7 +143,10 @@ def test_an_export_over_rest_is_verifiable(appliance: Appliance, rest: Rest, tmp
         proven = verified["proven"]
     assert verified["ok"] is True
     file.write_text(file.read_text().replace("/evidence", "/innocent", 1))
-    assert appliance.row("audit", "verify", "--export", str(file), "--excerpt", "--key", str(public))["ok"] is False
+    assert (
+        appliance.row("audit", "verify", "--export", str(file), "--excerpt", "--key", str(public))["ok"]
+        is False
+    )
 
 
 def _record(line: str) -> dict[str, Any]:

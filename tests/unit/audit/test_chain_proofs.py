@@ -105,7 +105,7 @@ def test_a_gap_is_a_finding_unless_it_is_declared(left_out: int, found: int, *, 
 @pytest.mark.nightly
 @pytest.mark.parametrize("excerpt", [False, True])
 def test_only_an_excerpt_may_lack_records(log: Path, public: bytes, tmp_path: Path, *, excerpt: bool) -> None:
-    """What a filter left out looks like what was removed afterwards, so an excerpt is declared."""
+    """Records that a filter left out look like records that were removed, so an excerpt is declared."""
     whole = checked(exported(log, Filter()), tmp_path / "x.ndjson", public, excerpt=excerpt)
     assert (whole.ok, whole.left_out) == (True, 0)
     part = checked(exported(log, Filter(decision=("deny",))), tmp_path / "y.ndjson", public, excerpt=excerpt)

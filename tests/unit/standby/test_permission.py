@@ -256,7 +256,7 @@ def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_standby_has_the_time_that_a_large_value_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The lease is told of a wait only from the time on at which a living standby would have stored the bytes."""
+    """The lease learns of a wait only when a living standby would have stored the bytes."""
 
     async def waits(size: int) -> float:
         pair.start_control(taken_over=False)

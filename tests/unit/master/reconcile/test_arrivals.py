@@ -103,6 +103,6 @@ async def test_a_node_of_another_machine_is_refused() -> None:
     )
     assert world.records.events[-1] == ("deny", "/t")
     assert world.registry.all() == []
-    # A node with another address of its machine in its URI has its port open; the caller's own address is no question.
+    # A node with another address of its machine in its URI has its port open; the caller's own address needs no check.
     for node, uri in (("/near", "http://192.168.1.10:4001/"), ("/here", "http://10.0.0.5:4002/")):
-        assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]
+        assert (await world.ask("registerPublisher", node, *call, uri))[0] == 1  # type: ignore[index]  # an answer is a list
