@@ -41,7 +41,7 @@ class Shares:
     """The rate of something costly that anybody may ask for, by address. Only for one thread."""
 
     def __init__(self) -> None:
-        # Of each address that has not its whole share: when it last asked, and what was left then.
+        # By address, unless its whole share is left: the time of its last request, and the rest of its share then.
         self._left: dict[bool, dict[str, tuple[float, float]]] = {False: {}, True: {}}
         self._looked = 0.0
 

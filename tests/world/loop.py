@@ -13,6 +13,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
 from typing import Any, TypeVar
 
@@ -164,10 +165,10 @@ class WorldLoop(asyncio.BaseEventLoop):
         task.add_done_callback(self.tasks.pop, context=self.outside.context)
         return task
 
-    def add_reader(self, file: Any, act: Callable[[], object]) -> None:  # type: ignore[override]  # the world's own files
+    def add_reader(self, file: Any, act: Callable[..., object], *arguments: Any) -> None:  # type: ignore[override]  # the world's own files
         """Call a function of the present process when a file is readable."""
         process = present_process()
-        file.readable = lambda: process.run(act)
+        file.readable = lambda: process.run(partial(act, *arguments))
 
     def remove_reader(self, file: Any) -> None:  # type: ignore[override]  # wider than asyncio's
         """Do not call it any more."""

@@ -13,6 +13,7 @@ from tests.world.loop import Process, present_process
 from tests.world.network import Address, Network
 
 _SECONDS = (0.0, 0.001, 0.005, 0.05)
+_FIRST_FREE_PORT = 50_000
 _AGAIN_SECONDS = 0.1
 Serve = Callable[[Any, Any], Awaitable[None]]
 
@@ -109,6 +110,10 @@ class Streams:
         """Return a socket of datagrams, or the object behind a descriptor."""
         return DatagramSocket(self) if kind else fileno
 
+    def free_port(self) -> int:
+        """Return a port that no socket had before."""
+        return _FIRST_FREE_PORT + len(self._sockets)
+
     def bind(self, address: Address, sock: "DatagramSocket") -> None:
         """Pass on the datagrams to this address."""
         self._sockets[address] = sock
@@ -152,7 +157,9 @@ class DatagramSocket:
         return self
 
     def sendto(self, data: bytes, target: Address) -> None:
-        """Send a datagram."""
+        """Send a datagram, from a free port of the machine if none is bound."""
+        if not self._address[1]:
+            self.bind((self.process.machine.name, self._streams.free_port()))
         self._streams.send(data, self._address, target)
 
     def recvfrom(self, _size: int) -> tuple[bytes, Address]:

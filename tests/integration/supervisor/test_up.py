@@ -240,4 +240,4 @@ def test_a_policy_that_was_loaded_outlasts_its_file(directory: Path) -> None:
     with up(directory, "--json") as running:
         assert running.wait_for(event="ready", timeout=2 * LIMIT)["revision"] == 4
     shutil.rmtree(state)
-    assert "cannot read the policy" in refusal(directory)
+    assert "the policy cannot be read" in refusal(directory)
