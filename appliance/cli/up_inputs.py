@@ -40,8 +40,9 @@ def read_inputs(settings: Settings, witness: str | None = None) -> range:
     Raises `StartError` with every error of the policy or of the specifications.
     """
     state = settings.state / _STATE
-    if settings.monitors is not None and _is_read_at_start(state, "monitor_revision"):
-        _require_specifications(settings.monitors, settings.site_keys)
+    author = _last_author(state)
+    if settings.monitors is not None and author in ("", DISK):
+        _require_specifications(settings.monitors, settings.site_keys, kept=author == DISK)
     return read_node_ports(settings, witness)
 
 
@@ -87,8 +88,10 @@ def _stored_in(state: Path) -> _Stored:
     return _Stored(policy, {name: ipaddress.ip_address(address) for name, address in hosts}, complete)
 
 
-def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
-    """Compile in a child process, because this process becomes the supervisor and would keep the compiler's memory."""
+def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: bool) -> None:
+    """Raise `StartError` for invalid specifications, unless a revision is kept, which then stays in force.
+
+    Compile in a child process, because this process becomes the supervisor and would keep the compiler's memory."""
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
@@ -99,7 +102,9 @@ def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
     with open(reader, encoding="utf-8") as answer:  # noqa: PTH123  as above
         result = answer.read()
     os.waitpid(child, 0)
-    if result != _VALID:
+    if result != _VALID and result and kept:
+        refused([*result.splitlines(), "the specifications that were in force before stay in force"])
+    elif result != _VALID:
         raise StartError(result or f"{folder}: the process that read the specifications exited early")
 
 
@@ -125,18 +130,21 @@ def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
     return ""
 
 
-def _is_read_at_start(state: Path, table: str) -> bool:
-    """Whether RVMaster will read the files on disk, rather than a revision that an operator loaded.
+def _last_author(state: Path) -> str:
+    """Return who brought the last stored specifications into force; `DISK`: they were read from the folder.
 
-    False if unknown: an earlier run may have left statements that are not in the database yet.
+    Empty: there are none. A question mark: unknown, because an earlier run may have left changes that are not in the
+    database yet.
     """
     try:
         if not state.exists():
-            return True
+            return ""
         if state.with_suffix(".ahead").stat().st_size:
-            return False
+            return "?"
         with contextlib.closing(sqlite3.connect(f"file:{state}?mode=ro", uri=True)) as database:
-            row = database.execute(f"SELECT who FROM {table} ORDER BY revision DESC LIMIT 1").fetchone()  # noqa: S608  one of two names
+            row = database.execute(
+                "SELECT who FROM monitor_revision ORDER BY revision DESC LIMIT 1"
+            ).fetchone()
     except (OSError, sqlite3.Error):
-        return False
-    return row is None or row[0] == DISK
+        return "?"
+    return "" if row is None else str(row[0])

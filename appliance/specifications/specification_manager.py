@@ -180,8 +180,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._acts = int(settings.get(_ACTS, "0"))
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
         named = () if restarted else self.switches.named
-        sources, checked = await specifications_at_start(
-            last, self._folder, self._check_at_start, self.site_keys, named=named
+        sources, checked, refused = await specifications_at_start(
+            last,
+            self._folder,
+            self._check_at_start,
+            self.site_keys,
+            named=named,
+            kept=self.in_force if self.revision else None,
         )
         if last is not None or (self.revision and sources_of(self.in_force) == sources):
             self._enforce(sources, checked)
@@ -192,6 +197,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
                 self._keep(sources, checked, who=DISK, note="read at start")
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        if refused:
+            self._say_folder_refused(refused)
         for name, error in checked.unbuilt.items():
             self._say_unbuilt(name, error)
         self.returns.start(self._disabled())
@@ -461,6 +468,19 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         await self.store.settled()
         await self.rollout.carried_out()
         return changed
+
+    def _say_folder_refused(self, findings: list[str]) -> None:
+        text = f"revision {self.revision} of the specifications stays in force, because the start refused the folder"
+        _log.error(text, findings=findings[:100])
+        self._trail.happened(
+            "specifications refused",
+            f"{text}: {findings[0]}",
+            severity=Severity.ALARM,
+            category="monitor",
+            resource="",
+            findings=findings[:100],
+            who=DISK,
+        )
 
     def _say_unbuilt(self, name: str, error: str) -> None:
         file = self.checked.monitors[name]

@@ -1,6 +1,8 @@
 """Stored revisions of the specifications: their form, the last switches of their monitors, and those of a start."""
 
+import contextlib
 from collections.abc import Awaitable, Callable, Collection, Sequence
+from typing import NamedTuple
 
 import msgspec
 
@@ -19,6 +21,17 @@ Check = Callable[[Sources, Sequence[str]], Awaitable[CheckedSpecifications]]
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """The revision before the first."""
+
+
+class StartingSpecifications(NamedTuple):
+    """The specifications that a start brings into force.
+
+    `refused` has the errors of the folder, if the revision that was in force before stays in force instead.
+    """
+
+    sources: Sources
+    checked: CheckedSpecifications
+    refused: list[str]
 
 
 class StoredSpecifications(Sources, frozen=True):
@@ -49,21 +62,46 @@ async def specifications_at_start(
     site_keys: Sequence[str],
     *,
     named: Collection[str],
-) -> tuple[Sources, CheckedSpecifications]:
+    kept: MonitorRevisionRow | None = None,
+) -> StartingSpecifications:
     """Return the specifications that a start brings into force: of the stored revision `last`, or the folder's (None).
+
+    If a reload would refuse the folder, they are those of `kept`, the revision that was in force before.
 
     Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is `named` to be
     enabled.
     """
+    refused: list[str] = []
     if last is None:
-        sources = folder.read()
-        checked = await check(sources, site_keys)
+        sources, checked, refused = await _folder_or_kept(folder, kept, check, site_keys)
     else:
         sources, checked = sources_of(last), await _check_kept(check, last, site_keys)
     unknown = sorted(set(named) - checked.monitors.keys())
     if unknown and (last is None or last.who == DISK):
         raise SpecificationsRefusedError([f"--enable: {unknown_monitors(unknown, checked)}"])
-    return sources, checked
+    return StartingSpecifications(sources, checked, refused)
+
+
+async def _folder_or_kept(
+    folder: SpecificationFolder, kept: MonitorRevisionRow | None, check: Check, site_keys: Sequence[str]
+) -> StartingSpecifications:
+    sources, checked = None, None
+    try:
+        sources = folder.read()
+        checked = await check(sources, site_keys)
+        findings = [*checked.unbuilt.values()]
+    except SpecificationsRefusedError as error:
+        if kept is None:
+            raise
+        findings = error.findings
+    if findings and kept is not None and sources_of(kept) != sources:
+        with contextlib.suppress(SpecificationsRefusedError):
+            before = await check(sources_of(kept), site_keys)
+            if not before.unbuilt:
+                return StartingSpecifications(sources_of(kept), before, findings)
+    if sources is None or checked is None:
+        raise SpecificationsRefusedError(findings)
+    return StartingSpecifications(sources, checked, [])
 
 
 def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> str:

@@ -338,3 +338,19 @@ async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) ->
     assert monitors.records.counts["shadow drop", "a"] == 1
     assert not monitors.records.counts["drop", "a"]
     assert not monitors.records.at
+
+
+@pytest.mark.parametrize("broken", ["a() { event e() /x std_msgs/String '{}' { missing = 1; } }", "nonsense"])
+async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, broken: str) -> None:
+    """The revision in force stays, with an alarm, so its monitors still guard; a corrected folder is taken."""
+    monitors = await desk.monitors()
+    (desk.folder / "a.rv").write_text(broken)
+    with pytest.raises(SpecificationsRefusedError):
+        await monitors.reload(admin.MonitorReload(), "adam")
+    for restarted in (False, True, False):
+        monitors = await desk.monitors(restarted=restarted)
+        assert (monitors.revision, monitors.sources.files, monitors.checked.unbuilt) == (1, {"a.rv": A}, {})
+    refused = [fields for event, fields in desk.trail.heard if event == "specifications refused"]
+    assert [fields["who"] for fields in refused] == ["adam", "disk", "disk"]
+    (desk.folder / "a.rv").write_text(A + " ")
+    assert (await desk.monitors()).revision == 2
