@@ -38,7 +38,7 @@ class TooFewFilesError(OSError):
 
 
 class Shares:
-    """The rate of something costly that anybody may ask for, by address. Only for one thread."""
+    """The rate of something costly that any client may request, by address. Only for one thread."""
 
     def __init__(self) -> None:
         # By address, unless its whole share is left: the time of its last request, and the rest of its share then.

@@ -1,4 +1,4 @@
-"""Tests of the collector's connections: strangers, however many, leave room for robots and operators."""
+"""Tests of the collector's connections: unproven addresses leave room for robots and operators."""
 
 import asyncio
 import json
@@ -44,7 +44,7 @@ def table(monkeypatch: pytest.MonkeyPatch) -> ClientConnections:
 
 
 def _opened(table: ClientConnections, address: str, number: int = 1) -> list[_Socket]:
-    """Return which of so many new connections of an address were accepted, opened slowly enough for its share."""
+    """Return the accepted ones of new connections of an address, opened slowly enough for its share."""
     accepted = []
     for _ in range(number):
         let_time_pass(10.0)
@@ -61,12 +61,12 @@ def _in_loop(story: Callable[[], None]) -> None:
     asyncio.run(run())
 
 
-def test_strangers_leave_half_of_the_connections(table: ClientConnections) -> None:
+def test_unproven_addresses_leave_half_of_the_connections(table: ClientConnections) -> None:
     """Seventeen addresses that take all they can get, leave half; a new operator and robots get in, and stay."""
 
     def story() -> None:
-        strangers = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
-        assert sum(not one.cut for one in strangers) == 200
+        others = [one for number in range(17) for one in _opened(table, f"203.0.113.{number}", 64)]
+        assert sum(not one.cut for one in others) == 200
         (operator,) = _opened(table, "10.0.0.1")
         table.prove("10.0.0.1")
         robots = [one for number in range(150) for one in _opened(table, f"10.1.0.{number}")]
@@ -81,7 +81,7 @@ def test_strangers_leave_half_of_the_connections(table: ClientConnections) -> No
 
 
 def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None:
-    """A stranger with few connections loses none to one with many, and its handshake that lost its place ends."""
+    """An address with few connections loses none to one with many, and its handshake that lost its place ends."""
 
     def story() -> None:
         (early,) = _opened(table, "10.0.0.7")
@@ -97,7 +97,7 @@ def test_room_is_made_by_the_address_with_most(table: ClientConnections) -> None
 
 
 def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None:
-    """The counts return to nothing: of strangers, of an address that was proven in between, and of robots."""
+    """The counts return to nothing: of unproven addresses, of an address that was proven in between, and of robots."""
 
     def story() -> None:
         for _ in range(3):
@@ -111,7 +111,7 @@ def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None
     _in_loop(story)
 
 
-def test_handshakes_of_strangers_have_a_share(table: ClientConnections) -> None:
+def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections) -> None:
     """An address that only shakes hands gets 50 a second, two 25 each; operators and robots are not delayed."""
 
     def handshakes(seconds: int, *addresses: str) -> int:
@@ -152,7 +152,7 @@ async def _status(door: Door, address: str, token: str = "", *, robot: bool = Fa
 
 
 def test_requests_without_a_token_have_a_share(table: ClientConnections, tmp_path: Path) -> None:
-    """Logins, wrong tokens and other requests of strangers are answered 429 beyond it; robots and operators are not."""
+    """Logins, wrong tokens and requests without one are answered 429 beyond it; robots and operators are not."""
 
     async def app(_scope: Any, _receive: Any, send: Any) -> None:
         await send({"type": "http.response.start", "status": 200, "headers": []})
