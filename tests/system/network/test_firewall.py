@@ -58,7 +58,7 @@ def _machine() -> None:
 def connect(host: Host, uid: int, *targets: tuple[str, int]) -> list[str]:
     """Try to connect from a host as a local user; return the result of each attempt."""
     process = host.popen(
-        [sys.executable, "-I", "-S", "-c", CLIENT, *(f"{address}/{port}" for address, port in targets)],
+        ["/usr/bin/python3", "-I", "-S", "-c", CLIENT, *(f"{address}/{port}" for address, port in targets)],
         user=uid,
         group=uid,
         extra_groups=[],

@@ -4,7 +4,6 @@ import os
 import select
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -81,7 +80,7 @@ def wait_until_listening(host: Host, process: "subprocess.Popen[str]") -> None:
 def ask(host: Host, uid: int, uri: str) -> str:
     """Query the master's pid as a local user."""
     process = host.popen(
-        [sys.executable, "-I", "-c", ASK, uri],
+        ["/usr/bin/python3", "-I", "-c", ASK, uri],
         user=uid,
         group=uid,
         extra_groups=[],
