@@ -51,7 +51,7 @@ def test_messages_pass_and_a_visitor_is_denied(demo: Compose) -> None:
     demo.wait_for_log("ocu", '"position"', timeout=240)
     denied = eventually(lambda: demo.audit("--deny", "--host", TABLET), demo.story)
     assert {one["rule"]["file"] for one in denied if one["rule"]} == {"/etc/rosrv/policies/containers.ini"}
-    assert "complete and unchanged" in demo.exec("appliance", "rosrv", "audit", "verify").stdout
+    demo.exec("appliance", "rosrv", "audit", "verify")  # fails if a record is missing or changed
 
 
 def test_a_policy_is_reloaded_over_rest(machine: Host, demo: Compose, rest: Rest) -> None:
