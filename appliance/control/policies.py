@@ -293,7 +293,7 @@ class Policies(Revisions[RevisionRow]):
         )
 
     def _file_refused(self, error: PolicyRefusedError) -> None:
-        """Say that a start did not take the file, to those who look at the log, the records or the status."""
+        """Report in the log, the records and the status that the start refused the file."""
         self.file_refused = error.findings[0]
         text = f"revision {self.revision} stays in force, because the start refused {self.file}"
         _log.error(text, findings=error.findings[:100])

@@ -34,7 +34,7 @@ class HostQuotaClass:
             return QuotaClass.NAMED
 
     def has_reserve(self, host: str) -> bool:
-        """Whether the last part of the audit log's reserve is kept for a host: the robot, or one that the policy names.
+        """Return whether the last part of the audit log's reserve is for this host: the robot, or one the policy names.
 
         A policy that names only `*` keeps it for hosts with a registration.
         """
