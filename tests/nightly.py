@@ -11,6 +11,7 @@ import argparse
 import datetime
 import json
 import os
+import stat
 import subprocess
 import sys
 import xml.etree.ElementTree
@@ -77,6 +78,40 @@ STAGES = (
 )
 
 
+# Tests run programs of this checkout as other users. In a mount namespace of its own, an open folder with the same
+# contents replaces each closed one above the checkout, and the command starts there: `sh -c … sh FOLDER… -- COMMAND…`.
+_OPEN_FOLDERS = """
+set -eu
+kept=$(mktemp --directory)
+while [ "$1" != -- ]; do
+    mount --rbind "$1" "$kept"
+    mount -t tmpfs -o mode=755 tmpfs "$1"
+    find "$kept" -mindepth 1 -maxdepth 1 -printf '%f\\n' | while read -r name; do
+        if [ -L "$kept/$name" ]; then cp --no-dereference "$kept/$name" "$1/"; continue; fi
+        if [ -d "$kept/$name" ]; then mkdir "$1/$name"; else : > "$1/$name"; fi
+        mount --rbind "$kept/$name" "$1/$name"
+    done
+    umount --lazy "$kept"
+    shift
+done
+shift
+exec "$@"
+"""
+
+
+def open_folders_above(checkout: Path) -> None:
+    """Start this program again where other users can reach the checkout, if they cannot reach it here."""
+    closed = [
+        str(folder) for folder in reversed(checkout.parents) if not folder.stat().st_mode & stat.S_IXOTH
+    ]
+    if not closed or os.geteuid() != 0:
+        return
+    again = [sys.executable, "-m", "tests.nightly", *sys.argv[1:]]
+    command = ["unshare", "--mount", "sh", "-c", _OPEN_FOLDERS, "sh", *closed, "--", *again]
+    os.chdir(checkout)
+    os.execvp("unshare", command)  # noqa: S606  util-linux, and our own script
+
+
 def lane_of(file: str) -> str:
     """Return the lane of a test file, by its path in the repository."""
     return next((lane for lane, parts in LANES.items() if any(part in file for part in parts)), "core")
@@ -137,6 +172,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--lane", choices=["core", *LANES], help="run the tests of one lane only")
     lane = parser.parse_args().lane
+    open_folders_above(ROOT)
     FOLDER.mkdir(parents=True, exist_ok=True)
     results = _earlier(_commit())
     failed: list[str] = []
