@@ -191,7 +191,10 @@ class Hunt:
         with tempfile.NamedTemporaryFile("r") as answer:
             child = os.fork()
             if not child:
-                signal.alarm(seconds)
+                signal.setitimer(
+                    signal.ITIMER_PROF, seconds
+                )  # of the processor, for a busy machine is not a hang
+                signal.alarm(10 * seconds)
                 self._run(session, items, answer.name)
             os.waitpid(child, 0)
             text = answer.read()
