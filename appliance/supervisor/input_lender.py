@@ -22,20 +22,29 @@ _LONGEST_PATH = 4096
 _ERROR_BYTES = 4  # an answer: an error number, or 0 and a descriptor
 _NOT_AN_INPUT = (1 << 32) - 1
 _BESIDE = ("", ".sig", ".tests.yaml")
+_ANSWER_SECONDS = 0.5  # RVMaster may wait meanwhile
 
 
 class Borrower:
-    """A role's end of the link."""
+    """A role's end of the link. A supervisor that hangs delays the role once, not at each request."""
 
     def __init__(self, link: socket.socket) -> None:
         self._link = link
         self._asking = threading.Lock()
+        self._is_owed = False  # the answer to an earlier request
 
     def open(self, path: Path) -> int | None:
-        """Return a descriptor of a file or folder; None if it is not an input of the role. Raises `OSError`."""
+        """Return a descriptor of a file or folder; None if it is not an input of the role.
+
+        Raises `OSError`, which is `TimeoutError` while the supervisor does not answer.
+        """
         with self._asking:
+            if self._is_owed:
+                for late in self._answer(path, 0)[1]:
+                    os.close(late)
+            self._link.settimeout(_ANSWER_SECONDS)
             self._link.send(os.fsencode(path))
-            answer, descriptors, _flags, _address = socket.recv_fds(self._link, _ERROR_BYTES, 1)
+            answer, descriptors = self._answer(path, _ANSWER_SECONDS)
         for descriptor in descriptors:
             os.set_inheritable(descriptor, False)
             return descriptor
@@ -43,6 +52,17 @@ class Borrower:
         if number == _NOT_AN_INPUT:
             return None
         raise OSError(number, os.strerror(number), str(path))
+
+    def _answer(self, path: Path, seconds: float) -> tuple[bytes, list[int]]:
+        self._is_owed = True
+        self._link.settimeout(seconds)
+        try:
+            answer, descriptors, _flags, _address = socket.recv_fds(self._link, _ERROR_BYTES, 1)
+        except (BlockingIOError, TimeoutError):
+            text = "the supervisor did not open the file in time; try again, or see rosrv status"
+            raise TimeoutError(errno.ETIMEDOUT, text, str(path)) from None
+        self._is_owed = False
+        return answer, descriptors
 
 
 def lend_inputs(inputs: Collection[Path]) -> socket.socket | None:

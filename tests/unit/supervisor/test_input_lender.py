@@ -1,6 +1,7 @@
 """Tests of `appliance.supervisor.input_lender` and `base.owner_access`: files that only their owner may reach."""
 
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -85,6 +86,23 @@ def test_a_role_gets_nothing_else(home: Path, borrower: Borrower) -> None:
     """Other files of the home are not lent, by whatever path; nor is the content of a folder that is only passed."""
     for path in (home / ".ssh_key", home / "monitors/../.ssh_key", home, Path("/etc/shadow")):
         assert borrower.open(path) is None
+
+
+def test_a_hanging_supervisor_delays_a_role_once(tmp_path: Path) -> None:
+    """Control serves nodes while the supervisor hangs, and takes a late answer for no other file."""
+    (tmp_path / "late").write_text("late")
+    ours, supervisors = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, supervisors, (tmp_path / "late").open() as late:
+        borrower = Borrower(ours)
+        with pytest.raises(TimeoutError):
+            borrower.open(tmp_path / "late")
+        ours.settimeout(None)  # a wait would hang
+        with pytest.raises(TimeoutError):
+            borrower.open(tmp_path / "other")
+        socket.send_fds(supervisors, [bytes(4)], [late.fileno()])
+        with pytest.raises(TimeoutError):
+            borrower.open(tmp_path / "third")
+        assert [Path(os.fsdecode(supervisors.recv(4096))).name for _ in range(2)] == ["late", "third"]
 
 
 def test_a_link_cannot_lend_the_files_of_another_user(
