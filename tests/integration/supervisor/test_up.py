@@ -198,7 +198,7 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
 @pytest.mark.parametrize(
     ("policy", "monitors", "said"),
     [
-        (None, None, ["cannot read the policy: No such file or directory"]),
+        (None, None, ["the policy cannot be read: No such file or directory"]),
         ("[Nods]\na = b\n[Commands]\nnosuchcall = *\n", None, ["policy.ini:1:", "policy.ini:4:"]),
         ("\xff", None, ["not UTF-8"]),
         (POLICY, "missing", ["the folder of specifications does not exist"]),
