@@ -333,8 +333,6 @@ def test_names_outside_the_grammar(field: Field, method: str, name: str) -> None
     "caller_id",
     [
         "voice",
-        "//voice",
-        "/voice/",
         "~voice",
         "/v\u043eice",
         "/voice ",
@@ -619,10 +617,11 @@ def test_uri_of_a_third_machine(field: Field) -> None:
             assert answer[0] == 1
             assert third.uri not in answer[2]
             talker = field.ros.talker("rospy", "/shared/talk", name="second_shared_voice")  # causes an update
-            connection, peer = home.accept()
-            with connection:
-                assert peer[0] == "10.77.0.2"
-                assert b"POST /" in connection.recv(4096)
+            for expected in (b"", b"POST /"):  # first RVMaster looks whether a node listens there
+                connection, peer = home.accept()
+                with connection:
+                    assert peer[0] == "10.77.0.2"
+                    assert expected in connection.recv(4096)
             talker.stop()
         assert third.peers == []
 

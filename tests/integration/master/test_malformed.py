@@ -49,7 +49,7 @@ def test_not_http(field: Field, data: bytes, status: int | None) -> None:
     assert answer.count(b"HTTP/1.1 ") == 1
     if status is not None:
         assert answer.split()[1] == str(status).encode()
-        field.recorded(event="limit exceeded", host="10.77.0.66")
+        field.recorded(event="limit exceeded" if status in (413, 431) else "malformed", host="10.77.0.66")
 
 
 DOCUMENTS = {
@@ -99,8 +99,7 @@ def test_not_xml_rpc(field: Field, name: str) -> None:
 def test_faults_are_recorded(field: Field) -> None:
     """Malformed requests are recorded with their host."""
     field.raw(post(b"<methodCall><methodName>getPid</methodName><params><oops/></params></methodCall>"))
-    record = field.recorded(event="malformed", host="10.77.0.66", decision="deny")
-    assert "byte" in record["reason"]
+    field.recorded("byte", event="malformed", host="10.77.0.66", decision="deny")
 
 
 @pytest.mark.parametrize("method", ["setParam", "getPid"])

@@ -184,18 +184,6 @@ def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
     assert int(site.epoch.read_text()) == 2
 
 
-def test_a_greater_epoch_of_the_other_appliance_ends_its_own(site: Site) -> None:
-    """The epoch is stored, and the request gets its promise."""
-    site.start()
-    site.until(site.held)
-    channel = PeerChannel("b", "a", PEER_KEY)
-    site.peer.sendto(channel.write(PromiseRequest(9, "theirs", 1)), (OWN, MEMBERSHIP.port))
-    site.until(
-        lambda: isinstance(site.reports[-1], messages.LeaseEnded) and int(site.epoch.read_text()) == 9,
-        serving=False,
-    )
-
-
 def test_a_damaged_epoch_file_keeps_it_passive(site: Site) -> None:
     """The process ends with the reason, and claims nothing."""
     site.epoch.write_text("7x\n")
