@@ -5,21 +5,26 @@ of chunks whose times overlap, and adds limits:
 
 1. It reads at most `LARGEST_CHUNK` bytes at once, and unpacks a chunk to at most that size.
 2. It unpacks and reads at most `PER_BYTE` bytes for each byte of the bag, plus one chunk. Without this limit, index
-   entries could name one message many times, or unpack two chunks in turn.
+   entries could name one message many times, or unpack many chunks in turn.
 3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
+
+The flight recorder writes a chunk for each stream, so the times of its chunks overlap. Messages of a chunk that is not
+compressed are read from the file. Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes in all.
 """
 
 import bz2
 import heapq
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from io import SEEK_CUR, BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import (
+    Chunk,
     ChunkInfo,
     Header,
     IndexData,
@@ -40,6 +45,14 @@ _UNPACKERS: dict[Callable[[bytes], bytes], Callable[[], Any]] = {
 _Entry = tuple[int, int, int]  # nanoseconds, offset of the chunk in the file, offset in the chunk
 
 
+class _Content(NamedTuple):
+    """The records of a chunk: in `file`, from `begin` to `end`."""
+
+    file: BinaryIO
+    begin: int
+    end: int
+
+
 class BoundedReader(Reader):
     """The reader of `rosbags`; raises `ReaderError` and `ValueError` beyond a limit."""
 
@@ -48,6 +61,11 @@ class BoundedReader(Reader):
         self._size = path.stat().st_size
         self._left = PER_BYTE * self._size + regular_files.LARGEST_CHUNK
         self._entries = 0
+        self._unread = Counter[
+            int
+        ]()  # for each chunk, the number of index entries whose messages were not read yet
+        self._unpacked = OrderedDict[int, _Content]()  # the latest used one is the last
+        self._unpacked_size = 0
 
     @property
     def message_count(self) -> int:
@@ -61,32 +79,43 @@ class BoundedReader(Reader):
         """Yield connection, nanoseconds and bytes of every message: by time, then by position in the file."""
         connections = {connection.id: connection for connection in self.connections}
         self._entries = 0
+        self._unread.clear()
         waiting: list[_Entry] = []
-        here, content = -1, BytesIO()
         infos = sorted(self.chunk_infos, key=lambda info: (info.start_time, info.pos))
         nexts = [*(info.start_time for info in infos), 1 << 63][1:]
         for info, following in zip(infos, nexts, strict=True):
-            for entry in self._index(info):
+            entries = self._index(info)
+            self._unread[info.pos] += len(entries)
+            for entry in entries:
                 heapq.heappush(waiting, entry)
             while waiting and waiting[0][0] < following:
                 time, place, offset = heapq.heappop(waiting)
-                if place != here:
-                    here, content = place, BytesIO(self._content(place))
-                content.seek(offset)
-                while (header := Header.read(content)).get_uint8("op") == RecordType.CONNECTION:
-                    self._charge(content.seek(read_uint32(content), SEEK_CUR) - offset)
-                if header.get_uint8("op") != RecordType.MSGDATA or header.get_time("time") != time:
-                    raise ReaderError("its index does not fit its messages.")
-                data = read_bytes(content, read_uint32(content))
-                self._charge(content.tell() - offset)
-                yield connections[header.get_uint32("conn")], time, data
+                number, data = self._message(place, offset, time)
+                yield connections[number], time, data
+
+    def _message(self, place: int, offset: int, time: int) -> tuple[int, bytes]:
+        """Return the connection's number and the bytes of the message at an offset in the chunk at `place`."""
+        file, begin, end = self._content(place)
+        file.seek(begin + offset)
+        while (header := Header.read(file)).get_uint8("op") == RecordType.CONNECTION:
+            self._charge(file.seek(read_uint32(file), SEEK_CUR) - begin - offset)
+        if header.get_uint8("op") != RecordType.MSGDATA or header.get_time("time") != time:
+            raise ReaderError("its index does not fit its messages.")
+        data = read_bytes(file, read_uint32(file))
+        if file.tell() > end:
+            raise ReaderError("a message goes beyond its chunk.")
+        self._charge(file.tell() - begin - offset)
+        self._unread[place] -= 1
+        if not self._unread[place] and place in self._unpacked:
+            self._unpacked_size -= self._unpacked.pop(place).end
+        return header.get_uint32("conn"), data
 
     def _index(self, info: ChunkInfo) -> list[_Entry]:
         """Return the index of a chunk, in the order of its connections."""
         assert self.bio is not None  # noqa: S101  the reader is open
         chunk = self.chunks[info.pos]
         self.bio.seek(chunk.datapos + chunk.datasize)
-        found: dict[int, list[IndexData]] = {connection.id: [] for connection in self.connections}
+        found: dict[int, list[IndexData]] = {number: [] for number in info.connection_counts}
         for _connection in info.connection_counts:
             begin = self.bio.tell()
             super().read_index_data(info.pos, found)
@@ -98,20 +127,32 @@ class BoundedReader(Reader):
             raise ReaderError("a chunk has messages before its first time.")
         return entries
 
-    def _content(self, place: int) -> bytes:
-        """Return an unpacked chunk."""
+    def _content(self, place: int) -> _Content:
+        """Return the content of the chunk at `place`: the bag itself, or the unpacked chunk."""
         assert self.bio is not None  # noqa: S101  the reader is open
         chunk = self.chunks[place]
+        if chunk.decompressor not in _UNPACKERS:
+            return _Content(self.bio, chunk.datapos, chunk.datapos + chunk.datasize)
+        if place in self._unpacked:
+            self._unpacked.move_to_end(place)
+            return self._unpacked[place]
+        content = self._unpacked[place] = self._unpack(chunk)
+        self._charge(content.end)
+        self._unpacked_size += content.end
+        while self._unpacked_size > regular_files.LARGEST_CHUNK:
+            _place, oldest = self._unpacked.popitem(last=False)
+            self._unpacked_size -= oldest.end
+        return content
+
+    def _unpack(self, chunk: Chunk) -> _Content:
+        assert self.bio is not None  # noqa: S101  the reader is open
         self.bio.seek(chunk.datapos)
-        data = read_bytes(self.bio, chunk.datasize)
-        if chunk.decompressor in _UNPACKERS:
-            unpacker = _UNPACKERS[chunk.decompressor]()
-            data = unpacker.decompress(data, regular_files.LARGEST_CHUNK)
-            if not unpacker.eof:
-                more = f"a chunk unpacks to more than {regular_files.LARGEST_CHUNK} bytes."
-                raise ReaderError("a chunk is cut off." if unpacker.needs_input else more)
-        self._charge(len(data))
-        return data
+        unpacker = _UNPACKERS[chunk.decompressor]()
+        data = unpacker.decompress(read_bytes(self.bio, chunk.datasize), regular_files.LARGEST_CHUNK)
+        if not unpacker.eof:
+            more = f"a chunk unpacks to more than {regular_files.LARGEST_CHUNK} bytes."
+            raise ReaderError("a chunk is cut off." if unpacker.needs_input else more)
+        return _Content(BytesIO(data), 0, len(data))
 
     def _charge(self, count: int) -> None:
         self._left -= count

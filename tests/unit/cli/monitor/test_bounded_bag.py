@@ -113,6 +113,23 @@ def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "damaged" in refusal(bag(tmp_path / "turns.bag", twice))
 
 
+@pytest.mark.parametrize(("name", "pack"), [("bz2", bz2.compress), ("none", bytes)])
+def test_chunks_of_the_same_time_are_unpacked_once(
+    name: str, pack: Callable[[bytes], bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording whose chunks overlap, as the flight recorder writes them, costs no more than one in order."""
+    monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 1 << 17)
+    monkeypatch.setattr(bounded_bag, "PER_BYTE", 2 if name == "none" else 60)
+    chunks = []
+    for stream in range(3):
+        times = range(stream, 300, 3)
+        records = [message(time, bytes(100)) for time in times]
+        offsets = [number * len(records[0]) for number in range(100)]
+        chunks.append((name, pack(b"".join(records)), list(zip(times, offsets, strict=True))))
+    found = RecordedFile(bag(tmp_path / "x.bag", chunks), ["*"]).messages()
+    assert [time for _topic, time, _data in found] == [second * 10**9 for second in range(300)]
+
+
 def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
     """A hundred index entries for one chunk count its messages only once."""
     place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
