@@ -113,7 +113,7 @@ def _add_reading(router: Routes, services: Services) -> None:
                 raise ProblemError(422, "bad-input", str(error)) from error
 
     @router.get("/{recording_id:recording}/timeline", responses=_UNKNOWN)
-    async def recording_timeline(
+    async def recording_timeline(  # noqa: PLR0917  the parameters of a request
         recording_id: OneId,
         bearer: Viewer,
         since: _Moment = None,
@@ -121,13 +121,17 @@ def _add_reading(router: Routes, services: Services) -> None:
         columns: Annotated[
             int, Query(ge=1, le=MOST_COLUMNS, description="number of columns that the time is divided into")
         ] = COLUMNS,
+        record: Annotated[
+            str | None,
+            Query(pattern="^[0-9a-f]{20}$", description="list the events around that of this audit record"),
+        ] = None,
     ) -> Timeline:
         """Return the traffic of each topic of a recording, and the events, on one time line; without messages."""
         start, end = _moment(since), _moment(until)
         return await read(
             admin.RecordingWanted(recording_id),
             bearer,
-            lambda row, bag: timeline(row, bag, start, end, columns),
+            lambda row, bag: timeline(row, bag, start, end, columns, record=record or ""),
         )
 
     @router.get("/{recording_id:recording}/messages", responses=_UNKNOWN)

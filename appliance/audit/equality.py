@@ -12,13 +12,13 @@ Invariants:
 
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from appliance.audit.record import AuditRecord
 from appliance.audit.record_format import LogEntry
-from appliance.audit.repetition import ABOUT, KIND, stands_for
+from appliance.audit.repetition import ABOUT, KIND, repetitions
 from appliance.base.varying_numbers import without_numbers
 
 FOLDED = frozenset({"denials folded", "repetitions folded"})
@@ -79,7 +79,12 @@ def plain_reason(record: AuditRecord) -> str:
 
 def times(record: AuditRecord) -> int:
     """Return how often the event of a record happened."""
-    return 1 if record.event in _ABOUT_THE_LOG else stands_for(record)
+    return times_of(record.event, record.detail)
+
+
+def times_of(event: str, detail: Mapping[str, Any]) -> int:
+    """Return how often an event happened, from its record's fields."""
+    return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
 
 
 def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:

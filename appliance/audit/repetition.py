@@ -9,6 +9,7 @@ Texts from peers cannot create an unlimited number of kinds:
    and resources by name, and the rest together.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -163,5 +164,10 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
 
 def stands_for(record: AuditRecord) -> int:
     """Return `detail.count` of a record whose reporter already counted repetitions, else 1."""
-    count = record.detail.get("count")
+    return repetitions(record.detail)
+
+
+def repetitions(detail: Mapping[str, Any]) -> int:
+    """Return `count` of a record's detail if it is a number of repetitions, else 1."""
+    count = detail.get("count")
     return count if type(count) is int and count > 0 else 1

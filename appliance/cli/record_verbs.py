@@ -308,7 +308,8 @@ def _drawn(found: Timeline) -> Iterator[str]:
         who = " ".join(filter(None, (event.resource, event.caller_id, event.host)))
         offset = (event.time - found.since) / _SECOND
         what = f"{event.event}: {event.reason}" if event.reason else event.event
-        yield f"  +{offset:.3f} s  {event.kind}  {printable(who)}  {printable(what)}  (record {event.record})"
+        kind = event.kind if event.times == 1 else f"{event.kind} {event.times} times"
+        yield f"  +{offset:.3f} s  {kind}  {printable(who)}  {printable(what)}  (record {event.record})"
     if found.more_events:
         yield f"  {counted(found.more_events, 'more event')}: list them with a shorter time (--since, --until)"
 

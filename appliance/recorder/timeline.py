@@ -8,7 +8,7 @@ publisher's header has a host, and the recorder's own header has none.
 """
 
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from itertools import islice
@@ -17,6 +17,7 @@ from typing import Any, get_args
 
 import msgspec
 
+from appliance.audit.equality import times_of
 from appliance.audit.record import Severity
 from appliance.audit.record_format import without_binding
 from appliance.channel.answers.recording_answers import (
@@ -75,6 +76,17 @@ class _Columns:
             if self.since <= time <= self.until:
                 counts[(time - self.since) // self._width] += 1
 
+    def spread(self, first: int, last: int, number: int, counts: list[int]) -> None:
+        """Count `number` events that happened between `first` and `last`, as if at equal distances."""
+        first, last = min(first, last), max(first, last)
+        for column in range(self._column(first), self._column(last) + 1):
+            begin = self.since + column * self._width
+            end = min(begin + self._width, self.until + 1)
+            counts[column] += _part(number, first, last, end) - _part(number, first, last, begin)
+
+    def _column(self, time: int) -> int:
+        return (min(max(time, self.since), self.until) - self.since) // self._width
+
     def only(self, first: int, last: int) -> int | None:
         """Return the column that contains both times; None if no column does."""
         if first < self.since or last > self.until:
@@ -83,16 +95,24 @@ class _Columns:
         return column if (last - self.since) // self._width == column else None
 
 
+def _part(number: int, first: int, last: int, time: int) -> int:
+    """Return how many of `number` events between `first` and `last` happened before `time`."""
+    return number * min(max(time - first, 0), last - first + 1) // (last - first + 1)
+
+
 def timeline(
     recording: Recording,
     bag: Path,
     since: int | None = None,
     until: int | None = None,
     columns: int = COLUMNS,
+    *,
+    record: str = "",
 ) -> Timeline:
     """Return the timeline from `since` to `until` (nanoseconds since the epoch; None: the recording's start or end).
 
-    Raises `OSError`, and `ValueError` if the recording has no such time or the bag is invalid.
+    It lists the first events, or those around the event of the audit record with the id `record`. Raises `OSError`, and
+    `ValueError` if the recording has no such time or the bag is invalid.
     """
     start = recording.began if since is None else max(since, recording.began)
     end = recording.ended if until is None else min(until, recording.ended)
@@ -101,13 +121,12 @@ def timeline(
     wanted = _Columns(start, end, columns)
     with BagReader.of(bag) as reader:
         flows, counts = _flows(reader, wanted), defaultdict[str, list[int]](lambda: [0] * columns)
-        events: list[RecordedEvent] = []
-        happened = 0
-        for event in _events(reader, start, end):
-            wanted.count((event.time,), counts[event.kind])
-            happened += 1
-            if len(events) < MOST_EVENTS:
-                events.append(event)
+        listed = _Listed(record)
+        for event, first, last in _events(reader, start):
+            if first <= end:
+                wanted.spread(first, last, event.times, counts[event.kind])
+            if event.time <= end:
+                listed.add(event)
     kept = sorted(flows, key=lambda flow: -sum(flow.counts))[:MOST_TOPICS]
     return Timeline(
         recording.id,
@@ -116,9 +135,33 @@ def timeline(
         sorted(kept, key=lambda flow: flow.topic),
         len(flows) - len(kept),
         [EventMarks(kind, counts[kind]) for kind in get_args(EventKind) if kind in counts],
-        events,
-        happened - len(events),
+        listed.events,
+        listed.happened - len(listed.events),
     )
+
+
+class _Listed:
+    """The first `MOST_EVENTS` events, or if the event of `record` comes later, those around it."""
+
+    def __init__(self, record: str) -> None:
+        self._record = record
+        self._first: list[RecordedEvent] = []
+        self._around: deque[RecordedEvent] = deque(maxlen=MOST_EVENTS)
+        self._found = self.happened = 0
+        """The number of events up to that of `record` (0: not yet), and of all."""
+
+    @property
+    def events(self) -> list[RecordedEvent]:
+        return list(self._around) if self._found > MOST_EVENTS else self._first
+
+    def add(self, event: RecordedEvent) -> None:
+        self.happened += 1
+        if event.record == self._record:
+            self._found = self.happened
+        if len(self._first) < MOST_EVENTS:
+            self._first.append(event)
+        if not self._found or self.happened < self._found + MOST_EVENTS // 2:
+            self._around.append(event)
 
 
 def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
@@ -145,24 +188,31 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
     return list(flows.values())
 
 
-def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent]:
+def _events(reader: BagReader, since: int) -> Iterator[tuple[RecordedEvent, int, int]]:
+    """Yield the events recorded from `since` on; a record may count several, between a first and a last time."""
     for said, time in _records(reader, since):
-        if time > until:
-            return
         kind = _kind(said)
-        if kind is not None:
-            yield RecordedEvent(
-                time=time,
-                kind=kind,
-                record=said.id,
-                event=said.event,
-                severity=said.severity.value,
-                decision=said.decision,
-                host=said.host,
-                caller_id=said.caller_id,
-                resource=said.resource,
-                reason=without_binding(said.reason, said.detail),
-            )
+        if kind is None:
+            continue
+        times, first, last = (
+            times_of(said.event, said.detail),
+            *map(said.detail.get, ("first_time", "last_time")),
+        )
+        spread = times > 1 and isinstance(first, int) and isinstance(last, int)
+        event = RecordedEvent(
+            time=time,
+            kind=kind,
+            record=said.id,
+            event=said.event,
+            severity=said.severity.value,
+            decision=said.decision,
+            host=said.host,
+            caller_id=said.caller_id,
+            resource=said.resource,
+            reason=without_binding(said.reason, said.detail),
+            times=times,
+        )
+        yield event, *((first, last) if spread else (time, time))
 
 
 def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:

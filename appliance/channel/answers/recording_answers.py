@@ -109,7 +109,10 @@ class RecordedFlow(msgspec.Struct, frozen=True):
 
 
 class EventMarks(msgspec.Struct, frozen=True):
-    """The number of events of one kind in each column of the time line, including events that are not listed."""
+    """The number of events of one kind in each column of the time line, including events that are not listed.
+
+    Events that a record only counts are spread evenly over the time between the first and the last.
+    """
 
     kind: EventKind
     counts: Annotated[list[int], doc("events in each column, in their order")]
@@ -128,6 +131,7 @@ class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     caller_id: str | None
     resource: Annotated[str | None, doc("topic, service, call or monitor")]
     reason: Annotated[str, doc("the reason, in words")]
+    times: Annotated[int, doc("how often it happened: a record may count repetitions")] = 1
 
 
 class Timeline(msgspec.Struct, frozen=True):
@@ -142,7 +146,7 @@ class Timeline(msgspec.Struct, frozen=True):
     ]
     more_topics: Annotated[int, doc("number of topics with fewer messages that are omitted")]
     marks: Annotated[list[EventMarks], doc("marks of each kind of event that occurred")]
-    events: Annotated[list[RecordedEvent], doc("the first events, in order")]
+    events: Annotated[list[RecordedEvent], doc("the first events, or those around `record`, in order")]
     more_events: Annotated[int, doc("number of further events of this time, which a shorter part would list")]
 
 

@@ -194,17 +194,37 @@ def test_publishers_cannot_forge_events(tmp_path: Path) -> None:
 
 
 def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
-    """Only the first events are listed, but the columns count all of them."""
+    """Only the first events are listed, or those around a record, but the columns count all of them."""
     writer = BagWriter(tmp_path / "a.bag", {})
     decided = writer.connect(RECORDS)
     writer.write(
         BagMessage(decided, BEGAN + number, record(number, decision="deny"))
-        for number in range(MOST_EVENTS + 7)
+        for number in range(3 * MOST_EVENTS)
     )
     writer.close()
-    found = timeline(RECORDING, tmp_path / "a.bag")
-    assert (len(found.events), found.more_events) == (MOST_EVENTS, 7)
-    assert sum(found.marks[0].counts) == MOST_EVENTS + 7
+    for asked, first in ((None, 0), (MOST_EVENTS - 1, 0), (2 * MOST_EVENTS, 3 * MOST_EVENTS // 2)):
+        about = "" if asked is None else f"{asked:020x}"
+        found = timeline(RECORDING, tmp_path / "a.bag", record=about)
+        assert [int(event.record, 16) for event in found.events] == list(range(first, first + MOST_EVENTS))
+        assert (found.more_events, sum(found.marks[0].counts)) == (2 * MOST_EVENTS, 3 * MOST_EVENTS)
+
+
+def test_counted_events_are_spread_over_their_time(tmp_path: Path) -> None:
+    """A record that stands for many events counts all of them, in any part of the time exactly once."""
+    writer = BagWriter(tmp_path / "a.bag", {})
+    detail = {"count": 999, "first_time": BEGAN + SECOND, "last_time": BEGAN + 4 * SECOND - 1}
+    said = record(1, event="message dropped", severity="warning", detail=detail)
+    writer.write([BagMessage(writer.connect(RECORDS), BEGAN + 5 * SECOND, said)])
+    writer.close()
+    found = timeline(RECORDING, tmp_path / "a.bag", columns=10)
+    assert found.marks[0].counts == [0, 333, 333, 333, 0, 0, 0, 0, 0, 0]
+    assert [event.times for event in found.events] == [999]
+    edges = [BEGAN, BEGAN + 1_234_567_890, BEGAN + 2_345_678_901, BEGAN + 9 * SECOND]
+    parts = [
+        timeline(RECORDING, tmp_path / "a.bag", *part, 7)
+        for part in ((edges[0], edges[1] - 1), (edges[1], edges[2] - 1), (edges[2], edges[3]))
+    ]
+    assert sum(sum(part.marks[0].counts) for part in parts) == 999
 
 
 @pytest.mark.parametrize("torn", [b"no bag", b"#ROSBAG V2.0\n", None])

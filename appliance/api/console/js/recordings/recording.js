@@ -36,35 +36,38 @@ function Incident(/** @type {{row: any, path: string}} */ { row, path }) {
   const { query } = useStore(place);
   const record = query.get("record") ?? row.triggers[0].record;
   const trigger = row.triggers.find((/** @type {any} */ one) => one.record === record);
-  const [part, setPart] = useState({ since: row.began, until: row.ended });
-  const [at, setAt] = useState(trigger?.time ?? row.began);
+  const [part, setPart] = useState({ since: row.began, until: row.ended, around: record }); // `around`: the record whose events are listed
+  const [{ at, about }, setAt] = useState({ at: trigger?.time ?? row.began, about: trigger ? record : null }); // `about`: the record that set the time
   const [topics, setTopics] = useState(/** @type {string[]} */ ([]));
-  const line = useResource((signal) => get(`${path}/timeline`, { since: iso(part.since), until: iso(part.until), columns: COLUMNS }, signal), [path, part.since, part.until]);
+  const line = useResource((signal) => get(`${path}/timeline`, { since: iso(part.since), until: iso(part.until), columns: COLUMNS, record: part.around }, signal), [path, part]);
   const events = line.value?.events ?? [];
-  const chosen = events.find((/** @type {any} */ one) => one.record === record && one.time === at) ?? null;
+  const chosen = (about && events.find((/** @type {any} */ one) => one.record === about)) ?? null;
+  const move = (/** @type {number} */ time) => setAt({ at: time, about: null });
   const pick = (/** @type {any} */ event) => {
-    setAt(event.time);
+    setAt({ at: event.time, about: event.record });
     go(`/console/recordings/${row.id}?record=${event.record}`, { replace: true });
   };
   const placed = useRef(trigger ? record : ""); // the record that set the selected time
   useEffect(() => {
     const known = events.find((/** @type {any} */ one) => one.record === record);
+    if (!known && line.value && part.around !== record) setPart({ ...part, around: record });
     if (!known || placed.current === record) return;
     placed.current = record;
-    setAt(known.time);
+    setAt({ at: known.time, about: record });
   }, [record, events]);
   useSteps(events, at, pick);
+  const all = () => setPart({ since: row.began, until: row.ended, around: about ?? record });
   const zoom = (/** @type {number} */ factor) => {
     const span = Math.min(row.ended - row.began, Math.max(SHORTEST, (part.until - part.since) * factor));
     const since = Math.min(row.ended - span, Math.max(row.began, at - span / 2));
-    setPart({ since, until: since + span });
+    setPart({ since, until: since + span, around: about ?? record });
   };
   return html`<section class="panel" aria-labelledby="line"><div class="panel-head"><h2 id="line">Time line</h2><span class="muted small">${lasting((part.until - part.since) / 1e9)} shown</span>
-      <span class="end"><button class="button small" aria-label="Nearer" title="Nearer (+)" onClick=${() => zoom(1 / 3)}><${Icon} name="plus" size=${16} /></button><button class="button small" aria-label="Farther" title="Farther (-)" onClick=${() => zoom(3)}><${Icon} name="minus" size=${16} /></button><button class="button small" onClick=${() => setPart({ since: row.began, until: row.ended })} title="All of it (0)">All</button></span></div>
+      <span class="end"><button class="button small" aria-label="Nearer" title="Nearer (+)" onClick=${() => zoom(1 / 3)}><${Icon} name="plus" size=${16} /></button><button class="button small" aria-label="Farther" title="Farther (-)" onClick=${() => zoom(3)}><${Icon} name="minus" size=${16} /></button><button class="button small" onClick=${all} title="All of it (0)">All</button></span></div>
       ${line.error ? html`<div class="panel-body"><${Failure} error=${line.error} retry=${line.again} /></div>` : !line.value ? html`<${Loading} rows=${8} />`
-        : html`<${Lanes} line=${line.value} at=${at} move=${setAt} zoom=${zoom} all=${() => setPart({ since: row.began, until: row.ended })} topics=${topics} choose=${setTopics} about=${chosen?.resource ?? null} />`}</section>
+        : html`<${Lanes} line=${line.value} at=${at} move=${move} zoom=${zoom} all=${all} topics=${topics} choose=${setTopics} about=${chosen?.resource ?? null} />`}</section>
     <div class="incident-grid"><${Events} line=${line.value} chosen=${chosen} pick=${pick} row=${row} />
-      <div class="stack">${chosen && html`<${Event} event=${chosen} />`}<${Messages} path=${path} at=${at} record=${chosen?.record ?? null} topics=${topics} clear=${() => setTopics([])} span=${(part.until - part.since) / 1e9} /></div></div>`;
+      <div class="stack">${chosen && html`<${Event} event=${chosen} />`}<${Messages} path=${path} at=${at} record=${about} topics=${topics} clear=${() => setTopics([])} span=${(part.until - part.since) / 1e9} /></div></div>`;
 }
 
 function Events(/** @type {any} */ { line, chosen, pick, row }) {
@@ -81,7 +84,7 @@ function Events(/** @type {any} */ { line, chosen, pick, row }) {
   return html`<section class="panel" aria-labelledby="happened"><div class="panel-head"><h2 id="happened">What happened</h2><span class="muted small end">j, k: next, previous</span></div>
     ${!line ? html`<${Loading} />` : !events.length ? html`<p class="panel-body muted">Only messages in this period.</p>`
       : html`<ul class="event-list tall happened" ref=${list}>${events.slice(0, most).map((/** @type {any} */ one) => html`<li key=${one.record} class=${`event${one === chosen ? " chosen" : ""}`}>
-        <button class="event-pick" aria-pressed=${String(one === chosen)} onClick=${() => pick(one)}><span class="event-time mono small">${clock(one.time / 1e9, span)}</span><span class="event-badge"><${Badge} word=${one.kind === "notice" ? "else" : one.kind} tone=${kindOf(one.kind).tone} /></span>
+        <button class="event-pick" aria-pressed=${String(one === chosen)} onClick=${() => pick(one)}><span class="event-time mono small">${clock(one.time / 1e9, span)}</span><span class="event-badge"><${Badge} word=${one.kind === "notice" ? "else" : one.kind} tone=${kindOf(one.kind).tone} />${one.times > 1 && html` <span class="count-badge">${counted(one.times, "time")}</span>`}</span>
         <span class="event-body"><${Given} value=${one.resource} mono most=${80} none="" /> <span class="event-reason"><${Given} value=${one.reason || one.event} most=${140} /></span></span></button></li>`)}</ul>
         ${events.length > most ? html`<div class="panel-body"><button class="button" onClick=${() => setMost(most + SHOWN)}>More events</button></div>` : null}
         ${line.more_events > 0 && html`<p class="panel-body muted small">${counted(line.more_events, "further event")} in this period: zoom in to list them.</p>`}`}</section>`;
