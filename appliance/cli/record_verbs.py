@@ -72,17 +72,21 @@ def now(
 
 @speaks
 def list_recordings(appliance: Appliance) -> None:
-    """List the recordings, oldest first.
+    """List the recordings, oldest first, and those that are still being made. --json lists only finished ones.
 
     Example: rosrv record list
     """
-    rows = appliance.ask_or_exit(admin.RecordingsWanted()).recordings
+    body = appliance.ask_or_exit(admin.RecordingsWanted())
+    rows = body.recordings
     for row in rows:
         if appliance.as_json:
             say_json(row)
         else:
             say(f"{row.id}  {_moment(row.began)}  {_summary(row)}")
-    if not rows and not appliance.as_json:
+    for making in [] if appliance.as_json else body.in_progress:
+        ends = f"being recorded until {_moment(making.ends)} or later, by {making.trigger.what}"
+        say(f"{making.id}  {_moment(making.began)}  {ends}")
+    if not rows and not body.in_progress and not appliance.as_json:
         say("no recordings; make one: rosrv record now (a recording is listed once it ends)")
 
 

@@ -194,7 +194,10 @@ def _grid(body: Status) -> Table:
         grid.add_row("bundle", _bundle(body.bundles))
     if body.recorder is not None:
         kept = body.recorder
-        grid.add_row("recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB")
+        making = f", {kept.in_progress} being made" if kept.in_progress else ""
+        grid.add_row(
+            "recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB{making}"
+        )
     return grid
 
 

@@ -5,10 +5,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
+from msgspec.structs import replace
+
+from appliance.audit.record_format import rfc3339
 from appliance.base import clock
 from appliance.channel import admin, messages
 from appliance.channel.answers.recording_answers import (
     OPERATORS,
+    OpenRecording,
     Recording,
     RecordingBegun,
     Recordings,
@@ -56,7 +60,7 @@ class RecordingOrders:
         self.link = Link(self._heard)
         self._kept: dict[str, Recording] = {}
         self._lent: dict[str, Recording] = {}  # temporary recordings of the data in memory
-        self._begun: str | None = None  # the id of the recording in progress, if it was returned to a client
+        self._open: dict[str, OpenRecording] = {}
         self._notes: set[asyncio.Future[None]] = set()
 
     def state(self) -> RecorderState | None:
@@ -64,7 +68,7 @@ class RecordingOrders:
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
-        return RecorderState(self.link.channel is not None, len(sizes), sum(sizes))
+        return RecorderState(self.link.channel is not None, len(sizes), sum(sizes), len(self._open))
 
     # --- what operators ask -------------------------------------------------------------------------------
 
@@ -72,7 +76,11 @@ class RecordingOrders:
         """Return the kept recordings, oldest first."""
         self._require()
         rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
-        return Recordings(kept, list(rules.topics), list(rules.never), rules.before)
+        in_progress = [
+            replace(recording, ends=self._plan.end_of(recording.id) or recording.ends)
+            for recording in self._open.values()
+        ]
+        return Recordings(kept, list(rules.topics), list(rules.never), rules.before, in_progress)
 
     async def recording(self, request: admin.RecordingWanted) -> Recording:
         """Return one recording."""
@@ -197,9 +205,10 @@ class RecordingOrders:
 
     def _find(self, recording_id: str) -> Recording:
         known = self._kept | self._lent
-        if recording_id == self._begun:
+        if (ends := self._plan.end_of(recording_id)) is not None:
             raise UnknownThingError(
-                f"recording {recording_id} is still being made: further triggers make it longer"
+                f"recording {recording_id} is still being made: ask again after {rfc3339(ends)}, or later if"
+                " further triggers make it longer"
             )
         if recording_id not in known:
             raise UnknownThingError(f"there is no recording {recording_id[:40]}")
@@ -222,18 +231,21 @@ class RecordingOrders:
 
     def _heard(self, message: object) -> None:
         match message:
-            case messages.RecordingsStated(recordings):
+            case messages.RecordingsStated(recordings, in_progress):
                 self._kept = {recording.id: recording for recording in recordings}
-                self._plan.stated(recordings)
+                self._open = {recording.id: recording for recording in in_progress}
+                self._plan.stated(recordings, in_progress)
+            case messages.RecordingOpened(recording):
+                self._open[recording.id] = recording
             case messages.RevisionsWanted():
                 self.link.send(self._in_force())
             case messages.RecordingClosed(recording):
-                self._begun = None
+                self._open.pop(recording.id, None)
                 self._plan.closed(recording)
                 self._closed(recording)
                 self._note(recording.id)
             case messages.RecordingMissed(trigger, reason, planned):
-                self._begun = None
+                self._open.pop(planned, None)
                 about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
                 if planned:
                     about["recording"] = planned
@@ -250,10 +262,11 @@ class RecordingOrders:
                 )
                 self._note(recording.id)
                 self.link.answered(message.number, message)
-            case messages.RecordingStarted(_number, recording_id):
-                self._begun = recording_id
-                self.link.answered(message.number, message)
-            case messages.MemoryLent(number) | messages.RecordingRefused(number):
+            case (
+                messages.RecordingStarted(number)
+                | messages.MemoryLent(number)
+                | messages.RecordingRefused(number)
+            ):
                 self.link.answered(number, message)
 
     def _note(self, recording_id: str) -> None:

@@ -114,7 +114,8 @@ class Recorder:
     def _obey(self, message: Any) -> None:
         match message:
             case messages.RecordingsAsked():
-                self._answers.append(messages.RecordingsStated(list(self._store.recordings)))
+                making = [making.opened for making in self._making]
+                self._answers.append(messages.RecordingsStated(list(self._store.recordings), making))
                 self._answers += [messages.RecordingClosed(found) for found in self._store.unnoted()]
                 self._answers += [messages.RecordingRemoved(0, *removed) for removed in self._store.removed()]
                 self._answers.append(messages.RevisionsWanted())
@@ -290,7 +291,7 @@ class Recorder:
             self._store.discard_part(progress.id)
             return None, str(error)
         self._making.append(making)
-        self._answers.append(messages.RevisionsWanted())
+        self._answers += [messages.RecordingOpened(making.opened), messages.RevisionsWanted()]
         _log.info("a recording begins", recording=progress.id, trigger=trigger.what, charged_to=charged_to)
         return making, ""
 

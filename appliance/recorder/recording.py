@@ -21,6 +21,7 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.recording_answers import (
     OPERATORS,
     LeftOutTopic,
+    OpenRecording,
     RecordedTopic,
     Recording,
     Trigger,
@@ -118,6 +119,12 @@ class RecordingInProgress:
         if not progress.following:
             progress.following = [{} for _ring in rings]
             progress.not_there = [reader.not_there for reader in self._readers]
+
+    @property
+    def opened(self) -> OpenRecording:
+        """The recording as far as it is known before its end."""
+        progress = self.progress
+        return OpenRecording(progress.id, progress.began, progress.ends, progress.triggers[0])
 
     def step(self) -> None:
         """Write the new messages up to the recording's end. Raises `OSError`."""

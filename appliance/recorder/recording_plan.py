@@ -24,7 +24,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from appliance.audit.record import Severity
-from appliance.channel.answers.recording_answers import APPLIANCE, OPERATORS, ROBOT, Recording, TriggerKind
+from appliance.channel.answers.recording_answers import (
+    APPLIANCE,
+    OPERATORS,
+    ROBOT,
+    OpenRecording,
+    Recording,
+    TriggerKind,
+)
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import kinds_of
 
@@ -159,12 +166,19 @@ class RecordingPlan:
 
     # --- messages of the recorder ---
 
-    def stated(self, recordings: Iterable[Recording]) -> None:
-        """Take the kept recordings into account, also after a restart of control."""
+    def stated(self, recordings: Iterable[Recording], in_progress: Iterable[OpenRecording]) -> None:
+        """Take the recorder's recordings into account, also after a restart of control."""
         kept = list(recordings)
         self._limit = HourlyLimit(self._rules.per_hour, kept)
         for recording in kept:
             self.closed(recording)
+        for making in in_progress:
+            if recording_owner(making.trigger.charged_to) not in self._open:
+                self.opened(making.trigger.charged_to, making.id, making.began, making.ends)
+
+    def end_of(self, recording_id: str) -> int | None:
+        """Return when an open recording ends; None if the recording is not open."""
+        return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
 
     def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
         """Note a recording that the recorder began or extended for an order or a call."""

@@ -74,6 +74,15 @@ class Recording(msgspec.Struct, frozen=True):
     )
 
 
+class OpenRecording(msgspec.Struct, frozen=True):
+    """A recording that is still being made."""
+
+    id: str
+    began: NanoMoment
+    ends: Annotated[NanoMoment, doc("when it ends, or later after further triggers")]
+    trigger: Annotated[Trigger, doc("the first trigger")]
+
+
 class RecordingBegun(msgspec.Struct, frozen=True):
     """A recording that is being made."""
 
@@ -90,6 +99,9 @@ class Recordings(msgspec.Struct, frozen=True):
     topics: Annotated[list[str], doc("names of topics that are recorded; `*` matches anything")] = []
     never: Annotated[list[str], doc("names and types that are never recorded")] = []
     before: Annotated[float, doc("seconds of messages that the memory keeps")] = 0.0
+    in_progress: Annotated[
+        list[OpenRecording], doc("recordings that are still being made: listed above when they have ended")
+    ] = []
 
 
 class Sender(msgspec.Struct, frozen=True):

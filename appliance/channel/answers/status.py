@@ -160,11 +160,12 @@ class AuditState(msgspec.Struct, frozen=True):
 
 
 class RecorderState(msgspec.Struct, frozen=True):
-    """The flight recorder: how many recordings are kept, and their bytes."""
+    """The flight recorder: how many recordings are kept, their bytes, and how many are being made."""
 
     running: bool
     recordings: int
     bytes: int
+    in_progress: int = 0
 
 
 class SwitchedOff(msgspec.Struct, frozen=True):

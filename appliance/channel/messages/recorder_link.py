@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import msgspec
 
-from appliance.channel.answers.recording_answers import Recording, Trigger
+from appliance.channel.answers.recording_answers import OpenRecording, Recording, Trigger
 from appliance.channel.messages.message import Message
 
 
@@ -30,9 +30,16 @@ class RecordingsAsked(Message):
 
 
 class RecordingsStated(Message):
-    """The recorder lists all kept recordings, oldest first."""
+    """The recorder lists all kept recordings, oldest first, and those that it is making."""
 
     recordings: list[Recording]
+    in_progress: list[OpenRecording] = msgspec.field(default_factory=list)
+
+
+class RecordingOpened(Message):
+    """The recorder began a recording."""
+
+    recording: OpenRecording
 
 
 class RevisionsWanted(Message):
@@ -132,7 +139,7 @@ class RecordingMissed(Message):
 
 
 RecorderLink = (
-    RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingClosed | RecordingNoted
-    | RecordingRequested | RecordingStarted | RecordingRemovalWanted | RecordingRemoved | RecordingRefused
-    | RecordingMissed | MemoryWanted | MemoryLent
+    RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingOpened | RecordingClosed
+    | RecordingNoted | RecordingRequested | RecordingStarted | RecordingRemovalWanted | RecordingRemoved
+    | RecordingRefused | RecordingMissed | MemoryWanted | MemoryLent
 )  # fmt: skip

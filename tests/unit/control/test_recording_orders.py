@@ -10,7 +10,7 @@ import pytest
 
 from appliance.audit.ids import IdSource
 from appliance.channel import admin, messages
-from appliance.channel.answers.recording_answers import Recording, Trigger
+from appliance.channel.answers.recording_answers import OpenRecording, Recording, Trigger
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
@@ -18,6 +18,7 @@ from appliance.control.recording_orders import RecorderAwayError, RecordingOrder
 from appliance.recorder.recording_plan import RecordingPlan
 from appliance.recorder.recording_store import MOST_TEMPORARY
 from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.memory_channel import memory_link
 
 pytestmark = pytest.mark.anyio
 
@@ -195,6 +196,21 @@ async def test_orders_have_the_name_of_their_operator() -> None:
     with pytest.raises(UnknownThingError):
         await scene.orders.remove(admin.RecordingRemove("b" * 20), "eve")
     recorder.close()
+
+
+async def test_an_open_recording_is_listed(scene: Scene) -> None:
+    """Until it is closed, a recording has its end as the plan extends it, and a request for it answers when to ask."""
+    ours, recorder = memory_link(messages.RecorderLink)
+    scene.orders.link.attach(ours)
+    opened = OpenRecording(KEPT.id, 1_000, 5 * 10**9, Trigger(1_000, "drop", "record", "so"))
+    recorder.send(messages.RecordingsStated([], [opened]))
+    await told(scene, lambda: bool(cast(Any, scene.orders.state()).in_progress))
+    assert (await scene.orders.recordings(admin.RecordingsWanted())).in_progress == [opened]
+    with pytest.raises(UnknownThingError, match="still being made: ask again after 1970-01-01T00:00:05"):
+        await scene.orders.recording(admin.RecordingWanted(KEPT.id))
+    recorder.send(messages.RecordingClosed(KEPT))
+    await told(scene, lambda: not cast(Any, scene.orders.state()).in_progress)
+    assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
 
 
 @pytest.mark.nightly

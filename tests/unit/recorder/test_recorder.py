@@ -409,8 +409,10 @@ def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
 def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
     """A recording can be removed by order; an order for an unknown recording is refused."""
     scene.happen()
-    scene.later(0.1)
+    [opened] = [said.recording for said in scene.later(0.1) if isinstance(said, messages.RecordingOpened)]
+    assert messages.RecordingsStated([], [opened]) in scene.later(0, messages.RecordingsAsked())
     [recording] = scene.closed(scene.later(6))
+    assert (opened.id, opened.began, opened.trigger) == (recording.id, recording.began, recording.triggers[0])
     assert scene.closed(scene.later(0, messages.RecordingsAsked())) == [recording]
     answers = scene.later(0, messages.RecordingNoted(recording.id), messages.RecordingsAsked())
     assert scene.closed(answers) == []

@@ -8,7 +8,14 @@ import pytest
 from msgspec import structs
 
 from appliance.audit.record import Severity
-from appliance.channel.answers.recording_answers import OPERATORS, ROBOT, UNKNOWN, TriggerKind
+from appliance.channel.answers.recording_answers import (
+    OPERATORS,
+    ROBOT,
+    UNKNOWN,
+    OpenRecording,
+    Trigger,
+    TriggerKind,
+)
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.recording_plan import HourlyLimit, RecordingPlan, span
 from tests.unit.recorder.test_recording_store import SECOND, recording
@@ -141,5 +148,11 @@ def test_recordings_of_an_order_are_prolonged_and_closed_ones_are_not(
     )
     assert dropped(plan, None, NOW)["recording"] == "order"
     closed = structs.replace(recording(10_000, charged_to=ROBOT), id="order")
-    plan.stated([closed])
+    plan.stated([closed], [])
     assert dropped(plan, "127.0.0.1", NOW)["recording"] not in {"asked", "order"}
+    again = made()  # after a restart of control, the recorder states what it is making
+    trigger = Trigger(NOW, "drop", "record", "so", ROBOT)
+    again.stated([closed], [OpenRecording("going on", NOW - SECOND, NOW + SECOND, trigger)])
+    assert again.end_of("going on") == NOW + SECOND
+    assert dropped(again, "127.0.0.1", NOW)["recording"] == "going on"
+    assert (again.end_of("going on") or 0) > NOW + SECOND

@@ -2,6 +2,7 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { take } from "../audit/proof.js";
+import { Moment } from "../moments.js";
 import { isDenial } from "../notable.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
@@ -52,10 +53,11 @@ export function OnTimeline({ record }) {
     const controller = new AbortController();
     const at = Date.parse(record.time) * 1e6;
     // While the recorder is off or does not answer, there is no time line to link to.
-    get("/v1/recordings", {}, controller.signal).then(({ recordings }) => setFound(recordings.find((/** @type {any} */ one) => (closed ? one.id === closed : one.began <= at && at <= one.ended)) ?? null), () => setFound(null));
+    get("/v1/recordings", {}, controller.signal).then(({ recordings, in_progress }) => setFound(recordings.find((/** @type {any} */ one) => (closed ? one.id === closed : one.began <= at && at <= one.ended)) ?? in_progress.find((/** @type {any} */ one) => one.id === record.detail.recording) ?? null), () => setFound(null));
     return () => controller.abort();
   }, [record.id, asked]);
   if (!found) return null;
+  if (found.ends) return html`<p class="muted small">The messages around it are being recorded: the time line is there at <${Moment} at=${found.ends / 1e9} />, or later if more happens.</p>`;
   return html`<div class="row"><${Link} class="button" aria-keyshortcuts="r" to=${`/console/recordings/${found.id}${closed ? "" : `?record=${record.id}`}`}><${Icon} name="recordings" size=${16} />Time line</${Link}>${closed && html`<${Taking} row=${found} />`}
     <span class="muted small">The messages around it were recorded.</span></div>`;
 }

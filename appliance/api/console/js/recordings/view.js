@@ -35,16 +35,17 @@ function List(/** @type {{value: any, error: unknown, again: () => void, running
   const [shown, setShown] = useState(PAGE);
   const off = error instanceof Problem && error.status === 404;
   const rows = [...(value?.recordings ?? [])].reverse();
+  const making = value?.in_progress ?? [];
   const groups = alike(rows);
   const size = rows.reduce((sum, row) => sum + row.size, 0);
-  return html`<div class="head"><h1>Recordings</h1>${value && html`<span class="head-sub">${counted(rows.length, "recording")}, ${bytes(size)}</span>`}
+  return html`<div class="head"><h1>Recordings</h1>${value && html`<span class="head-sub">${counted(rows.length, "recording")}, ${bytes(size)}${making.length ? `, ${making.length} being made` : ""}</span>`}
       <div class="head-actions"><${RecordNow} disabled=${off || !running} /></div></div>
     <section class="panel" aria-label="Recordings">
       ${off ? html`<${Empty} icon="recordings" title="The flight recorder is off">With <code>recorder: {enabled: true}</code> in appliance.yaml it keeps the robot's messages of the minute before an event.</${Empty}>`
         : error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} rows=${6} />`
-        : !rows.length ? html`<${Empty} icon="recordings" title="No recording yet">A message dropped by a monitor, an alarm and the other triggers in <code>recorder.triggers</code> start one; so does Record now.</${Empty}>`
+        : !rows.length && !making.length ? html`<${Empty} icon="recordings" title="No recording yet">A message dropped by a monitor, an alarm and the other triggers in <code>recorder.triggers</code> start one; so does Record now.</${Empty}>`
         : html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>What happened</th><th>Began</th><th class="number">Lasts</th><th class="number">Contents</th><th class="number">Size</th><th>State</th><th><span class="sr-only">Actions</span></th></tr></thead>
-          <tbody>${groups.slice(0, shown).map((some) => html`<${Alike} key=${some[some.length - 1].id} rows=${some} again=${again} />`)}</tbody></table></div>
+          <tbody>${making.map((/** @type {any} */ one) => html`<${Making} key=${one.id} one=${one} />`)}${groups.slice(0, shown).map((some) => html`<${Alike} key=${some[some.length - 1].id} rows=${some} again=${again} />`)}</tbody></table></div>
           ${groups.length > shown && html`<div class="panel-body"><button class="button" onClick=${() => setShown(shown + PAGE)}>Older recordings</button></div>`}`}
     </section>`;
 }
@@ -61,20 +62,30 @@ export function alike(rows) {
   return found;
 }
 
+function Making(/** @type {{one: any}} */ { one }) {
+  return html`<tr><td class="first why"><${Why} why=${one.trigger} /></td><td data-label="Began"><${Moment} at=${one.began / 1e9} /></td>
+    <td colspan="3" data-label="Ends">at <${Moment} at=${one.ends / 1e9} />, or later if more happens</td><td data-label="State"><${Badge} word="being made" tone="note" /></td><td></td></tr>`;
+}
+
 function Alike(/** @type {{rows: any[], again: () => void}} */ { rows, again }) {
   const [open, setOpen] = useState(false);
   const count = rows.length > 1 && html`<button class="count-badge" aria-expanded=${String(open)} title=${open ? "Show the last one only" : "Show each recording"} onClick=${() => setOpen(!open)}>${counted(rows.length, "recording")}<${Icon} name=${open ? "minus" : "plus"} size=${12} /></button>`;
   return html`<${Row} row=${rows[0]} first=${rows[rows.length - 1]} count=${count} again=${again} />${open && rows.slice(1).map((row) => html`<${Row} key=${row.id} row=${row} part again=${again} />`)}`;
 }
 
+/** The first trigger. @param {{why: any, to?: string, count?: any, more?: number}} given `to`: the recording's page; `more`: further triggers */
+function Why({ why, to, count, more = 0 }) {
+  const name = why.monitor || why.resource ? html`${why.monitor && html`<strong><${Given} value=${why.monitor} most=${60} /></strong>`}${why.monitor && why.resource && " on "}${why.resource && html`<${Given} value=${why.resource} most=${80} mono />`}` : html`<${Given} value=${why.text} most=${120} />`;
+  return html`<div class="row"><${Badge} word=${why.what} tone=${kindOf(why.what).tone} />${to ? html`<${Link} to=${to}>${name}</${Link}>` : html`<span>${name}</span>`}
+      ${(why.caller_id || why.host) && html`<span class="muted">by <${Given} value=${why.caller_id} most=${60} mono none="no name" /> of <${Given} value=${why.host} mono none="no address" /></span>`}${count}</div>
+      ${(why.monitor || why.resource) && html`<div class="muted"><${Given} value=${why.text} most=${160} />${more > 0 && html` <span class="small">and ${counted(more, "more", "more")}</span>`}</div>`}`;
+}
+
 /** @param {{row: any, first?: any, count?: any, part?: boolean, again: () => void}} given `first`: the oldest of the recordings that the row stands for */
 function Row({ row, first = row, count, part = false, again }) {
   const [why, ...more] = row.triggers;
   const messages = row.topics.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + one.messages, 0);
-  return html`<tr class=${part ? "part" : ""}><td class="first why"><div class="row"><${Badge} word=${why.what} tone=${kindOf(why.what).tone} />
-      <${Link} to=${`/console/recordings/${row.id}`}>${why.monitor || why.resource ? html`${why.monitor && html`<strong><${Given} value=${why.monitor} most=${60} /></strong>`}${why.monitor && why.resource && " on "}${why.resource && html`<${Given} value=${why.resource} most=${80} mono />`}` : html`<${Given} value=${why.text} most=${120} />`}</${Link}>
-      ${(why.caller_id || why.host) && html`<span class="muted">by <${Given} value=${why.caller_id} most=${60} mono none="no name" /> of <${Given} value=${why.host} mono none="no address" /></span>`}${count}</div>
-      ${(why.monitor || why.resource) && html`<div class="muted"><${Given} value=${why.text} most=${160} />${more.length > 0 && html` <span class="small">and ${counted(more.length, "more", "more")}</span>`}</div>`}</td>
+  return html`<tr class=${part ? "part" : ""}><td class="first why"><${Why} why=${why} to=${`/console/recordings/${row.id}`} count=${count} more=${more.length} /></td>
     <td data-label="Began"><span><${Moment} at=${row.began / 1e9} />${first !== row && html` <span class="muted small nowrap">since <${Moment} at=${first.began / 1e9} /></span>`}</span></td>
     <td class="number nowrap" data-label="Lasts">${lasting((row.ended - row.began) / 1e9)}</td>
     <td class="number" data-label="Contents"><span>${counted(messages, "message")} <span class="muted small nowrap">of ${counted(row.topics.length, "topic")}</span></span></td>
