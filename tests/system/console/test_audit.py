@@ -370,7 +370,7 @@ def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
 
 
 def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:
-    """A row has the count, the times, the first record and the last value; its button, also by keyboard, shows each."""
+    """A row has the count, the times and the last value, and opens the newest full record; its button, also by keyboard, shows each."""
     drops = [drop(2), drop(3, "7 more in the same second", count=7), drop(4)]
     reader = opened()
     reader.page.route(
@@ -382,7 +382,7 @@ def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> 
     expect(page.locator(".head-sub")).to_have_text("4 records shown in 2 rows")
     for text in ("limit", "9 times", "since", "/cmd_vel", "limit.drive dropped it: speed 0.4"):
         expect(rows.first).to_contain_text(text)
-    expect(rows.first.get_by_role("link")).to_have_attribute("href", re.compile(f"{2:020x}$"))
+    expect(rows.first.get_by_role("link")).to_have_attribute("href", re.compile(f"{4:020x}$"))
     more = rows.first.get_by_role("button", name="9 times")
     more.press("Enter")
     expect(more).to_have_attribute("aria-expanded", "true")

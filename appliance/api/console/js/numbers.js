@@ -41,7 +41,8 @@ export function counted(value, one, many = `${one}s`) {
   return `${count(value)} ${value === 1 ? one : many}`;
 }
 
-const LEAST = 1.5; // shortest interval of a rate in seconds: the relay reports its counters once a second
+const LEAST = 10; // shortest interval of a rate in seconds: the relay reports its counters once a second
+const MINUTE = 60;
 
 /**
  * The growth of a counter per second at each sample, since the newest sample that is at least `LEAST` older. It is null
@@ -61,4 +62,12 @@ export function growth(samples, read) {
     found.push({ time: after.time, value: more < 0 ? null : more / seconds });
   }
   return found;
+}
+
+/** The growth of a counter per second in the last minute; null if that is not known. @template {{time: number}} S @param {S[]} samples @param {(sample: S) => number} read */
+export function lately(samples, read) {
+  const after = samples.at(-1);
+  const before = after && (samples.findLast((one) => one.time <= after.time - MINUTE) ?? samples[0]);
+  if (!before || after.time - before.time < LEAST || read(after) < read(before)) return null;
+  return (read(after) - read(before)) / (after.time - before.time);
 }

@@ -11,6 +11,7 @@ import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { Rule } from "../parts/rule.js";
 import { OnTimeline } from "../recordings/taking.js";
+import { iso } from "../recordings/times.js";
 import { get } from "../rest.js";
 import { go, Link } from "../router.js";
 import { plain } from "../words.js";
@@ -20,6 +21,8 @@ import { auditPath } from "./filters.js";
 import { Grant } from "./grant.js";
 import { Why } from "./why.js";
 
+const [FIRST_TIME, LAST_TIME] = [1e17, 4.1e18]; // nanoseconds: the years 1973 to 2099
+const ID = /^[0-9a-f]{20}$/;
 const GIVEN = new Set(["revoked", "connection refused"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
 const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "shadow observed"]);
@@ -60,11 +63,19 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     ${isDenial(record) && (isDecided(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
     <${OnTimeline} key=${`t${record.id}`} record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
-    ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono /></dd>`)}</dl></div>`}
+    ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Detail} name=${name} value=${value} filter=${filter} /></dd>`)}</dl></div>`}
     <${Around} title="Before it, by the same host or node" records=${before} filter=${filter} /><${Around} title="After it, by the same host or node" records=${after} filter=${filter} />
     <div class="stack-tight"><div class="row"><button class="button small" aria-expanded=${String(raw)} onClick=${() => setRaw(!raw)}>${raw ? "Hide JSON" : "Show JSON"}</button><span class="muted small mono">${record.id}</span></div>
       ${raw && html`<pre class="bytes">${plain(JSON.stringify(record, null, 2), 20_000).replaceAll("⟨LF⟩", "\n")}</pre>`}</div>
   </div>`;
+}
+
+/** A field of the record's detail. Times are nanoseconds since the epoch. @param {{name: string, value: any, filter: Record<string, string>}} given */
+function Detail({ name, value, filter }) {
+  if (typeof value === "number" && value > FIRST_TIME && value < LAST_TIME) return html`<${Moment} at=${iso(value)} />`;
+  const to = { recorded_id: auditPath(filter, String(value)), recording: `/console/recordings/${value}` }[name];
+  if (to && ID.test(value)) return html`<${Link} to=${to} class="mono">${value}</${Link}>`;
+  return html`<${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono />`;
 }
 
 function isDenial(/** @type {any} */ record) {

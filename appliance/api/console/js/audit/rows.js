@@ -46,6 +46,11 @@ export function grouped(records) {
   return rows;
 }
 
+/** The record that a row shows and opens: the newest that is not just a number of repetitions. @param {Row} row */
+export function shownOf({ records, first }) {
+  return records.filter((one) => !one.detail.count).reduce((best, one) => (best && best.sequence > one.sequence ? best : one), null) ?? first;
+}
+
 /** How often it happened, and a button that shows each record. @param {{row: Row, open: boolean, toggle: () => void}} given */
 export function Count({ row, open, toggle }) {
   if (row.count === 1) return null;

@@ -6,7 +6,7 @@ import { Outcome } from "../parts/badge.js";
 import { actor, Given } from "../parts/given.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
-import { Count, Range } from "./rows.js";
+import { Count, Range, shownOf } from "./rows.js";
 
 /** @param {{rows: import("./rows.js").Row[], opened: (row: import("./rows.js").Row) => boolean, toggle: (row: import("./rows.js").Row) => void, chosen: string, filter: Record<string, string>}} given */
 export function RecordTable({ rows, opened, toggle, chosen, filter }) {
@@ -17,7 +17,7 @@ export function RecordTable({ rows, opened, toggle, chosen, filter }) {
       const time = html`<${Range} row=${row} />`;
       const count = html`<${Count} row=${row} open=${open} toggle=${() => toggle(row)} />`;
       return [
-        html`<${Row} key=${row.first.id} record=${row.first} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
+        html`<${Row} key=${row.first.id} record=${shownOf(row)} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
         open && row.records.map((one) => html`<${Row} key=${`each ${one.id}`} record=${one} time=${html`<${Moment} at=${one.time} />`} reason=${one.reason} part chosen=${is(one)} filter=${filter} />`),
       ];
     })}</tbody></table></div>`;

@@ -12,7 +12,7 @@ import { Presets } from "./presets.js";
 import { Evidence, Export, Verify } from "./proof.js";
 import { RecordPanel } from "./record.js";
 import { useRecords } from "./records.js";
-import { grouped } from "./rows.js";
+import { grouped, shownOf } from "./rows.js";
 import { RecordTable } from "./table.js";
 import { Timeline } from "./timeline.js";
 
@@ -28,7 +28,7 @@ export function Audit() {
     const ids = row.records.map((one) => one.id);
     setOpen(opened(row) ? new Set([...open].filter((id) => !ids.includes(id))) : new Set([...open, ...ids]));
   };
-  useSteps(rows.flatMap((row) => (opened(row) ? row.records.map((one) => [one]) : [[row.first, ...row.records]])), chosen, filter);
+  useSteps(rows.flatMap((row) => (opened(row) ? row.records.map((one) => [one]) : [[shownOf(row), ...row.records]])), chosen, filter);
   useReturn(chosen);
   return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${rows.length < records.length ? ` in ${counted(rows.length, "row")}` : ""}${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">

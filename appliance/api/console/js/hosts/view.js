@@ -49,7 +49,7 @@ export function Hosts() {
       failed(failure);
     }
   };
-  return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "host")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up</span>
+  return html`<div class="head"><h1>Hosts</h1><span class="head-sub">${counted(body.hosts.length, "tunnel")}, ${body.hosts.filter((/** @type {any} */ one) => one.state === "up").length} up; ${counted(body.machines.length, "machine")} without a tunnel</span>
       <div class="head-actions"><${Button} role="operator" onClick=${reload} title=${`Read ${body.hosts_file} again`}><${Icon} name="again" size=${16} />Reload hosts.yaml</${Button}><${Block}>Block a host…</${Block}><${Button} role="admin" tone="primary" onClick=${() => setOpen({ what: "enrol" })}><${Icon} name="plus" size=${16} />Enrol a host</${Button}></div></div>
     <div class="standing">${isolation === "none" && html`<${Notice} title="Tunnels need isolation netns or container">With isolation none the appliance shares the robot's network, and no host can be enrolled.</${Notice}>`}
       ${body.troubles.map((/** @type {string} */ one) => html`<${Notice} key=${one} tone="warn" title="Needs attention"><${Given} value=${one} most=${400} /></${Notice}>`)}</div>

@@ -2,6 +2,7 @@
 
 import { useEffect, useRef, useState } from "../html.js";
 import { live } from "../live.js";
+import { growth } from "../numbers.js";
 import { ask } from "../rest.js";
 import { useStore } from "../store.js";
 
@@ -53,11 +54,5 @@ export function stateOf(row) {
 
 /** The growth of a monitor's counter over the samples. @param {any[]} samples @param {string} name @param {number} place */
 export function counters(samples, name, place) {
-  const found = [];
-  for (let index = 1; index < samples.length; index += 1) {
-    const [before, after] = [samples[index - 1], samples[index]];
-    const more = (after.monitors[name]?.[place] ?? 0) - (before.monitors[name]?.[place] ?? 0);
-    found.push({ time: after.time, value: more < 0 || after.time <= before.time ? null : more / (after.time - before.time) });
-  }
-  return found;
+  return growth(samples, (one) => one.monitors[name]?.[place] ?? 0);
 }

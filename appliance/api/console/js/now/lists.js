@@ -1,6 +1,6 @@
 /** The latest denials and actions of monitors, live. */
 
-import { Count, grouped, Range } from "../audit/rows.js";
+import { Count, grouped, Range, shownOf } from "../audit/rows.js";
 import { html, useState } from "../html.js";
 import { isSelftest } from "../graph/model.js";
 import { Moment } from "../moments.js";
@@ -40,13 +40,17 @@ function Entry(/** @type {{row: import("../audit/rows.js").Row, what: (row: impo
     ${open && row.records.length > 1 && html`<ul class="each">${row.records.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <${Given} value=${one.reason || one.event} most=${200} /></li>`)}</ul>`}</li>`;
 }
 
-function denied(/** @type {import("../audit/rows.js").Row} */ { first: one, value }, /** @type {any} */ count) {
+function denied(/** @type {import("../audit/rows.js").Row} */ row, /** @type {any} */ count) {
+  const { value } = row;
+  const one = shownOf(row);
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
     <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${isSelftest(one) ? "rosrv selftest" : one.resource ? one.category : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" />${count}</div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${value || one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 
-function done(/** @type {import("../audit/rows.js").Row} */ { first: one, value }, /** @type {any} */ count) {
+function done(/** @type {import("../audit/rows.js").Row} */ row, /** @type {any} */ count) {
+  const { value } = row;
+  const one = shownOf(row);
   return html`<span class="event-badge"><${Badge} word=${one.event.replace(/^(monitor|message) /, "")} tone=${one.severity === "alarm" ? "deny" : one.severity === "warning" ? "warn" : "note"} /></span><div class="event-body">
     <div><strong><${Given} value=${one.detail.monitor} most=${60} /></strong> <span class="muted">on</span> <${Given} value=${one.resource} most=${80} mono />${count}</div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${value || one.reason || one.detail.category || one.event} most=${200} /></${Link}></div></div>`;

@@ -4,7 +4,7 @@ import { html } from "../html.js";
 import { live } from "../live.js";
 import { inOwnZone, lasting, Moment, useNow } from "../moments.js";
 import { notable } from "../notable.js";
-import { count, counted, growth } from "../numbers.js";
+import { count, counted, growth, lately } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { By, Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
@@ -65,7 +65,7 @@ function Card(/** @type {any} */ { name, to, figure, tone = "", words = false, c
 
 function Curves() {
   const samples = useStore(live, (one) => one.samples);
-  const series = (/** @type {string} */ name, /** @type {any} */ colour, /** @type {(one: any) => number} */ read) => ({ name, colour, points: growth(samples, read) });
+  const series = (/** @type {string} */ name, /** @type {any} */ colour, /** @type {(one: any) => number} */ read) => ({ name, colour, points: growth(samples, read), lately: lately(samples, read) });
   return html`<section class="panel" aria-labelledby="curves"><div class="panel-head"><h2 id="curves">Rates, last 15 minutes</h2></div>
     <div class="panel-body plots">
       <div><h3>Decisions</h3><${Plot} label="Decisions" span=${SPAN} series=${[series("allowed", "c1", (one) => one.allowed), series("denied", "c2", (one) => one.denied)]} /></div>

@@ -8,7 +8,7 @@ const LEFT = 44;
 const BOTTOM = 20;
 const TOP = 6;
 
-/** @typedef {{name: string, colour: "c1" | "c2" | "c3" | "c4", points: {time: number, value: number | null}[]}} Series */
+/** @typedef {{name: string, colour: "c1" | "c2" | "c3" | "c4", points: {time: number, value: number | null}[], lately?: number | null}} Series `lately`: the average of the last minute, for the legend */
 
 /** @param {{label: string, series: Series[], span?: number, height?: number, unit?: string, say?: (value: number | null) => string}} given `span`: seconds shown */
 export function Plot({ label, series, span = 900, height = 148, unit = "/s", say = rate }) {
@@ -29,10 +29,11 @@ export function Plot({ label, series, span = 900, height = 148, unit = "/s", say
     const place = event.clientX - /** @type {Element} */ (event.currentTarget).getBoundingClientRect().left;
     setAt(place < LEFT || place > width ? null : place);
   };
-  const said = within.map((one) => ({ ...one, now: nearest(one.points, moment) }));
+  const said = within.map((one) => ({ ...one, now: moment === null ? one.lately ?? nearest(one.points, null) : nearest(one.points, moment) }));
+  const averaged = moment === null && said.some((one) => (one.lately ?? null) !== null);
   return html`<div class="stack-tight">
     <ul class="plot-legend">${said.map((one) => html`<li key=${one.name}><span class=${`swatch ${one.colour}`}></span>${one.name} <b>${say(one.now)}</b>${unit}</li>`)}
-      ${moment !== null && html`<li class="muted">${minute(moment)}</li>`}</ul>
+      ${moment !== null && html`<li class="muted">${minute(moment)}</li>`}${averaged && html`<li class="muted">in the last minute</li>`}</ul>
     <div class="plot plot-box" ref=${box}>
       ${width > 0 && html`<svg height=${height} viewBox=${`0 0 ${width} ${height}`} role="img" aria-label=${`${label}: ${said.map((one) => `${one.name} ${say(one.now)}${unit}`).join(", ")}`}
         onPointerMove=${move} onPointerLeave=${() => setAt(null)}>
