@@ -4,10 +4,10 @@ Text from the network (names, log entries) is printed without control characters
 """
 
 import datetime
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from mmap import mmap
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import typer
@@ -18,6 +18,7 @@ from appliance.base.atomic_files import NotLastingError, write_where_told
 from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 
+_T = TypeVar("_T")
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
@@ -61,3 +62,11 @@ def say_diff(lines: Iterable[str]) -> None:
     """Print the lines of a unified diff: additions green, removals red, positions cyan."""
     for line in lines:
         terminal.say(line, {"+": "green", "-": "red", "@": "cyan"}.get(line[:1], ""))
+
+
+def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, list[_T]]]:
+    """Group rows by host: the host with the most rows first, the rows of each host in their order."""
+    found: dict[str, list[_T]] = {}
+    for row in rows:
+        found.setdefault(host(row), []).append(row)
+    return sorted(found.items(), key=lambda item: -len(item[1]))

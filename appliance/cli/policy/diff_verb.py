@@ -12,7 +12,7 @@ import typer
 from appliance.channel.admin import PolicyRevisions, PolicyRevisionWanted
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_diff, say_json
+from appliance.cli.output import by_host, say_diff, say_json
 from appliance.cli.policy.policy_input import (
     Enrolled,
     Robot,
@@ -32,6 +32,8 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from rosmop.tool.terminal import counted, refused, say
+
+_MOST_CALLERS = 4  # names in one line
 
 
 @dataclass(frozen=True)
@@ -151,13 +153,13 @@ def _compiled(source: _Source, known: PolicyContext) -> Policy:
 
 def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Path | None) -> bool:
     differences = diff(old, new, _requests(requests, appliance))
-    for difference in differences:
-        if appliance.as_json:
+    if appliance.as_json:
+        for difference in differences:
             say_json(_difference_fields(difference))
-        else:
-            for line in _difference_lines(difference):
-                say(line, "yellow" if difference.granted else "red")
-    if not appliance.as_json:
+    else:
+        for host, its in by_host(differences, lambda one: str(one.request.host)):
+            say(f"{host}: {counted(len(its), 'request')}")
+            _say_requests(its)
         say(f"{counted(len(differences), 'request')} would be decided differently")
     return bool(differences)
 
@@ -172,13 +174,24 @@ def _requests(file: Path | None, appliance: Appliance) -> Iterator[Request]:
                 yield from live.requests()
 
 
-def _difference_lines(difference: Difference) -> Iterator[str]:
-    request = difference.request
-    who = f"{request.host} {request.caller_id}".strip()
-    yield f"{difference.word}: {who}: {request.category} {request.resource}"
-    yield f"  seen in {counted(difference.count, 'record')}"
-    yield f"  old: {difference.old.reason}"
-    yield f"  new: {difference.new.reason}"
+def _say_requests(differences: list[Difference]) -> None:
+    """Print the requests of one host, those of several nodes with the same decisions once."""
+    equal: dict[tuple[str, ...], list[Difference]] = {}
+    for one in differences:
+        request = one.request
+        key = one.word, request.category.value, request.resource, one.old.reason, one.new.reason
+        equal.setdefault(key, []).append(one)
+    for (word, category, resource, before, after), its in equal.items():
+        style = "yellow" if its[0].granted else "red"
+        callers = [one.request.caller_id for one in its if one.request.caller_id]
+        named = ", ".join(callers[:_MOST_CALLERS]) or "clients without a name"
+        more = f" and {len(callers) - _MOST_CALLERS} more" if len(callers) > _MOST_CALLERS else ""
+        say(
+            f"  {word}: {category} {resource} by {named}{more}, in {counted(sum(one.count for one in its), 'record')}",
+            style,
+        )
+        say(f"    old: {before}", style)
+        say(f"    new: {after}", style)
 
 
 def _difference_fields(difference: Difference) -> dict[str, object]:

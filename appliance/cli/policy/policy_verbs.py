@@ -12,7 +12,7 @@ import typer
 
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import Json, say_json
+from appliance.cli.output import Json, by_host, say_json
 from appliance.cli.policy.policy_impact import PolicyImpact, impact_of
 from appliance.cli.policy.policy_input import (
     Enrolled,
@@ -28,6 +28,7 @@ from appliance.policy.decision_reasons import DecisionExplanation, explain, rend
 from appliance.policy.grant import DecidedRequest, UngrantableError
 from appliance.policy.grant import grant as grant_of
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
+from appliance.policy.live_rights import Ending
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
@@ -64,16 +65,25 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
             f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
             "red" if errors else "green",
         )
-    for ending in impact.ends:
-        if appliance.as_json:
+    _say_endings(impact.ends, as_json=appliance.as_json)
+    raise typer.Exit(1 if errors else 0)
+
+
+def _say_endings(endings: list[Ending], *, as_json: bool) -> None:
+    if as_json:
+        for ending in endings:
             fields = asdict(ending)
             say_json({"ends": fields.pop("what"), **fields})
-        else:
-            whose = f"{ending.caller_id or 'a client'} on {ending.host}"
-            say(f"would end: {ending.what} {ending.resource} of {whose}: {ending.reason}", "yellow")
-    if impact.ends and not appliance.as_json:
-        say(f"{counted(len(impact.ends), 'live connection')} would end", "yellow")
-    raise typer.Exit(1 if errors else 0)
+        return
+    for host, its in by_host(endings, lambda ending: ending.host):
+        say(f"would end on {host}: {counted(len(its), 'connection')}", "yellow")
+        for ending in its:
+            say(
+                f"  {ending.what} {ending.resource} of {ending.caller_id or 'a client'}: {ending.reason}",
+                "yellow",
+            )
+    if endings:
+        say(f"{counted(len(endings), 'live connection')} would end", "yellow")
 
 
 def _say_finding(finding: PolicyFinding, *, as_json: bool) -> None:
