@@ -35,6 +35,7 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.record_format import as_object
+from appliance.audit.repeated import recorded_in_full
 from appliance.audit.search import Follower, RecordInContext, export, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verification import verify
@@ -288,11 +289,12 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         """
         shown = await desk.record(bearer, record_id, 0)
         record = readable_by(shown.entry, bearer).record
-        known = None
+        known, first = None, await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
+        in_full = None if first is None else readable_by(first, bearer)
         if asks_policy(record):
             known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
-            return await asyncio.to_thread(explained, record, known)
+            return await asyncio.to_thread(explained, record, known, in_full)
 
     @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:

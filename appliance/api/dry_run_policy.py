@@ -14,6 +14,7 @@ from appliance.api.denials import asked_of, is_denial
 from appliance.api.policy_models import Change, Ended, Report
 from appliance.api.problems import Finding, ProblemError
 from appliance.audit.record import AuditRecord
+from appliance.audit.record_format import LogEntry
 from appliance.audit.why import lines_of
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
@@ -73,8 +74,11 @@ def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
     )
 
 
-def explained(record: AuditRecord, current: PolicyKnown | None) -> Why:
-    """Explain a record; if it is a denial that a policy might allow, `current` must be given."""
+def explained(record: AuditRecord, current: PolicyKnown | None, in_full: LogEntry | None = None) -> Why:
+    """Explain a record; if it is a denial that a policy might allow, `current` must be given.
+
+    `in_full`: the record that a record of repetitions continues.
+    """
     found, refusal = None, ""
     try:
         if current is not None:
@@ -85,7 +89,7 @@ def explained(record: AuditRecord, current: PolicyKnown | None) -> Why:
     except UngrantableError as error:
         refusal = str(error)
     added = [f"would be allowed by: {line}" for line in found.added] if found is not None else []
-    return Why(lines=[*lines_of(record), *added], grant=found, refusal=refusal)
+    return Why(lines=[*lines_of(record, in_full), *added], grant=found, refusal=refusal)
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:

@@ -17,6 +17,7 @@ from appliance.audit.record import SCHEMA_VERSION, AuditRecord, RuleReference
 from appliance.base.timestamps import parse_timestamp
 
 _SECOND = 1_000_000_000
+_GIVES_UP = ("unregister", "unsubscribe")
 _NOT_THE_RECORDS = ("schema", "sequence", "chain")
 _OF_THE_RECORD = (
     "event", "severity", "decision", "host", "caller_id", "category", "resource", "rule", "revision", "reason",
@@ -121,6 +122,14 @@ def fields_of(entry: LogEntry) -> dict[str, str | None]:
         "rule": rule_text(record.rule),
         "revision": None if record.revision is None else str(record.revision),
     }
+
+
+def requested(record: AuditRecord) -> str | None:
+    """Return the word for a request: its category, or the call that gives the resource up (unregisterPublisher)."""
+    call = record.detail.get("call")
+    if record.category != "command" and isinstance(call, str) and call.startswith(_GIVES_UP):
+        return call
+    return record.category
 
 
 def rule_text(rule: RuleReference | None) -> str | None:

@@ -4,15 +4,47 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from appliance.audit.record import AuditRecord
-from appliance.audit.record_format import rfc3339, rule_text
+from appliance.audit.record_format import LogEntry, rfc3339, rule_text
 from appliance.base.actors import actor
 
 _ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
 """The events of monitors that trigger recordings, if `recorder.triggers` has them."""
 
+_TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
+"""The counts by name in a summary of repetitions (`repetition.py`)."""
 
-def lines_of(record: AuditRecord) -> Iterator[str]:
-    """Yield the lines of the explanation; the caller must escape untrusted text in them."""
+
+def lines_of(record: AuditRecord, in_full: LogEntry | None = None) -> Iterator[str]:
+    """Yield the lines of the explanation; the caller must escape untrusted text in them.
+
+    `in_full`: the record of the first event, if this record counts repetitions.
+    """
+    yield from _own_lines(record)
+    yield from _counted(record.detail)
+    if in_full is not None:
+        yield f"the first, in full: record {in_full.sequence}, {rfc3339(in_full.record.time)}"
+        yield from (f"  {line}" for line in lines_of(in_full.record))
+
+
+def _counted(detail: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the monitor, number, time and reasons of counted repetitions."""
+    if "count" not in detail:
+        return
+    if "monitor" in detail:
+        yield f"monitor: {detail['monitor']}"
+    times = [
+        rfc3339(time) for name in ("first_time", "last_time") if isinstance(time := detail.get(name), int)
+    ]
+    yield f"counted: {detail['count']}{f', {times[0]} to {times[-1]}' if times else ''}"
+    for what in _TALLIES:
+        if found := _mapping(detail.get(what)):
+            yield f"{what}: {', '.join(f'{name} ({number} times)' for name, number in found.items())}"
+    texts = dict.fromkeys(str(detail[name]) for name in ("first_text", "last_text") if name in detail)
+    if texts:
+        yield f"from first to last: {' … '.join(texts)}"
+
+
+def _own_lines(record: AuditRecord) -> Iterator[str]:
     detail = record.detail
     yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]

@@ -15,7 +15,7 @@ from rich.text import Text
 from appliance.audit.chain_findings import Elsewhere, FindingKind, Verification
 from appliance.audit.equality import FOLDED, EqualRecords, grouped
 from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import LogEntry, fields_of, printable, rfc3339, rule_text
+from appliance.audit.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
 from appliance.audit.search import RecordInContext
 from appliance.base.actors import actor
 from appliance.evidence.export_verification import ExportVerification
@@ -53,7 +53,7 @@ def line(entry: LogEntry) -> str:
         record.event,
         record.host,
         record.caller_id,
-        record.category,
+        requested(record),
         record.resource,
         _by(record),
     ]
@@ -194,7 +194,7 @@ def _cells(row: EqualRecords) -> tuple[Text, ...]:
         Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
         Text(printable(record.event), style="bold red" if alarming else ""),
         Text(_joined(record.host, record.caller_id, _by(record))),
-        Text(_joined(record.category, _monitor(record), record.resource)),
+        Text(_joined(requested(record), _monitor(record), record.resource)),
         Text(_why(record) if row.records == 1 else _why_of_several(row)),
     )
 

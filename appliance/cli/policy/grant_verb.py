@@ -6,14 +6,14 @@ from typing import Annotated, Any, NoReturn
 import msgspec
 import typer
 
-from appliance.audit.record import AuditRecord
+from appliance.audit.record_format import LogEntry
 from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
-from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.cli.policy.live_verbs import say_loaded
@@ -44,9 +44,11 @@ def _explained(appliance: Appliance, record: str) -> Why:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
     from appliance.api.denials import asks_policy  # noqa: PLC0415  not for every verb
     from appliance.api.dry_run_policy import explained  # noqa: PLC0415  as above
+    from appliance.audit.repeated import recorded_in_full  # noqa: PLC0415  as above
 
     with Errors():
-        found = _record(appliance, record)
+        entry = _entry(appliance, record)
+        found = entry.record
         try:
             known = appliance.ask(PolicyWanted()).given() if asks_policy(found) else None
         except NotRunningError as error:
@@ -55,7 +57,8 @@ def _explained(appliance: Appliance, record: str) -> Why:
                 err=True,
             )
             known = None
-        return explained(found, known)
+        assert isinstance(appliance.way, AdminSocket)  # noqa: S101  it has no place
+        return explained(found, known, recorded_in_full(appliance.way.audit().path, entry))
 
 
 @speaks
@@ -127,7 +130,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():
-        found = _record(appliance, record)
+        found = _entry(appliance, record).record
         known = appliance.ask_or_exit(PolicyWanted())
         try:
             return granted(found, known)
@@ -135,11 +138,11 @@ def _granted(appliance: Appliance, record: str) -> Granted:
             fail(str(error), 1)
 
 
-def _record(appliance: Appliance, record: str) -> AuditRecord:
+def _entry(appliance: Appliance, record: str) -> LogEntry:
     shown = appliance.audit().show(record, 0)
     if shown is None:
         _unknown(record)
-    return shown.entry.record
+    return shown.entry
 
 
 def _unknown(record: str) -> NoReturn:

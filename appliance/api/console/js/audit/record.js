@@ -4,7 +4,7 @@ import { isDecided } from "../categories.js";
 import { Block } from "../hosts/block.js";
 import { html, useEffect, useRef, useState } from "../html.js";
 import { Moment } from "../moments.js";
-import { Badge, Outcome } from "../parts/badge.js";
+import { Badge, Outcome, requested } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
@@ -85,7 +85,7 @@ function isDenial(/** @type {any} */ record) {
 function Around(/** @type {{title: string, records: any[], filter: Record<string, string>}} */ { title, records, filter }) {
   if (!records.length) return null;
   return html`<div><h3>${title}</h3><ul class="around">${records.map((one) => html`<li key=${one.id}><span class="muted nowrap"><${Link} to=${auditPath(filter, one.id)}><${Moment} at=${one.time} /></${Link}></span><${Outcome} record=${one} />
-    <span><${Given} value=${one.event === "decision" ? one.category : one.event} /> <${Given} value=${one.resource} mono most=${80} none="" /></span></li>`)}</ul></div>`;
+    <span><${Given} value=${one.event === "decision" ? requested(one) : one.event} /> <${Given} value=${one.resource} mono most=${80} none="" /></span></li>`)}</ul></div>`;
 }
 
 function explain(/** @type {any} */ record) {

@@ -2,7 +2,7 @@
 
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
-import { Outcome } from "../parts/badge.js";
+import { Outcome, requested } from "../parts/badge.js";
 import { actor, Given } from "../parts/given.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
@@ -34,7 +34,7 @@ function Row(/** @type {{record: any, time: any, count?: any, reason: string, pa
   return html`<tr class=${`pick${chosen ? " chosen" : ""}${part ? " part" : ""}`} aria-selected=${chosen ? "true" : undefined} onClick=${open} data-id=${record.id} data-sequence=${record.sequence}>
     <td class="time"><a href=${auditPath(filter, record.id)} onClick=${link}>${time}</a></td>
     <td><${Outcome} record=${record} /></td>
-    <td><${Given} value=${record.event === "decision" ? record.category : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
+    <td><${Given} value=${record.event === "decision" ? requested(record) : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
     <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono /></td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>

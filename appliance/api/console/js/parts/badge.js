@@ -19,3 +19,9 @@ export function Badge({ word, tone, title }) {
 export function Outcome(/** @type {{record: Record<string, any>}} */ { record }) {
   return html`<${Badge} word=${record.decision ?? record.severity} />`;
 }
+
+/** The word for a request: its category, or the call that gives the resource up. @param {Record<string, any>} record */
+export function requested(record) {
+  const call = String(record.detail?.call ?? "");
+  return record.category !== "command" && /^(unregister|unsubscribe)/.test(call) ? call : record.category;
+}
