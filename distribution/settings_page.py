@@ -16,7 +16,7 @@ your machine, `rosrv config check FILE` every error of a file. A key can also be
 and its name in capitals, with two underscores between section and key: `ROSRV_AUDIT__DURABILITY=strict`
 ([order](../operating.md#the-settings)).
 
-Sizes are bytes, or take a unit (`64MiB`). Relative paths are below the folder of the file.
+Sizes are bytes, or take a unit (`64MiB`). Relative paths, defaults too, are below the folder of the file.
 
 """
 _TABLE = "| key | default | values | meaning |\n|---|---|---|---|\n"

@@ -6,7 +6,8 @@
     4. flags
 
 All mistakes are reported at once, each with its location. For an unknown key, the nearest known key is also suggested.
-Relative paths in the file are relative to the file's folder; all other paths, to the working directory.
+With a file, its relative paths and the relative defaults (`policies/default.ini`) are below the file's folder; all other
+paths, and without a file the defaults, are below the working directory.
 """
 
 import dataclasses
@@ -143,12 +144,14 @@ class _Gathered:
             raise ConfigError([Mistake(str(file), "is nested too deeply, or refers to itself")]) from error
         except (yaml.YAMLError, ValueError) as error:
             raise ConfigError([Mistake(str(file), not_yaml(error))]) from error
-        if values is None:
-            return
+        values = {} if values is None else values
         if not isinstance(values, dict):
             raise ConfigError([Mistake(f"{file}:1", "must have lines of the form `key: value`")])
         for path in _PATH_KEYS:
             _resolve_path(values, path, file.absolute().parent)
+        for field in dataclasses.fields(Settings):
+            if isinstance(field.default, Path):  # an absolute default stays as it is
+                values.setdefault(field.name, str(file.absolute().parent / field.default))
         self._values = values
 
     def add_environment(self, environment: Mapping[str, str]) -> None:

@@ -208,12 +208,14 @@ def test_a_file_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: p
 
 
 def test_relative_paths_depend_on_their_source(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A path in the file is relative to the file, a path in a flag to the working directory; the result is absolute."""
+    """With a file, its paths and the defaults are below its folder; all other paths are below the working directory."""
     monkeypatch.chdir("/")
+    assert resolve(None, {}, {}).hosts == Path("/ipsec/hosts.yaml")
     file.write_text("policy: policies/a.ini\nstate: /srv/state\n")
     settings = resolve(file, {}, {})
     assert settings.policy == file.parent / "policies/a.ini"
     assert settings.state == Path("/srv/state")
+    assert settings.hosts == file.parent / "ipsec/hosts.yaml"
     assert resolve(file, {}, {"policy": Path("b.ini")}).policy == Path("/b.ini")
 
 
