@@ -2,8 +2,8 @@
 
 from appliance.channel.admin import GraphWanted
 from appliance.cli.connection.target import Appliance, speaks
-from appliance.cli.output import say_json
-from rosmop.tool.terminal import counted, printable, say
+from appliance.cli.output import say_json, say_row
+from rosmop.tool.terminal import counted, say
 
 
 @speaks
@@ -25,10 +25,7 @@ def list_nodes(appliance: Appliance) -> None:
             )
         )  # fmt: skip
         lost = "  lost: it does not answer" if node.state == "lost" else ""
-        say(
-            f"{printable(node.name):<{width}}  {printable(node.host):<15}  {counts}{lost}",
-            "red" if lost else "",
-        )
+        say_row([f"{node.name:<{width}}", f"{node.host:<15}", f"{counts}{lost}"], "red" if lost else "")
     if not nodes and not appliance.as_json:
         say("no node is registered")
 
@@ -52,6 +49,6 @@ def list_topics(appliance: Appliance) -> None:
             f"{counted(len(topic.publishers), 'publisher')}, {counted(len(topic.subscribers), 'subscriber')}"
         )
         past = "" if topic.mediated else "  bypasses the appliance"
-        say(f"{printable(topic.name):<{name}}  {printable(topic.type):<{kind}}  {ends}, {rate:.1f} Hz{past}")
+        say_row([f"{topic.name:<{name}}", f"{topic.type:<{kind}}", f"{ends}, {rate:.1f} Hz{past}"])
     if not topics and not appliance.as_json:
         say("no topic is registered")

@@ -4,6 +4,8 @@ Text from the network (names, log entries) is printed without control characters
 """
 
 import datetime
+import shutil
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from mmap import mmap
 from pathlib import Path
@@ -19,6 +21,7 @@ from rosmop.tool import terminal
 from rosmop.tool.terminal import printable
 
 _T = TypeVar("_T")
+_GAP, _INDENT = "  ", "    "
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
@@ -70,3 +73,17 @@ def by_host(rows: Iterable[_T], host: Callable[[_T], str]) -> list[tuple[str, li
     for row in rows:
         found.setdefault(host(row), []).append(row)
     return sorted(found.items(), key=lambda item: -len(item[1]))
+
+
+def say_row(parts: Iterable[str], style: str = "") -> None:
+    """Print a row: one line in a pipe; on a terminal, parts that it has no room for are on further, indented lines."""
+    first, *rest = parts
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    line = first
+    for part in rest:
+        if width is None or len(line) + len(_GAP) + len(part) <= width:
+            line += _GAP + part
+        else:
+            terminal.say(line.rstrip(), style)
+            line = _INDENT + part
+    terminal.say(line, style)

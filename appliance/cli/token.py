@@ -11,7 +11,7 @@ from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket
 from appliance.cli.connection.target import Appliance, speaks, speaks_here
 from appliance.cli.durations import span_given
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import say
 
 _Name = Annotated[
@@ -130,7 +130,7 @@ def list_tokens(appliance: Appliance) -> None:
         else:
             end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
         used = _use(row, body.uses_since)
-        say(f"{row.name:<24} {row.role:<12} {row.id}  created {moment(row.created)}  {end}  {used}")
+        say_row([f"{row.name:<24} {row.role:<12} {row.id}", f"created {moment(row.created)}", end, used])
 
 
 def _use(row: Token, since: float | None) -> str:

@@ -10,7 +10,7 @@ from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.host.private_output import usage_error
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import counted, say
 
 _Address = Annotated[
@@ -87,7 +87,14 @@ def list_blocks(running: Appliance) -> None:
             say_json(row)
         else:
             end = "no end" if row.until is None else f"until {moment(row.until)}"
-            say(f"{_named(row):<37}  since {moment(row.since)}  {end:<23}  by {row.who}{_note(row)}")
+            say_row(
+                [
+                    f"{_named(row):<37}",
+                    f"since {moment(row.since)}",
+                    f"{end:<23}",
+                    f"by {row.who}{_note(row)}",
+                ]
+            )
     if not blocks and not running.as_json:
         say("no host is blocked")
 

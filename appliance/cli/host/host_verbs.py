@@ -15,7 +15,7 @@ from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.host.kit_files import key_and_request, placed, wishes_of, write_kit, write_script
 from appliance.cli.host.private_output import new_output, usage_error
-from appliance.cli.output import moment, say_json
+from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import printable, say
 
 _Name = Annotated[
@@ -135,14 +135,14 @@ def list_hosts(
         if running.as_json:
             say_json(row)
         else:
-            say("  ".join(_words(row)))
+            say_row(_words(row))
     if running.as_json or group is not None:
         return
     if not body.hosts:
         say("no hosts; enrol one: rosrv host add NAME")
     for machine in body.machines:
         nodes = f"{machine.nodes} nodes in clear text"
-        say("  ".join([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)]))
+        say_row([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)])
     for trouble in body.troubles:
         say(f"! {trouble}")
 

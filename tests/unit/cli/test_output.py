@@ -1,10 +1,11 @@
 """Tests of `appliance.cli.output`."""
 
 import json
+import sys
 
 import pytest
 
-from appliance.cli.output import loaded_by, moment, say_json, usage_error
+from appliance.cli.output import loaded_by, moment, say_json, say_row, usage_error
 from rosmop.tool.terminal import counted, printable, say
 
 
@@ -54,3 +55,16 @@ def test_an_object_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_revision_names_its_loader(who: str, shown: str) -> None:
     """The rollback of an unconfirmed revision is called automatic."""
     assert loaded_by(who, 0.0) == shown
+
+
+def test_a_row_fits_the_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not fit is on a further line; in a pipe a row is one line, whatever its length."""
+    row = ["laptop    10.113.11.2", "up", "from 192.168.1.7 for 5 s", "ports closed"]
+    say_row(row)
+    assert capsys.readouterr().out == "  ".join(row) + "\n"
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setenv("COLUMNS", "40")
+    say_row(row)
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert lines == ["laptop    10.113.11.2  up", "    from 192.168.1.7 for 5 s", "    ports closed"]
