@@ -1,5 +1,8 @@
 """Keep the ends of things by the system time, although its clock may step back."""
 
+import math
+from collections.abc import Mapping
+
 from appliance.base import clock
 
 
@@ -7,15 +10,30 @@ class Deadlines:
     """Ends in seconds since the epoch. One has passed as soon as the system time *or* the time since the boot says so.
 
     An end is compared with the system time when it is first seen. From then on, a step back of the clock, such as by a
-    false time service, postpones nothing.
+    false time service, postpones nothing. After a restart `limit` has the same effect with the seconds that were left.
     """
 
     def __init__(self) -> None:
         self._deadlines: dict[str, tuple[float, float]] = {}
+        self._limits: dict[str, float] = {}  # by name: the latest end, in seconds since the boot
 
     def passed(self, name: str, end: float) -> bool:
         """Whether the end of `name` has passed."""
         known = self._deadlines.get(name)
         if known is None or known[0] != end:
             known = self._deadlines[name] = end, clock.since_boot() + end - clock.wall()
-        return clock.wall() >= end or clock.since_boot() >= known[1]
+        return clock.wall() >= end or clock.since_boot() >= min(known[1], self._limits.get(name, math.inf))
+
+    def limit(self, left: Mapping[str, float]) -> None:
+        """Let each of these ends pass in at most so many seconds, whatever the system time is."""
+        now = clock.since_boot()
+        for name, seconds in left.items():
+            self._limits[name] = min(now + seconds, self._limits.get(name, math.inf))
+
+    def left(self) -> dict[str, float]:
+        """Return the seconds until each end that was seen, by the time since the boot; 0: it has passed."""
+        now = clock.since_boot()
+        return {
+            name: max(0.0, min(end, self._limits.get(name, math.inf)) - now)
+            for name, (_wall, end) in self._deadlines.items()
+        }

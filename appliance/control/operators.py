@@ -24,6 +24,7 @@ from appliance.control.token_orders import TokenOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
+from appliance.store.stored_deadlines import StoredDeadlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,7 @@ class Operators:
     certification: Certification
     hosts: HostEnrolment
     tokens: TokenOrders
+    ends_of_tokens: StoredDeadlines
     clock: ClockCheck
     forwarded: ForwarderLink
     collected: ForwarderLink
@@ -47,6 +49,7 @@ class Operators:
 def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Operators:
     """Make the parts that serve operators. The specifications must already be loaded."""
     settings, trail, ends = base.settings, base.trail, parts.endpoints
+    ends_of_tokens = StoredDeadlines(base.store)
     certification = Certification(
         base.store,
         trail,
@@ -56,6 +59,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         appliances=base.host_authority.appliances,
         master_port=settings.listen_address[1],
         rest=rest_address(settings),
+        ends=ends_of_tokens,
         changed=base.policies.hosts_changed,
     )
     hosts = HostEnrolment(
@@ -66,7 +70,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         machines=parts.core.registry.machines,
     )
     rest = Current[RestLink]()
-    tokens = TokenOrders(base.store, trail, lambda: rest().state_tokens())
+    tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
     syslog = settings.audit.syslog
     forwarded = ForwarderLink(syslog.to, syslog.send, trail)
@@ -148,6 +152,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         certification=certification,
         hosts=hosts,
         tokens=tokens,
+        ends_of_tokens=ends_of_tokens,
         clock=clock,
         forwarded=forwarded,
         collected=collected,

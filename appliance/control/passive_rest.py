@@ -45,6 +45,7 @@ class ReplicatedTokens:
                 connection.execute("BEGIN")  # one snapshot: keys and tokens of the same time
                 keys = {row[0]: TokenKeys(*row[1:]) for row in connection.execute("SELECT * FROM token_keys")}
                 found = connection.execute("SELECT * FROM token").fetchall()
+                self._ends.limit(dict(connection.execute("SELECT id, seconds FROM token_left")))
             rows = {row[0]: TokenRow._make((*row, keys.get(row[0]))) for row in found}
             changed, self._rows = rows != self._rows, rows
             self.usable()  # from now on, no step of the clock postpones an end

@@ -157,6 +157,7 @@ class _Control:
             "the ends of own connections": listener_limits.own_connection_table.sweep,
             "the return of memory": return_spare_memory,
             "the check of the clock": operators.clock.watch,
+            "the ends of tokens": operators.ends_of_tokens.watch,
             "the check of protection that is off": operators.switched_off.watch,
             "the blocks of hosts": operators.blocks.watch,
             "the bundles": operators.bundles.run,

@@ -34,10 +34,12 @@ class TokenRefusedError(Exception):
 class TokenOrders:
     """All tokens. `changed()` is called when the usable tokens have changed."""
 
-    def __init__(self, store: StateStore, trail: AuditTrail, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, store: StateStore, trail: AuditTrail, ends: Deadlines, changed: Callable[[], None]
+    ) -> None:
         self._store = store
         self._trail = trail
-        self._ends = Deadlines()
+        self._ends = ends
         self._rows = {row.id: row for row in store.tokens()}
         self.usable()  # from now on, no step of the clock postpones an end
         settings = store.settings()

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
@@ -48,6 +49,7 @@ class Certification:
         appliances: ApplianceTable,
         master_port: int,
         rest: RestAddress,
+        ends: Deadlines,
         changed: Callable[[], int],
     ) -> None:
         self.store = store
@@ -55,7 +57,7 @@ class Certification:
         self.table = table
         self.tunnels = tunnels
         self.rest = rest
-        self.awaited = EnrolmentTokens(store.hosts)
+        self.awaited = EnrolmentTokens(store.hosts, ends)
         self.changing = asyncio.Lock()
         self.changed = changed
         self._authority = authority

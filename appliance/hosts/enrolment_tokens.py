@@ -14,6 +14,7 @@ import re
 import secrets
 
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.store.host_tables import EnrolmentTokenRow, HostTables
 
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
@@ -26,17 +27,19 @@ class BadEnrolmentTokenError(Exception):
 
 
 class EnrolmentTokens:
-    """The unused tokens; expired tokens are removed."""
+    """The unused tokens; expired tokens are removed. `ends` keeps their ends although the clock may step back."""
 
-    def __init__(self, tables: HostTables) -> None:
+    def __init__(self, tables: HostTables, ends: Deadlines) -> None:
         self._tables = tables
+        self._ends = ends
         self._rows = {row.name: row for row in tables.awaited()}
+        self.rows()  # from now on, no step of the clock postpones an end
 
     def rows(self) -> dict[str, EnrolmentTokenRow]:
         """Return the valid tokens by the names of their hosts."""
-        now = clock.wall()
-        for name in [name for name, row in self._rows.items() if row.expires <= now]:
-            self.forget(name)
+        for row in list(self._rows.values()):
+            if self._ends.passed(row.id, row.expires):
+                self.forget(row.name)
         return dict(self._rows)
 
     def addresses(self) -> dict[str, str]:
@@ -51,6 +54,7 @@ class EnrolmentTokens:
         secret = secrets.token_urlsafe(32)
         row = EnrolmentTokenRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row
+        self._ends.passed(row.id, row.expires)
         self._tables.save_awaited(row)
         return row, f"rosrv-enrol_{token_id}_{secret}"
 

@@ -17,6 +17,7 @@ import msgspec
 import structlog
 
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from appliance.store.state_file import StateStore
@@ -54,6 +55,7 @@ class TimedDisables:
         self._store = store
         self._come_back = come_back
         self._kept: dict[str, _Return] = {}
+        self._ends = Deadlines()
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
@@ -105,13 +107,12 @@ class TimedDisables:
 
     async def _run(self) -> None:
         while self._kept:
-            now = clock.wall()
-            due = {name: one.back for name, one in self._kept.items() if one.until <= now}
+            due = {name: one.back for name, one in self._kept.items() if self._ends.passed(name, one.until)}
             if due:
                 await self._bring_back(due)
                 continue
             self._changed.clear()
-            left = min(one.until for one in self._kept.values()) - now
+            left = min(seconds for name, seconds in self._ends.left().items() if name in self._kept)
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._changed.wait(), left)
 

@@ -1,6 +1,6 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +47,7 @@ CREATE TABLE IF NOT EXISTS token_keys (
     id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS token_use (id TEXT PRIMARY KEY, used REAL NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS token_left (id TEXT PRIMARY KEY, seconds REAL NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS monitor_state (
     relay INTEGER PRIMARY KEY, epoch INTEGER NOT NULL, content BLOB NOT NULL
 );
@@ -341,6 +342,16 @@ class StateStore:
     def token_uses(self) -> dict[str, float]:
         """Return the last use of each token that was ever used, by id."""
         return dict(self.database.query("SELECT id, used FROM token_use"))
+
+    def save_time_left(self, left: Mapping[str, float]) -> None:
+        """Store the seconds until the ends of tokens, by id."""
+        with self.database.together():
+            for token, seconds in left.items():
+                self.database.put("token_left", token, seconds)
+
+    def time_left(self) -> dict[str, float]:
+        """Return the stored seconds until the ends of tokens, by id."""
+        return dict(self.database.query("SELECT id, seconds FROM token_left"))
 
     # --- settings ---
 

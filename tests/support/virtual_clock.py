@@ -61,3 +61,10 @@ def let_time_pass(seconds: float) -> None:
     present = clock.source()
     assert isinstance(present, VirtualClock)
     present.advance(seconds)
+
+
+def set_wall(seconds: float) -> None:
+    """Set the system time of the virtual clock of the present context."""
+    present = clock.source()
+    assert isinstance(present, VirtualClock)
+    present.set_wall(seconds)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.base import clock
+from appliance.base.deadlines import Deadlines
 from appliance.control.host_blocks import BlockTable, blocks_at_start
 from appliance.control.lease_client import LeaseClient
 from appliance.control.replication import Pair
@@ -96,7 +97,7 @@ class Two:
         self.store.save_setting("monitor returns", returns)
         blocks.put(HOST, seconds=HOUR, who="ann", note="")
         self.store.save_tokens(make_token("ci", "viewer", now=now, seconds=HOUR)[0])
-        EnrolmentTokens(self.store.hosts).add(
+        EnrolmentTokens(self.store.hosts, Deadlines()).add(
             "ocu", seconds=HOUR, address="10.0.0.9", days=1.0, kit={}, who="ann"
         )
 
@@ -178,6 +179,7 @@ DATES = {
     "token.created": "shown to people",
     "token.revoked": "shown to people",
     "token_use.used": "shown to people",
+    "token_left.seconds": "a length",
     "host.expires": "the end of a certificate, which is a date",
     "host.enrolled": "shown to people",
     "host.revoked": "shown to people",

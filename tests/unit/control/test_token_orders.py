@@ -47,7 +47,7 @@ class Lives:
         if self.store is not None:
             self.store.close()
         self.store = StateStore(self.home, failed=pytest.fail, kind=InlineDatabase)
-        return TokenOrders(self.store, self.trail, lambda: None)
+        return TokenOrders(self.store, self.trail, Deadlines(), lambda: None)
 
 
 @pytest.fixture
@@ -289,7 +289,7 @@ async def _rotate_and_die(lives: Lives) -> None:
     store.settled = killed  # type: ignore[method-assign]  # killed instead of answering
     trail = AuditTrail(lives.log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     lives.log.record = lambda record: record.id  # type: ignore[method-assign]  # its thread is in the parent
-    await TokenOrders(store, trail, lambda: None).rotate(TokenRotate("alice"))
+    await TokenOrders(store, trail, Deadlines(), lambda: None).rotate(TokenRotate("alice"))
 
 
 async def uses(tokens: TokenOrders) -> dict[str, float | None]:

@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.base.clock import using
+from appliance.base.deadlines import Deadlines
 from appliance.channel.admin import (
     AuthorityWanted,
     HostAdd,
@@ -110,6 +111,7 @@ class Bench:
             appliances=appliances,
             master_port=11311,
             rest=RestAddress(8443, "", 8443),
+            ends=Deadlines(),
             changed=self._changed,
         )
         certification.served_by("sha256//pin")

@@ -11,6 +11,7 @@ import msgspec
 import pytest
 
 from appliance.audit.record import Severity
+from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
@@ -37,12 +38,12 @@ class World:
         self.recorded: list[dict[str, Any]] = []
         self.obstacle: str | None = None
         self.apis: list[Api] = []
-        self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # this class is the trail
+        self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # this class is the trail
         self.begin(require_proof=False)
 
     def begin(self, *, require_proof: bool) -> None:
         """Start control again with the saved tokens."""
-        self.tokens = TokenOrders(self.store, self, self.token_changed)  # type: ignore[arg-type]  # as above
+        self.tokens = TokenOrders(self.store, self, Deadlines(), self.token_changed)  # type: ignore[arg-type]  # as above
         parts: Any = self
         self.link = RestLink(
             parts, self.tokens, parts, served=print, certified=print, require_proof=require_proof
