@@ -32,6 +32,9 @@ from appliance.control.policy_gate import PolicyRefusedError
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared
+from appliance.policy.lost_rights import LostRights
+from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.signing.fingerprints import fingerprint
 from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 from appliance.specifications.specification_manager import SpecificationManager
@@ -73,7 +76,8 @@ class Trial(msgspec.Struct, frozen=True):
 class BundleRecord(msgspec.Struct, frozen=True):
     """The stored record: the bundle in force since `since` with its revisions, the refused one, and a trial.
 
-    `interrupted` is the SHA-256 of the bundle whose last `interruptions` trials ended with the process.
+    `policy_back` is the revision of the policy before the bundle. `interrupted` is the SHA-256 of the bundle whose last
+    `interruptions` trials ended with the process.
     """
 
     in_force: str = ""
@@ -81,6 +85,7 @@ class BundleRecord(msgspec.Struct, frozen=True):
     since: float = 0.0
     policy: int = 0
     monitors: int = 0
+    policy_back: int = 0
     refused: RefusedBundle | None = None
     trial: Trial | None = None
     interrupted: str = ""
@@ -88,7 +93,10 @@ class BundleRecord(msgspec.Struct, frozen=True):
 
 
 class BundleGate:
-    """The gate, and control's end of the link to the process `bundles`. `health()` returns the present health."""
+    """The gate, and control's end of the link to the process `bundles`.
+
+    `health(deprived)` returns the present health without denials of hosts for which `deprived(host)` is true.
+    """
 
     def __init__(
         self,
@@ -99,11 +107,13 @@ class BundleGate:
         hosts: HostEnrolment,
         store: StateStore,
         trail: AuditTrail,
-        health: Callable[[], RobotHealth],
+        health: Callable[[Callable[[Address], bool]], RobotHealth],
     ) -> None:
         self._fleet = fleet
         self._policies, self._monitors, self._hosts = policies, monitors, hosts
-        self._store, self._trail, self._health = store, trail, health
+        self._store, self._trail, self._measured = store, trail, health
+        self._earlier: Policy | None = None  # the policy before the bundle
+        self._lost: LostRights | None = None
         self.link = Link(self._heard)
         self._record = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=BundleRecord)
         self._poll = messages.BundlePollReported()
@@ -139,6 +149,8 @@ class BundleGate:
         """Undo an interrupted trial, then take bundles as they are offered."""
         if self._record.trial is not None:
             await self._undo_interrupted(self._record, self._record.trial)
+        if self._record.policy_back:
+            self._earlier = await self._policies.compiled(self._record.policy_back)
         while self._fleet.bundles.root is not None:
             self._state()
             try:
@@ -224,18 +236,21 @@ class BundleGate:
 
     async def _try(self, trial: Trial, contents: messages.BundleContents) -> None:
         """Put a bundle into force for the trial; keep it if the robot stays healthy, otherwise go back."""
-        before = self._health()
+        before, self._earlier = self._health(), self._policies.current
         try:
             await self._put_in_force(trial, contents)
             reason = await self._watched(before)
         except _REFUSALS as error:
             reason = str(error)
         if reason:
+            self._earlier = None
             await self._undo(trial)
             self._refuse(trial.path, trial.sha256, reason)
             return
         policy, monitors = self._policies.revision, self._monitors.revision
-        await self._keep(BundleRecord(trial.path, trial.sha256, clock.wall(), policy, monitors))
+        await self._keep(
+            BundleRecord(trial.path, trial.sha256, clock.wall(), policy, monitors, trial.policy_back)
+        )
         self._trail.happened(
             "bundle in force",
             f"{trial.path} is in force, healthy for {self._fleet.bundles.confirm_seconds:g} s",
@@ -264,6 +279,15 @@ class BundleGate:
                 return reason
             self._state()
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
+
+    def _health(self) -> RobotHealth:
+        """Return the present health, without denials of hosts from which the bundle took a right."""
+        old, new, lost = self._earlier, self._policies.current, self._lost
+        if old is None:
+            return self._measured(lambda _host: False)
+        if lost is None or (lost.old, lost.new) != (old, new):
+            lost = self._lost = LostRights(old, new)
+        return self._measured(lost.took_from)
 
     def _refuse(self, path: str, sha256: str, reason: str) -> None:
         refused = RefusedBundle(path, sha256, reason[:4000])

@@ -2,16 +2,18 @@
 
 A host can make any number of denials, and the host from which a change takes a right has a reason to. So all denials of
 the robot's own nodes count, but of every other host a few, and of all of them together little more than the number
-that needs attention: it takes several hosts, and they can hide no denial of the robot's.
+that needs attention: it takes several hosts, and they can hide no denial of the robot's. Denials of a host from which
+the bundle itself took a right do not count.
 """
 
 import ipaddress
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 from appliance.channel.answers.status import MinuteState, ProcessInfo
 from appliance.control.monitor_states import monitors_status
+from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager
 from appliance.telemetry.metrics import Meter
@@ -21,17 +23,20 @@ _ATTENTION_AT = MinuteState(0, {}).attention_at
 _OF_ONE_HOST, _OF_OTHER_HOSTS = 3, 12
 
 
-def counted_denials(by_host: Mapping[str, int], policy: Policy) -> int:
+def counted_denials(
+    by_host: Mapping[str, int], policy: Policy, deprived: Callable[[Address], bool] = lambda _host: False
+) -> int:
     """Return how many denials count. `by_host` has those of unknown hosts together, under an empty name.
 
-    Addresses that the policy names as one network count as one host.
+    Addresses that the policy names as one network count as one host. Denials of hosts for which
+    `deprived(host)` is true do not count.
     """
     own, others = 0, Counter[str]()
     for host, number in by_host.items():
         address = ipaddress.ip_address(host) if host else None
         if address is not None and any(address in network for network in policy.robot):
             own += number
-        else:
+        elif address is None or not deprived(address):
             others["" if address is None else policy.alike(address)] += number
     return own + min(_OF_OTHER_HOSTS, sum(min(_OF_ONE_HOST, number) for number in others.values()))
 
@@ -46,12 +51,17 @@ class RobotHealth(NamedTuple):
 
     @classmethod
     def of(
-        cls, meter: Meter, policy: Policy, monitors: SpecificationManager, processes: Sequence[ProcessInfo]
+        cls,
+        meter: Meter,
+        policy: Policy,
+        monitors: SpecificationManager,
+        processes: Sequence[ProcessInfo],
+        deprived: Callable[[Address], bool],
     ) -> Self:
         """Return the present health."""
         state = monitors_status(monitors)
         return cls(
-            counted_denials(meter.denied_hosts.counts(), policy),
+            counted_denials(meter.denied_hosts.counts(), policy, deprived),
             frozenset([*state.failing, *state.held]),
             frozenset(process.role for process in processes if process.failing),
             tuple(state.refused),

@@ -98,8 +98,8 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         hosts=hosts,
         store=base.store,
         trail=trail,
-        health=lambda: RobotHealth.of(
-            trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes
+        health=lambda deprived: RobotHealth.of(
+            trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes, deprived
         ),
     )
     looks = Queries(

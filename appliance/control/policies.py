@@ -241,6 +241,14 @@ class Policies(Revisions[RevisionRow]):
         row = await self._kept_revision(request.revision)
         return msgspec.convert(self._described(row), answers.RevisionText)
 
+    async def compiled(self, number: int) -> Policy | None:
+        """Return a kept revision as a policy; None if it is not kept, or not valid any more."""
+        try:
+            row = await self._kept_revision(number)
+            return judged(row.text, row.signature, row.file, self.known)
+        except (UnknownThingError, PolicyRefusedError):
+            return None
+
     async def _kept_revision(self, number: int) -> RevisionRow:
         row = self.in_force if number == self.revision else await self._find(number)
         if row is None:

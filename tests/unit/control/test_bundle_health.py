@@ -6,6 +6,7 @@ import pytest
 
 from appliance.audit.budget import Budget
 from appliance.control.bundle_health import RobotHealth, counted_denials
+from appliance.policy.lost_rights import LostRights
 from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
@@ -69,3 +70,19 @@ def test_denials_are_counted_by_host() -> None:
     ):
         trail.decided(Asker(host, "/n", 0), "c", "publish", "/t", Decision(allowed, None, "why"))
     assert trail.meter.denied_hosts.counts() == {"10.0.0.66": 1, "": 2}
+
+
+def test_denials_that_the_new_policy_causes_do_not_count() -> None:
+    """Hosts that lose a right by it do not count, however many they are; the robot's nodes and other hosts do."""
+    hosts = [f"10.1.0.{number}" for number in range(1, 5)]
+    narrower = compile_policy(
+        "[Publishers]\ndefault = robot 10.0.0.0/24 10.1.0.1 10.1.0.2 10.1.0.3 10.1.0.4 10.1.0.5\n/stop/* = robot\n",
+        file="policy.ini",
+        robot=[ipaddress.ip_address(ROBOT)],
+    )
+    denied = dict.fromkeys(hosts, 40)
+    assert counted_denials(denied, narrower, LostRights(_POLICY, narrower).took_from) == 0
+    assert counted_denials(denied, _POLICY, LostRights(narrower, _POLICY).took_from) == 12, (
+        "a wider policy causes no denial"
+    )
+    assert counted_denials({ROBOT: 11} | denied, narrower, LostRights(_POLICY, narrower).took_from) == 11
