@@ -14,7 +14,7 @@ from rosbags.rosbag1.writer import WriterError
 
 from rosmop.recordings.recording import Reader, RecordingError, fits, messages_of, ros_type
 from rosmop.run.engine import MonitorSet
-from rosmop.run.outcomes import MessageSender, Outcome, Verdict, bound
+from rosmop.run.outcomes import DROPPED, MessageSender, Outcome, Verdict, bound
 from roswire.definitions import Definitions
 
 _OWN = "/rosrv"  # caller id of messages that monitors publish; monitors do not receive them
@@ -38,12 +38,17 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class OutputBag:
-    """Write a bag of the messages that subscribers would have received. Raises `RecordingError`."""
+    """Write a bag of the messages that subscribers would have received. Raises `RecordingError`.
+
+    Tools order messages of the same time by their connections. So a message after or before one of a monitor gets a
+    later time than the earlier of the two, if need be by a nanosecond.
+    """
 
     def __init__(self, path: Path, definitions: Definitions) -> None:
         self._path = path
         self._definitions = definitions
         self._connections: dict[_Header, Connection] = {}
+        self._last, self._published = 0, False
         try:
             self._writer = Writer(path)
             self._writer.open()
@@ -61,7 +66,7 @@ class OutputBag:
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         """Write a message of a recorded publisher."""
         sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
-        self._write((*sent, *_sender(connection)), time_ns, data)
+        self._write((*sent, *_sender(connection)), time_ns, data, published=False)
 
     def publish(self, outcome: Outcome) -> None:
         """Write the messages that monitors published."""
@@ -69,16 +74,18 @@ class OutputBag:
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
             header = (message.topic, f"{package}/msg/{kind}", text, digest, _OWN, None)
-            self._write(header, outcome.time, message.data)
+            self._write(header, outcome.time, message.data, published=True)
         for judged in outcome.judged.values():
             self.publish(judged)
 
-    def _write(self, header: _Header, time_ns: int, data: bytes) -> None:
+    def _write(self, header: _Header, time_ns: int, data: bytes, *, published: bool) -> None:
         if header not in self._connections:
             topic, kind, text, digest, caller, latching = header
             self._connections[header] = self._writer.add_connection(
                 topic, kind, msgdef=text, md5sum=digest, callerid=caller, latching=latching
             )
+        time_ns = max(time_ns, self._last + (published or self._published))
+        self._last, self._published = time_ns, published
         self._writer.write(self._connections[header], time_ns, data)
 
 
@@ -177,6 +184,11 @@ def _outcome(  # noqa: PLR0917  a message and its facts
 
 def _after(started: Outcome, outcome: Outcome) -> Outcome:
     """Return the outcome of the first message, with the output of `init` in front."""
+    shift = len(started.published)
+    outcome.judged = {**started.judged, **{shift + number: one for number, one in outcome.judged.items()}}
+    outcome.handling = {
+        number if number == DROPPED else shift + number: one for number, one in outcome.handling.items()
+    }
     outcome.log = [*started.log, *outcome.log]
     outcome.published = [*started.published, *outcome.published]
     outcome.faults = [*started.faults, *outcome.faults]

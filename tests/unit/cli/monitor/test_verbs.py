@@ -40,11 +40,30 @@ def test_output_has_what_subscribers_would_receive(tmp_path: Path) -> None:
     digests = {kind: standard_definitions().md5sum(kind) for kind in ("std_msgs/Int32", "std_msgs/String")}
     assert found == [
         ("/t", digests["std_msgs/Int32"], 10**9, number(10)),
-        ("/out", digests["std_msgs/String"], 10**9, message("std_msgs/String", data="n")),
+        ("/out", digests["std_msgs/String"], 10**9 + 1, message("std_msgs/String", data="n")),
         ("/u", digests["std_msgs/Int32"], 3 * 10**9, number(3)),
     ]
     assert types["/out"] == "std_msgs/msg/String"
     assert rosrv(*command).returncode == 2
+
+
+def test_output_is_in_the_order_of_the_robot_for_every_tool(tmp_path: Path) -> None:
+    """Tools sort by time and then by connection; a message comes before those that it causes, and after `init`'s."""
+    (tmp_path / "a.rv").write_text("""a() { std_msgs::Int32 n;
+        init() { n.data = 100; PUBLISH(/out, std_msgs/Int32, n); }
+        event e(int x) /t std_msgs/Int32 '{data:x}' { n.data = x; PUBLISH(/out, std_msgs/Int32, n); } }""")
+    (tmp_path / "b.rv").write_text(
+        "b() { event e(int x) /out std_msgs/Int32 '{data:x}' { if (x > 9) x = 9; } }"
+    )
+    sent = [("/u", 2), ("/t", 1), ("/t", 3)]  # all at the same time
+    bag = make_bag(tmp_path / "in.bag", [(topic, "std_msgs/Int32", 1, number(x)) for topic, x in sent])
+    files, out = [str(tmp_path / "a.rv"), str(tmp_path / "b.rv")], tmp_path / "out.bag"
+    rosrv("monitor", "run", *files, "--bag", str(bag), "--output", str(out))
+    with Reader(out) as reader:
+        found = sorted((time, one.id, one.topic, data[0]) for one, time, data in reader.messages())
+    assert [(topic, x) for _time, _id, topic, x in found] == [
+        ("/u", 2), ("/out", 9), ("/t", 1), ("/out", 1), ("/t", 3), ("/out", 3)
+    ]  # fmt: skip
 
 
 def test_the_types_of_the_recording_are_known(tmp_path: Path) -> None:
