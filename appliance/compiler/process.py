@@ -5,9 +5,10 @@ Invariants:
 1. The process has no network and no files, only its lifeline and its link to control.
 2. Specifications that exceed the limits of memory or processor time end only this process.
 3. The process ends with exit status 0 after `_IDLE_SECONDS` without work.
-4. When the work's budget of processor time is used up, the compiler answers with a refusal; when control closes the
-   link, it does not answer. In both cases the process ends (status 0), because a thread cannot be stopped. The
-   supervisor starts the next process on demand.
+4. When the work's budget of processor time is used up, the compiler answers with a refusal, and the process ends
+   (status 0), because a thread cannot be stopped. The supervisor starts the next process on demand.
+5. The process ends in the same way when control closes the link, also while it starts or is idle: without a link
+   nobody can ask it, and the supervisor starts no other compiler while it runs.
 """
 
 import asyncio
@@ -49,7 +50,6 @@ class CompilerProcess:
     def __init__(self, lifeline: Channel) -> None:
         self._child = Child(lifeline, messages.CompilerLink, said=self._said, lost=self._lost)
         self._asked: asyncio.Queue[_Question] = asyncio.Queue()
-        self._working = False
 
     async def run(self) -> None:
         """Answer questions until none comes for `_IDLE_SECONDS`, or the supervisor stops the process."""
@@ -68,22 +68,20 @@ class CompilerProcess:
     async def _work(self, wanted: _Question) -> None:
         budget = _budget(wanted)
         ends = _used() + budget
-        self._working = True
         work = asyncio.ensure_future(asyncio.to_thread(answer, wanted))
         while not work.done() and (left := ends - _used()) > 0:
             await asyncio.wait((work,), timeout=max(left, 0.05))
-        self._working = False
         if work.done():
-            self._child.tell(work.result())
+            if not self._child.tell(work.result()):
+                self._lost("")
             return
         text = f"they take more than the {budget} s of processor time that {_purpose(wanted)} has to compile them"
         self._child.tell(messages.CompilationRefused(wanted.number, [text]))
         os._exit(0)
 
     def _lost(self, _reason: str) -> None:
-        """End the process, because control no longer waits for its work."""
-        if self._working:
-            os._exit(0)
+        """End the process, because control can no longer ask it."""
+        os._exit(0)
 
     def _said(self, message: Any) -> None:
         if isinstance(message, _Question):
