@@ -3,11 +3,14 @@
 Every module of the kernel (docs/dev/architecture.md) is loaded with all its mutants inside, each switched by a number.
 A first run records which tests reach which mutant. Then each chosen mutant is switched on in a fork of this process,
 which runs only those tests, until one fails. With `--all`, it also runs the tests that are left out of the gate.
+`--module master` changes the modules whose path contains `master` instead of the kernel. A seed then chooses the same
+mutants whatever the tests reach, so that two states of the tests can be compared.
 """
 
 import argparse
 import ast
 import builtins
+import importlib
 import importlib.abc
 import importlib.machinery
 import json
@@ -27,14 +30,22 @@ import pytest
 ROOT = Path(__file__).parents[1]
 _PAGE = (ROOT / "docs" / "dev" / "architecture.md").read_text(encoding="utf-8")
 _KERNEL = re.findall(r"`([\w/]+)\.py` \d+", _PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0])
-MODULES = {f"appliance.{path.replace('/', '.')}": ROOT / "appliance" / f"{path}.py" for path in _KERNEL}
 FOLDERS = ("tests/unit", "tests/world")
-_SECONDS = 300  # a mutant whose tests take longer is found: it hangs
 _OPPOSITES: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
     ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
 }  # fmt: skip
 _REACHED = "__reached_mutant__"
+
+
+def modules_of(part: str) -> dict[str, Path]:
+    """Return the modules of the kernel, or with a part of a path all modules of the appliance that it is in."""
+    paths = _KERNEL
+    if part:
+        found = (ROOT / "appliance").rglob("*.py")
+        paths = [str(file.relative_to(ROOT / "appliance").with_suffix("")) for file in found]
+        paths = sorted(path for path in paths if part in path and not path.endswith("__init__"))
+    return {f"appliance.{path.replace('/', '.')}": ROOT / "appliance" / f"{path}.py" for path in paths}
 
 
 class _Switches(ast.NodeTransformer):
@@ -117,21 +128,22 @@ class _Switches(ast.NodeTransformer):
 
 
 class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads the kernel's modules with their switches; `described` says what each number changes."""
+    """Loads modules with their switches; `described` says what each number changes."""
 
-    def __init__(self) -> None:
+    def __init__(self, modules: dict[str, Path]) -> None:
+        self.modules = modules
         self.described: list[str] = []
 
     def find_spec(
         self, fullname: str, _path: Sequence[str] | None, _target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return how to load a module of the kernel."""
-        file = MODULES.get(fullname)
+        """Return how to load one of the modules."""
+        file = self.modules.get(fullname)
         return None if file is None else importlib.machinery.ModuleSpec(fullname, self, origin=str(file))
 
     def exec_module(self, module: types.ModuleType) -> None:
         """Load a module with its switches."""
-        file = MODULES[module.__name__]
+        file = self.modules[module.__name__]
         module.__file__ = str(file)
         tree = ast.parse(file.read_text(encoding="utf-8"))
         switches = _Switches(str(file.relative_to(ROOT)), len(self.described))
@@ -143,8 +155,11 @@ class MutantLoader(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 class Hunt:
     """A plugin of pytest that runs the collected tests once to learn what they reach, then once for each mutant."""
 
-    def __init__(self, loader: MutantLoader, number: int, seed: int) -> None:
-        self._loader, self._number, self._seed = loader, number, seed
+    def __init__(
+        self, loader: MutantLoader, number: int, seed: int, seconds: int, *, everything: bool
+    ) -> None:
+        self._loader, self._number, self._seed, self._everything = loader, number, seed, everything
+        self._seconds = seconds
         self._reaches: dict[int, set[str]] = {}  # by mutant
         self._active = -1
         self._test = ""
@@ -165,19 +180,21 @@ class Hunt:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         """Run everything in forks, so that no run affects another."""
         items = session.items
-        learned = self._fork(session, items, _SECONDS * 10)
+        learned = self._fork(session, items, self._seconds * 10)
         if learned["failed"]:
             raise pytest.UsageError(f"without a mutant, these tests fail: {learned['failed']}")
         reaches: dict[str, list[str]] = learned["reaches"]
         reached = sorted(map(int, reaches))
-        chosen = random.Random(self._seed).sample(reached, min(self._number, len(reached)))  # noqa: S311  a sample
+        known = sorted(range(len(self._loader.described)), key=self._loader.described.__getitem__)
+        sampled = known if self._everything else reached
+        chosen = random.Random(self._seed).sample(sampled, min(self._number, len(sampled)))  # noqa: S311  a sample
         print(
             f"{len(self._loader.described)} mutants, {len(reached)} reached by {len(items)} tests; {len(chosen)} chosen"
         )
         for count, number in enumerate(chosen, 1):
             self._active = number
-            wanted = set(reaches[str(number)])
-            outcome = self._fork(session, [item for item in items if item.nodeid in wanted], _SECONDS)
+            wanted = set(reaches.get(str(number), []))
+            outcome = self._fork(session, [item for item in items if item.nodeid in wanted], self._seconds)
             found = ", ".join(outcome["failed"]) or "SURVIVED"
             self.survivors += [] if outcome["failed"] else [number]
             print(f"{count}/{len(chosen)} {self._loader.described[number]}: {found[:120]}", flush=True)
@@ -230,14 +247,23 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--number", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--seconds", type=int, default=300, help="a mutant whose tests take longer is found: it hangs"
+    )
     parser.add_argument("--all", action="store_true", help="also run tests that are not of the gate")
+    parser.add_argument(
+        "--module", default="", metavar="PART", help="part of the paths of the changed modules"
+    )
     parser.add_argument(
         "tests", nargs="*", default=[folder for folder in FOLDERS if (ROOT / folder).exists()]
     )
     given = parser.parse_args()
-    loader = MutantLoader()
+    loader = MutantLoader(modules_of(given.module))
     sys.meta_path.insert(0, loader)
-    hunt = Hunt(loader, given.number, given.seed)
+    hunt = Hunt(loader, given.number, given.seed, given.seconds, everything=bool(given.module))
+    if given.module:
+        for name in loader.modules:
+            importlib.import_module(name)
     options = ["-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no", "-s"]
     options += [] if given.all else ["-m", "not nightly and not real"]
     return int(pytest.main([*options, *given.tests], plugins=[hunt]))
