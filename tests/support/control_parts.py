@@ -9,7 +9,7 @@ import functools
 import ipaddress
 import itertools
 from collections.abc import Iterable
-from typing import Any, Self, cast
+from typing import Any, NamedTuple, Self, cast
 
 from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
@@ -49,17 +49,33 @@ _INNER_PORT = 9
 _TABLES = {"Publisher": Kind.PUBLICATION, "Subscriber": Kind.SUBSCRIPTION, "Service": Kind.SERVICE}
 
 
+class Denied(NamedTuple):
+    """The record of a denied call, with the recorded parameters of a command."""
+
+    category: str
+    resource: str
+    decision: Decision
+    about: dict[str, str]
+
+
 class Records:
-    """An audit trail that keeps (event, resource)."""
+    """An audit trail that keeps (event, resource), the denied decisions, and the requests that were not understood."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str | None]] = []
+        self.denied: list[Denied] = []
+        self.refused: list[str] = []
 
         self.strict = False
         self.revision = 1
         self.obstacle: str | None = None
         self.debt = ""
         self.meter = Meter()
+
+    def clear(self) -> None:
+        self.events.clear()
+        self.denied.clear()
+        self.refused.clear()
 
     def shut_out(self, _host: str) -> str:
         return ""
@@ -71,13 +87,18 @@ class Records:
         return self.owing(host)
 
     def decided(
-        self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
+        self, _caller: Any, _method: str, category: str, resource: str, decision: Decision, **more: Any
     ) -> str:
         self.events.append(("allow" if decision.allowed else "deny", resource))
+        if not decision.allowed:
+            about = {name: value for name, value in more.items() if name != "reads"}
+            self.denied.append(Denied(category, resource, decision, about))
         return "id"
 
-    def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
+    def happened(self, event: str, _reason: str, *, resource: str | None = None, **detail: Any) -> str:
         self.events.append((event, resource))
+        if detail.get("decision") == "deny":
+            self.refused.append(f"{event}: {detail.get('caller_id', '')} {detail['category']} {resource}")
         return "id"
 
 
@@ -117,10 +138,13 @@ class HiddenMaster:
         self.nodes: dict[str, str] = {}
         self.parameters: dict[str, Value] = {"run_id": "1"}
         self.pid = 4711
+        self.go = asyncio.Event()
+        self.go.set()
 
     async def call(self, method: str, *params: Value) -> Value:
         """Carry out one call, or the calls of a multicall, which takes a turn of the loop."""
         await asyncio.sleep(0)
+        await self.go.wait()
         if method == "system.multicall":
             parts = cast(list[dict[str, Any]], params[0])
             return [[self.carry_out(part["methodName"], *part["params"])] for part in parts]

@@ -1,35 +1,52 @@
 """Conversations with RVMaster as text: each line is an action, followed by the lines of its effects.
 
-Actions (`Conversation.say`):
+Calls, made at a host (`own`: by the appliance's own node):
 
-    10.0.0.1 /talker registerPublisher /chatter std_msgs/String    a call of the Master API, made at that host
+    10.0.0.1 /talker registerPublisher /chatter std_msgs/String    a call of the Master API
     10.0.0.1 /talker:2 registerPublisher /chatter ...               the same by a second life of the node
     10.0.0.2 /listener requestTopic /chatter of /talker             a call of another node's API
-    own /rosout registerPublisher /rosout_agg rosgraph_msgs/Log     a call of the appliance's own node
+    10.0.0.2 /tool multicall setParam /a 1 | deleteParam /b         several calls in one request
+    10.0.0.2 calls getPid ["/tool"]                                 any call, with all its parameters as JSON
+    begin 10.0.0.2 /tool setParam /a 1                              a call that the conversation does not wait for
+
+Events:
+
     /talker dies | /talker is silent | /talker answers              and is checked
     /talker misses the list of /chatter                             its delivery failed
+    /ear loses its connection for /chatter                          and is checked
+    nodes may be silent for 60 s                                    before they are lost; otherwise 0 s
     policy NAME | policy NAME, NAME                                 put that policy in force, or several at once
     host 10.0.0.1 is expelled                                       revoke everything that its nodes have
     `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
+    `ROSMaster is slow` | `ROSMaster answers`                       its answers wait until then
+    `the queue of changes is full`                                  calls that change the graph wait for a round
     a round                                                         of the reconcile loop
     `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
     state                                                           what control and the ROS master have
     given LINE                                                      another action, whose effects are not listed
 
-Effects follow, one per line, in the order in which they are carried out; a denial is `deny: reason`, the answer to a
-question `answer: value`, a withheld update `withhold`. Nodes are written by name (a second incarnation as
-`/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI.
+Effects follow, one per line, in the order in which they are carried out. First come the answers of calls: a denial as
+`deny CATEGORY RESOURCE: reason`, with the reason in the record below it if the caller gets less, another failure as
+`refused: reason`, an error of the caller as `error: reason`, the answer to a question as `answer: value`. Then comes
+`record malformed` or `record limit exceeded`, last a withheld update as `withhold`. Nodes are written by name (a second
+incarnation as `/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI.
 Effects that only store state for a restart of control are left out. No socket is opened and no name is random, so a
 formal model of RVMaster can be compared with the text.
+
+A file has policies (`policy NAME`, or `policy NAME like OTHER` for more sections, with indented lines), and then
+conversations (`# title`).
 """
 
+import asyncio
 import ipaddress
 import json
+import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 from appliance.channel import messages
+from appliance.configuration.settings import LivenessSection
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.endpoints.traffic import RelayTraffic
@@ -50,8 +67,9 @@ from appliance.master.graph.effects import (
     WriteRecord,
 )
 from appliance.master.graph.registry import Incarnation, Kind
+from appliance.policy.model import text_for_caller
 from appliance.specifications.allocation import Allocation
-from roswire.xmlrpc import Value
+from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts
 from tests.support.idle import idle
 
@@ -65,16 +83,17 @@ _SHAPES = {
     "unregisterService": "RS",
     "subscribeParam": "AR",
     "unsubscribeParam": "AR",
-    "setParam": "RV",
-    "deleteParam": "R",
-    "getPublishedTopics": "R",
-    "getSystemState": "",
-    "getTopicTypes": "",
-    "lookupNode": "R",
-    "lookupService": "R",
-    "requestTopic": "R",
+    "setParam": "RJ",
+    "publisherUpdate": "RJ",
+    "paramUpdate": "RJ",
+    "requestTopic": "RP",
 }
-_QUESTIONS = {"getPublishedTopics", "getSystemState", "getTopicTypes", "lookupNode", "lookupService"}
+# Calls whose answer is not only that they were carried out.
+_QUESTIONS = {
+    "getParam", "getParamNames", "getPid", "getPublishedTopics", "getSystemState", "getTopicTypes", "getUri",
+    "hasParam", "lookupNode", "lookupService", "searchParam",
+}  # fmt: skip
+_RAW = re.compile(r"(\S+) calls (\S+) (\[.*\])(?: of (\S+))?")
 _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
 _WORDS = {
     PlaceResource: "place",
@@ -91,10 +110,11 @@ _WORDS = {
 class Conversation:
     """RVMaster and its clients; `policies` maps the names in `policy NAME` to texts."""
 
-    def __init__(self, parts: ControlParts, **policies: str) -> None:
+    def __init__(self, parts: ControlParts, policies: dict[str, str]) -> None:
         self.parts = parts
         self._policies = policies
         self._names: dict[str, str] = {}  # of incarnations, by their keys
+        self._begun: dict[str, asyncio.Task[list[str]]] = {}  # calls without an answer, by their lines
 
     async def say(self, line: str) -> list[str]:
         """Return the effects of one line."""
@@ -104,43 +124,109 @@ class Conversation:
 
     async def _effects(self, line: str) -> list[str]:
         self.parts.enactor.noted.clear()
-        self.parts.records.events.clear()
-        said = shlex.split(line)
-        answers = (
-            await self._call_by(said) if len(said) > 2 and said[2] in _SHAPES else await self._event(said)
-        )
-        await self.parts.settle()
+        self.parts.records.clear()
+        call = line.removeprefix("begin ")
+        if call != line:
+            self._begun[call] = asyncio.create_task(self._call_by(call))
+            answers = []
+        else:
+            answers = await (
+                self._call_by(line) if line[0].isdigit() or line[:4] == "own " else self._event(line)
+            )
+        await self._settle()
+        answers += self._finished()
         shown = [self._shown(effect) for effect in self.parts.enactor.noted]
-        denied = [resource for event, resource in self.parts.records.events if event == "deny"]
-        withheld = denied[1:] if answers and answers[0].startswith("deny: ") else denied
-        return [*answers, *filter(None, shown), *(f"withhold {key}" for key in withheld)]
+        refused = [f"record {record}" for record in self.parts.records.refused]
+        withheld = [f"withhold {one.resource}" for one in self.parts.records.denied]
+        return [*answers, *refused, *filter(None, shown), *withheld]
 
-    async def _call_by(self, said: list[str]) -> list[str]:
-        """Make a call; return its denial, or the answer to a question."""
-        host, name, method, *rest = said
-        own = host == "own"
-        if method == "requestTopic":
-            topic, _of, publisher = rest
-            target = self._node(publisher)
-            return _denial(await self.parts.ask(method, name, topic, [["TCPROS"]], host=host, target=target))
-        call = self._call(host, name, method, rest)
-        answer = await self.parts.ask(*call, host="127.0.0.1" if own else host, own=own)
+    async def _settle(self) -> None:
+        """Wait until all work is done, or, while a call waits, for the work that does not wait."""
+        for _ in range(50 if self._begun else 0):
+            await asyncio.sleep(0)
+        if all(task.done() for task in self._begun.values()):
+            await self.parts.settle()
         self._names |= {
-            node.key: "".join([node.name, *name.partition(":")[1:]])
+            node.key: f"{node.name}{'' if (life := node.api.port - 40_000) == 1 else f':{life}'}"
             for node in self.parts.registry.all()
             if node.key not in self._names
         }
-        assert isinstance(answer, list)
-        if method in _QUESTIONS and answer[0] == 1:
-            return [f"answer: {self._value(answer[1])}: {self._value(answer[2])}"]
-        if method in _QUESTIONS and answer[0] == -1:
-            return [f"answer: {answer[1]!s}"]
-        return _denial(answer)
 
-    async def _event(self, said: list[str]) -> list[str]:
+    def _finished(self) -> list[str]:
+        """Return the answers of calls that were begun earlier and have one now."""
+        finished = [line for line, task in self._begun.items() if task.done()]
+        return [
+            f"answered {line}: {answer}"
+            for line in finished
+            for answer in self._begun.pop(line).result() or ["done"]
+        ]
+
+    async def _call_by(self, line: str) -> list[str]:
+        """Make a call; return the lines of its answer."""
+        raw = _RAW.fullmatch(line)
+        if raw is not None:
+            host, method, text, called = raw.groups()
+            answer = await self._ask(host, method, json.loads(text), called)
+            return self._answered(method, answer, raw=True)
+        host, name, method, *rest = shlex.split(line)
+        called = rest[-1] if rest[-2:-1] == ["of"] else None
+        if method != "multicall":
+            params = self._parameters(host, name, method, rest[: -2 if called else None])
+            return self._answered(method, await self._ask(host, method, params, called))
+        calls = [shlex.split(part) for part in line.partition(" multicall ")[2].split(" | ")]
+        parts = [{"methodName": one, "params": self._parameters(host, name, one, of)} for one, *of in calls]
+        answers = await self._ask(host, "system.multicall", [parts], called)
+        assert isinstance(answers, list)
+        return [
+            f"{number}. {shown}"
+            for number, ((one, *_), answer) in enumerate(zip(calls, answers, strict=True), 1)
+            for shown in self._answered(one, answer[0] if isinstance(answer, list) else answer) or ["done"]
+        ]
+
+    async def _ask(self, host: str, method: str, params: Sequence[Any], called: str | None) -> Value:
+        own = host == "own"
+        target = None if called is None else self._node(called)
+        where = "127.0.0.1" if own else host
+        try:
+            return await self.parts.ask(method, *params, host=where, own=own, target=target)
+        except FaultReceived as fault:
+            return {"faultString": fault.text}
+
+    def _answered(self, method: str, answer: Any, *, raw: bool = False) -> list[str]:
+        """Return the lines of an answer; none if a call was only carried out."""
+        if isinstance(answer, dict):
+            return [f"fault: {answer['faultString']}"]
+        if raw and not isinstance(answer[0], int):
+            return [f"{number}. {one}" for number, part in enumerate(answer, 1) for one in self._part(part)]
+        code, text, value = answer
+        if code == 0:
+            return self._denied(text)
+        if code == -1 and (raw or method not in _QUESTIONS):
+            return [f"error: {text}: {json.dumps(value)}"]
+        if raw or method in _QUESTIONS:
+            return [f"answer: {self._value(text)}: {self._value(value)}" if code == 1 else f"answer: {text}"]
+        return []
+
+    def _part(self, part: Any) -> list[str]:
+        """Return the lines of one answer of a multicall."""
+        return self._answered("", part[0] if isinstance(part, list) else part, raw=True)
+
+    def _denied(self, text: str) -> list[str]:
+        """Return the lines of an answer with the code 0, and take its decision from the records."""
+        denied = self.parts.records.denied
+        for place, one in enumerate(denied):
+            told = text_for_caller(one.decision, self.parts.current.tell)
+            if text == f"{told} [id]":
+                del denied[place]
+                about = "".join(f" {name} {value}" for name, value in one.about.items())
+                longer = [f"recorded: {one.decision.reason}"] if one.decision.told else []
+                return [f"deny {one.category} {one.resource}{about}: {text}", *longer]
+        return [f"refused: {text}"]
+
+    async def _event(self, line: str) -> list[str]:
         """Apply an event that is not a call; return the lines to show beside its effects."""
         parts = self.parts
-        match said:
+        match shlex.split(line):
             case ["state"]:
                 return self._state()
             case ["a", "relay", "starts", "anew"]:
@@ -151,17 +237,34 @@ class Conversation:
             case ["host", host, "is", "expelled"]:
                 expelled = parts.revocation.expel(ipaddress.ip_address(host), "the host was expelled")
                 parts.enactor.carry_out(expelled)
-            case ["ROSMaster", "starts", "anew"]:
-                parts.hidden.restart()
-                await parts.round()
             case ["a", "round"]:
                 await parts.round()
-            case ["ROSMaster", "has", name, kind, resource, "of", owner]:
-                uri = parts.faces.inner_uri(self._node(owner))
-                await parts.hidden.call(_REGISTER[Kind(kind)], name, resource, "type", uri)
+            case ["the", "queue", "of", "changes", "is", "full"]:
+                parts.fill_queue()
+            case ["nodes", "may", "be", "silent", "for", seconds, "s"]:
+                parts.liveness.settings = LivenessSection(silent=float(seconds))
+            case ["ROSMaster", *happening]:
+                await self._master_event(happening)
             case [name, *happening]:
                 await self._node_event(self._node(name), happening)
         return []
+
+    async def _master_event(self, happening: list[str]) -> None:
+        """Apply an event to the ROS master."""
+        hidden = self.parts.hidden
+        match happening:
+            case ["starts", "anew"]:
+                hidden.restart()
+                await self.parts.round()
+            case ["is", "slow"]:
+                hidden.go.clear()
+            case ["answers"]:
+                hidden.go.set()
+            case ["has", name, kind, resource, "of", owner]:
+                uri = self.parts.faces.inner_uri(self._node(owner))
+                await hidden.call(_REGISTER[Kind(kind)], name, resource, "type", uri)
+            case _:
+                raise ValueError(f"unknown action: ROSMaster {' '.join(happening)!r}")
 
     async def _node_event(self, node: Incarnation, happening: list[str]) -> None:
         """Apply an event to a node, and have control check the node."""
@@ -169,6 +272,8 @@ class Conversation:
             case ["misses", "the", "list", "of", topic]:
                 missed = NodeCall("publisherUpdate", (topic, []))
                 self.parts.watchlist.could_not_tell(node, missed, "it does not answer")
+            case ["loses", "its", "connection", "for", topic]:
+                self.parts.watchlist.cut_off(node, topic)
             case ["dies"] | ["is", "silent"] | ["answers"]:
                 clients = self.parts.clients
                 for names, word in ((clients.gone, "dies"), (clients.silent, "silent")):
@@ -201,20 +306,22 @@ class Conversation:
         node = self.parts.faces.by_inner_uri(self.parts.hidden.nodes[name])
         return name if node is None else self._names[node.key]
 
-    def _call(self, host: str, name: str, method: str, rest: list[str]) -> tuple[Any, ...]:
+    def _parameters(self, host: str, name: str, method: str, rest: list[str]) -> list[Any]:
         name, _, life = name.partition(":")
-        given, parameters = iter(rest), list[Value]()
-        for shape in _SHAPES[method]:
+        given, parameters = iter(rest), [name]
+        for shape in _SHAPES.get(method, "R" * len(rest)):
             match shape:
                 case "A":
                     parameters.append(f"http://{host}:{40_000 + int(life or 1)}/")
                 case "S":
                     parameters.append(f"rosrpc://{host}:{next(given)}")
-                case "V" if method == "setParam":
+                case "J":
                     parameters.append(json.loads(next(given)))
+                case "P":
+                    parameters.append(json.loads(next(given, '[["TCPROS"]]')))
                 case _:
                     parameters.append(next(given))
-        return (method, name, *parameters)
+        return parameters
 
     def _node(self, name: str) -> Incarnation:
         keys = [key for key, known in self._names.items() if known == name]
@@ -327,6 +434,22 @@ def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:
     return ", ".join(f"{kind} {resource}" for kind, resource in registrations) or "nothing"
 
 
-def _denial(answer: Value) -> list[str]:
-    assert isinstance(answer, list)
-    return [f"deny: {answer[1]!s}"] if answer[0] == 0 else []
+def conversations_of(text: str) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the policies and the conversations of a file, by name and title."""
+    head, *conversations = f"\n{text}".split("\n# ")
+    policies: dict[str, str] = {}
+    for part in head.split("\npolicy ")[1:]:
+        name, _, rules = part.partition("\n")
+        name, _, base = name.partition(" like ")
+        policies[name] = policies.get(base, "") + re.sub(r"(?m)^    ", "", f"{rules}\n")
+    return policies, dict(one.strip().split("\n", 1) for one in conversations)
+
+
+async def taken_place(written: str, policies: dict[str, str]) -> str:
+    """Return a conversation with the effects that its actions have."""
+    conversation = Conversation(await ControlParts.begun(), policies)
+    lines: list[str] = []
+    for line in written.splitlines():
+        if not line.startswith(" "):
+            lines += [line, *(f"    {effect}" for effect in await conversation.say(line))]
+    return "\n".join(lines)
