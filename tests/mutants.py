@@ -17,6 +17,7 @@ import json
 import os
 import random
 import re
+import select
 import signal
 import sys
 import tempfile
@@ -208,11 +209,13 @@ class Hunt:
         with tempfile.NamedTemporaryFile("r") as answer:
             child = os.fork()
             if not child:
-                signal.setitimer(
-                    signal.ITIMER_PROF, seconds
-                )  # of the processor, for a busy machine is not a hang
-                signal.alarm(10 * seconds)
+                # Of the processor, for a busy machine is not a hang.
+                signal.setitimer(signal.ITIMER_PROF, seconds)
                 self._run(session, items, answer.name)
+            ended = select.select([process := os.pidfd_open(child)], [], [], 10 * seconds)[0]
+            os.close(process)
+            if not ended:  # an alarm would not do: a test with a time limit sets its own
+                os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
             text = answer.read()
             return json.loads(text) if text else {"failed": ["it did not end"], "reaches": {}}
