@@ -25,6 +25,7 @@ import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Self
 
 from rich.console import Console
 from rich.table import Table
@@ -58,11 +59,12 @@ class Successes:
             self.times.append(time.monotonic())
             self._new.notify_all()
 
-    def until_after(self, moment: float) -> None:
-        """Wait for a success after this time. Raises `TimeoutError`."""
+    def until_after(self, moment: float, seconds: float = _SECONDS) -> float:
+        """Wait for a success after this time; return the time of the first. Raises `TimeoutError`."""
         with self._new:
-            if not self._new.wait_for(lambda: self.times[-1] > moment, _SECONDS):
-                raise TimeoutError(f"nothing worked for {_SECONDS:g} s")
+            if not self._new.wait_for(lambda: self.times[-1] > moment, seconds):
+                raise TimeoutError(f"nothing worked for {seconds:g} s")
+            return next(one for one in self.times if one > moment)
 
     def longest_pause(self) -> float:
         """Return the longest time between two successes."""
@@ -75,18 +77,24 @@ class Watch:
     def __init__(self, robot: StandbyRobot) -> None:
         self._robot = robot
         self._ended = threading.Event()
-        self.found: dict[str, Successes] = {}
+        self.found: dict[str, list[Successes]] = {}
+        self.topics: dict[Process, Successes] = {}
         self._threads: list[threading.Thread] = []
 
-    def __enter__(self) -> dict[str, Successes]:
+    def __enter__(self) -> Self:
         robot = self._robot
         robot.registrar.send("time")
         for listener in robot.listeners:
-            self._watch(f"topic to {listener.label.partition(' ')[0]}", _events(listener, "received"))
+            client = listener.label.partition(" ")[0]
+            self.topics[listener] = self._watch(f"topic to {client}", _events(listener, "received"))
         for caller in robot.callers:
             self._watch(f"service from {caller.label.partition(' ')[0]}", _calls(robot, caller))
         self._watch("Master API", _events(robot.registrar, "acknowledged"))
-        return self.found
+        return self
+
+    def longest_pauses(self) -> dict[str, float]:
+        """Return the longest pause of each kind."""
+        return {name: max(one.longest_pause() for one in these) for name, these in self.found.items()}
 
     def __exit__(self, *exc: object) -> None:
         self._ended.set()
@@ -94,8 +102,9 @@ class Watch:
             thread.join()
         self._robot.registrar.send("rest")
 
-    def _watch(self, name: str, once: Callable[[], None]) -> None:
-        successes = self.found[name] = Successes()
+    def _watch(self, name: str, once: Callable[[], None]) -> Successes:
+        successes = Successes()
+        self.found.setdefault(name, []).append(successes)
 
         def work() -> None:
             while not self._ended.is_set():
@@ -105,6 +114,7 @@ class Watch:
         thread = threading.Thread(target=work)
         self._threads.append(thread)
         thread.start()
+        return successes
 
 
 def _events(process: Process, event: str) -> Callable[[], None]:
@@ -165,7 +175,12 @@ def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
                     pauses.setdefault(name, []).append(pause)
                 print(turn + 1, {name: round(pause, 2) for name, pause in found.items()}, flush=True)
             robot.lost_nothing()
-    table = Table("seconds without", "least", "median", "most", title=f"{number} takeovers, load {load}")
+    print_pauses(pauses, f"{number} takeovers, load {load}")
+
+
+def print_pauses(pauses: dict[str, list[float]], title: str) -> None:
+    """Print a table of the pauses of each kind."""
+    table = Table("seconds without", "least", "median", "most", title=title)
     pauses["any of them"] = [max(turn) for turn in zip(*pauses.values(), strict=True)]
     for name, times in pauses.items():
         table.add_row(name, *(f"{one:.2f}" for one in (min(times), statistics.median(times), max(times))))
@@ -175,7 +190,7 @@ def takeovers(number: int, load: int, seed: int, *, planned: bool) -> None:
 def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> dict[str, float]:
     """Return the longest pause of everything; then both appliances are in sync again."""
     active, passive = site.pair()
-    with Watch(robot) as found:
+    with Watch(robot) as watch:
         if planned:
             with contextlib.suppress(
                 NotRunningError
@@ -185,13 +200,13 @@ def one_takeover(site: StandbySite, robot: StandbyRobot, *, planned: bool) -> di
             site.cut(active)
         site.until_taken_over(passive)
         taken = time.monotonic()
-        for successes in found.values():
+        for successes in (one for these in watch.found.values() for one in these):
             successes.until_after(taken + _AFTER)
     if not planned:
         site.restore(active)
     site.until_both_in_sync()
     eventually(lambda: site.pids(active, "control"), site.story)
-    return {name: successes.longest_pause() for name, successes in found.items()}
+    return watch.longest_pauses()
 
 
 def registrations(rounds: int, load: int) -> None:

@@ -21,22 +21,22 @@ from appliance.standby import witness
 from appliance.standby.kit import PairPlan, make_kits
 from appliance.standby.membership import PORT, Membership, path_of, save_membership
 from appliance.standby.witness import LeaseRecord
-from examples.landshark.lab import INTERFACE, Lab
+from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Process
 from tests.support.waiting import eventually
 
-ROBOT, FIXED, OCU = "10.79.0.10", "10.79.0.100", "10.79.0.20"
+ROBOT, FIXED, OCU, ARM = "10.79.0.10", "10.79.0.100", "10.79.0.20", "10.79.0.30"
 ADDRESSES = {"a": "10.79.0.2", "b": "10.79.0.3"}
 MASTER_PORT = 11311
 MASTER = f"http://{FIXED}:{MASTER_PORT}"
 PORTS = ["11311", "19001-26000"]
 
 
-def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any]]:
-    """Return the memberships of both appliances, and the settings of the witness."""
+def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any], dict[str, Any]]:
+    """Return the memberships of both appliances, and the settings of the witness and of a follower."""
     plan = PairPlan(
         name="a",
         address=ADDRESSES["a"],
@@ -48,11 +48,15 @@ def memberships(folder: Path) -> tuple[dict[str, Membership], dict[str, Any]]:
         ports=tuple(PORTS),
         master_port=11311,
         epoch=1,
-        followers={},
+        followers={"arm": ARM},
     )
     kits = make_kits(plan)
-    (settings,) = (json.loads(file.text) for file in kits.folders["witness"] if file.name == "witness.json")
-    return {"a": kits.own, "b": kits.other}, settings | {"state": str(folder / "lease")}
+    witness, follower = (
+        json.loads(next(file.text for file in kits.folders[name] if file.name == "witness.json"))
+        for name in ("witness", "follower-arm")
+    )
+    members = {"a": kits.own, "b": kits.other}
+    return members, witness | {"state": str(folder / "lease")}, follower | {"state": str(folder / "followed")}
 
 
 class StandbySite:
@@ -63,14 +67,16 @@ class StandbySite:
     ) -> None:
         self.lab, self.home = lab, home
         self.robot = lab.host("robot", f"{ROBOT}/24")
-        members, settings = memberships(home)
-        self.settings = home / "witness.json"
-        self.settings.write_text(json.dumps(settings))
-        self.settings.chmod(0o600)
+        members, settings, follower = memberships(home)
+        self.settings, self._follower_settings = home / "witness.json", home / "follower.json"
+        for path, body in ((self.settings, settings), (self._follower_settings, follower)):
+            path.write_text(json.dumps(body))
+            path.chmod(0o600)
         shutil.copy(str(witness.__file__), home / "witness.py")
         (home / "boot").write_text(secrets.token_hex(8))
         self.lease = witness.LeaseFile(str(home / "lease"), ("a", "b"))
         self.witness: Process | None = None
+        self._follower: Process | None = None
         self.appliances: dict[str, Appliance] = {}
         for name, address in ADDRESSES.items():
             one = Appliance(
@@ -83,13 +89,30 @@ class StandbySite:
             save_membership(path_of(one.state), members[name])
             self.appliances[name] = one
 
-    def command(self, *words: str) -> list[str]:
+    def command(self, *words: str, settings: Path | None = None) -> list[str]:
         """Return a command of the witness, as on a robot without the product."""
         program = (
             f"import sys; sys.path.insert(0, {str(self.home)!r}); import witness;"
             f" witness.BOOT_ID = {str(self.home / 'boot')!r}; sys.exit(witness.main(sys.argv[1:]))"
         )
-        return [sys.executable, "-I", "-S", "-c", program, *words, "--settings", str(self.settings)]
+        return [
+            sys.executable,
+            "-I",
+            "-S",
+            "-c",
+            program,
+            *words,
+            "--settings",
+            str(settings or self.settings),
+        ]
+
+    def start_follower(self) -> Host:
+        """Start the follower on a further computer of the robot; return that computer."""
+        arm = self.lab.host("arm", f"{ARM}/24")
+        command = ["nice", "-n", "-10", *self.command("follow", settings=self._follower_settings)]
+        self._follower = Process(arm, command, env=dict(os.environ), label="follower")
+        self._follower.wait_for_error("follows the witness")
+        return arm
 
     def start_witness(self) -> None:
         """Start the witness; at the first start with a lease of which `a` is in sync."""
@@ -192,13 +215,13 @@ class StandbySite:
                 os.kill(pid, number)
 
     @contextlib.contextmanager
-    def without_link(self, here: str, there: str) -> Iterator[None]:
-        """Lose all packets between two addresses while the block runs."""
+    def without_link(self, *pairs: tuple[str, str]) -> Iterator[None]:
+        """Lose all packets between the two addresses of each pair while the block runs."""
+        ways = [way for here, there in pairs for way in ((here, there), (there, here))]
         self._switch(
             "add table bridge lost",
             "add chain bridge lost some { type filter hook forward priority 0 ; }",
-            f"add rule bridge lost some ip saddr {here} ip daddr {there} drop",
-            f"add rule bridge lost some ip saddr {there} ip daddr {here} drop",
+            *(f"add rule bridge lost some ip saddr {one} ip daddr {other} drop" for one, other in ways),
         )
         try:
             yield
@@ -224,5 +247,6 @@ class StandbySite:
     def __exit__(self, *exc: object) -> None:
         for one in self.appliances.values():
             one.close()
-        if self.witness is not None:
-            self.witness.stop()
+        for process in (self.witness, self._follower):
+            if process is not None:
+                process.stop()

@@ -122,7 +122,7 @@ def answer_to(sock: socket.socket) -> bytes:
 def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) -> None:
     """The active one goes on alone, and takes the other back."""
     active, passive = site.pair()
-    with site.without_link(ADDRESSES["a"], ADDRESSES["b"]):
+    with site.without_link((ADDRESSES["a"], ADDRESSES["b"])):
         eventually(lambda: site.in_sync() == {active}, site.story)
         robot.lost_nothing()
     site.until_both_in_sync()
@@ -132,7 +132,7 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
 def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, robot: StandbyRobot) -> None:
     """The standby takes over, although it hears the active one."""
     active, passive = site.pair()
-    with site.without_link(ADDRESSES[active], ROBOT):
+    with site.without_link((ADDRESSES[active], ROBOT)):
         site.until_taken_over(passive)
         robot.lost_nothing()
 
@@ -168,7 +168,7 @@ def test_flapping_links(site: StandbySite, robot: StandbyRobot) -> None:
     for pause in (0.1, 0.4, 0.7, 1.3, 0.2, 1.0):
         active, _ = site.pair()
         for ends in ((ADDRESSES["a"], ADDRESSES["b"]), (ADDRESSES[active], ROBOT)):
-            with site.without_link(*ends):
+            with site.without_link(ends):
                 wait(pause)
     robot.lost_nothing()
 

@@ -25,7 +25,7 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 @pytest.fixture(scope="module")
 def members(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pair]]:
     """Yield both appliances, without an epoch."""
-    made, _settings = memberships(tmp_path_factory.mktemp("members"))
+    made, *_settings = memberships(tmp_path_factory.mktemp("members"))
     yield {
         name: Pair(one, LeaseClient(), 0, None, taken_over=True, tunnels=StandbyTunnels())
         for name, one in made.items()

@@ -34,7 +34,7 @@ WALL = 1_790_000_000.0
 @pytest.fixture(scope="module")
 def members(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
     """Return both appliances."""
-    made, _settings = memberships(tmp_path_factory.mktemp("members"))
+    made, *_settings = memberships(tmp_path_factory.mktemp("members"))
     return {
         name: Pair(one, LeaseClient(), 0, None, taken_over=True, tunnels=StandbyTunnels())
         for name, one in made.items()
