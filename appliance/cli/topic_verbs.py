@@ -134,8 +134,12 @@ def _described(topic: Topic) -> Iterator[str]:
         rate = f"{publisher.messages_per_second:.1f} Hz, {publisher.bytes_per_second:.0f} bytes/s"
         delay = f"{publisher.delay_seconds * 1e6:.0f} µs in the relay"
         yield f"  published by {printable(publisher.node)}: {rate}, {delay}, {publisher.dropped} not delivered"
+    connected = {connection.to for connection in topic.connections}
     for node in topic.subscribers:
-        yield f"  received by {printable(node)}"
+        if node in connected or not topic.mediated or all(one.node == node for one in topic.publishers):
+            yield f"  received by {printable(node)}"
+        else:
+            yield f"  subscribed by {printable(node)}, which is not connected to a publisher"
     if not topic.mediated:
         yield "  its messages bypass the appliance"
 

@@ -24,6 +24,11 @@ from appliance.rpc.server import Handler
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.specification_manager import ALLOCATION
 
+_REFUSALS = 2
+_REFUSALS_OF_A_ROBOT = (
+    4  # a further computer whose cable was unplugged refuses until the witness has answered it
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
@@ -124,6 +129,8 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
             nodes=nodes,
             settings=settings.liveness,
             quota_class=base.quota_class,
+            refusals=_REFUSALS if base.replication is None else _REFUSALS_OF_A_ROBOT,
+            shut_out=base.replication.admission.in_doubt if base.replication is not None else lambda: False,
         ),
         handler=handler,
     )

@@ -153,6 +153,7 @@ class _Control:
         work: dict[str, Callable[[], Awaitable[None]]] = {
             "the reconciliation with the ROS master": parts.reconciler.run,
             "the checks of nodes": parts.endpoints.liveness.run,
+            "the reminders of subscribers": parts.reminders.run,
             "the ends of connections": listener_limits.connection_table.sweep,
             "the ends of own connections": listener_limits.own_connection_table.sweep,
             "the return of memory": return_spare_memory,

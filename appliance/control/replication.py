@@ -24,6 +24,7 @@ from appliance.channel.answers.standby_answers import OtherAppliance, StandbySta
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.lease_client import HandOverError, LeaseClient
+from appliance.control.robot_admission import RobotAdmission
 from appliance.control.standby_tunnels import StandbyTunnels
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.standby.link_certificates import replication_context
@@ -166,6 +167,7 @@ class Replication:
         self._permission = 0
         self._unserved = ""  # why no standby can connect
         self._trouble_since: float | None = None
+        self.admission = RobotAdmission()
         self._absent = taken_over and wait == "standby"
         self._tasks: set[asyncio.Task[None]] = set()
         self._reported: messages.ReplicationReported | None = None
@@ -283,6 +285,8 @@ class Replication:
         await self._lease.hand_over()
 
     def _lease_changed(self, state: messages.LeaseState) -> None:
+        if state.answered is not None:
+            self.admission.note_answer(state.answered)
         if state.alone and state.permission > self._permission:
             self._permission = state.permission
             self.sender.answer_alone()

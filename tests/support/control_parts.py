@@ -345,6 +345,7 @@ class ControlParts:
             trail,
             own_parameters=dict,
         )
+        self.shut_out = False  # whether the robot's firewalls may refuse connections
         self.liveness = Liveness(
             self.registry,
             self.graph,
@@ -354,6 +355,8 @@ class ControlParts:
             nodes=self.nodes,
             settings=settings.LivenessSection(silent=silent),
             quota_class=lambda _host: QuotaClass.REGISTERED,
+            refusals=2,
+            shut_out=lambda: self.shut_out,
         )
         self._serving = functools.partial(
             serving,

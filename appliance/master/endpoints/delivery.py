@@ -1,7 +1,9 @@
 """Deliver the calls that nodes expect from a master. Each node has its own queue, in order.
 
 A slow or dead node does not delay other nodes. Every list of publishers is delivered, even if a newer list waits,
-because roscpp must see a removal before the following addition.
+because roscpp must see a removal before the following addition. The two are some time apart: of lists that arrive
+together, rospy uses only the last, and takes a connection that is ending for a connection. Calls about other topics
+overtake a list that waits for this reason.
 
 A failed call is repeated a few times, then dropped and reported to `troubled`. The node is then checked, and gets the
 missed updates when it answers again (`Watchlist.could_not_tell`).
@@ -14,6 +16,7 @@ from dataclasses import dataclass, field
 
 import structlog
 
+from appliance.base import clock
 from appliance.master.endpoints.node_api import NodeApiClient
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
@@ -26,6 +29,36 @@ from roswire.xmlrpc import FaultReceived
 
 _log = structlog.get_logger()
 MASTER_NAME = "/master"
+_APART_SECONDS = 0.3  # between a list that removes a publisher and a list that adds it
+_LISTS = "publisherUpdate"
+
+
+@dataclass(slots=True)
+class _DeliveredList:
+    """The last delivered list of a topic: the publishers that were `removed` are not added before `free`."""
+
+    publishers: frozenset[object] | None = (
+        None  # None: unknown; the answer to the registration had the first list
+    )
+    removed: frozenset[object] | None = frozenset()  # None: all
+    free: float = 0.0
+
+    def follow(self, publishers: frozenset[object]) -> None:
+        """Note the delivery of the next list."""
+        now = clock.now()
+        if now >= self.free:
+            self.removed = frozenset()
+        if self.publishers is None and not publishers:
+            self.removed, self.free = None, now + _APART_SECONDS
+        elif self.publishers is not None and (gone := self.publishers - publishers):
+            self.removed = None if self.removed is None else self.removed | gone
+            self.free = now + _APART_SECONDS
+        self.publishers = publishers
+
+    def wait(self, publishers: frozenset[object]) -> float:
+        """Return the seconds until this list may be delivered."""
+        adds = publishers if self.removed is None else self.removed & publishers
+        return max(0.0, self.free - clock.now()) if adds else 0.0
 
 
 @dataclass(slots=True)
@@ -40,8 +73,9 @@ class _Queue:
         self.calls.append((call, weight))
         self.weight += weight
 
-    def take(self) -> tuple[NodeCall, int]:
-        call, weight = self.calls.popleft()
+    def take(self, position: int = 0) -> tuple[NodeCall, int]:
+        call, weight = self.calls[position]
+        del self.calls[position]
         self.weight -= weight
         return call, weight
 
@@ -79,6 +113,7 @@ class Delivery:
         self._tries = tries
         self._queues: dict[str, _Queue] = {}
         self._workers: dict[str, asyncio.Task[None]] = {}
+        self._lists: dict[str, dict[str, _DeliveredList]] = {}  # by node and topic
 
     @property
     def waiting(self) -> int:
@@ -106,6 +141,7 @@ class Delivery:
 
     def drop(self, incarnation: Incarnation) -> None:
         """Drop the waiting calls of a node."""
+        self._lists.pop(incarnation.key, None)
         queue = self._queues.pop(incarnation.key, None)
         if queue is not None:
             self._held.give_back(incarnation.host, queue.weight)
@@ -120,8 +156,23 @@ class Delivery:
     def _lose(self, queue: _Queue, why: str) -> None:
         self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
 
-    def _take(self, queue: _Queue) -> NodeCall:
-        call, weight = queue.take()
+    def _next(self, queue: _Queue) -> tuple[int, float]:
+        """Return the position of the next call, and the seconds until it may be delivered."""
+        lists = self._lists.get(queue.incarnation.key, {})
+        waits: dict[str, tuple[int, float]] = {}
+        for position, (call, _weight) in enumerate(queue.calls):
+            topic = str(call.parameters[0]) if call.method == _LISTS else ""
+            if topic in waits:
+                continue
+            delivered = lists.get(topic)
+            seconds = delivered.wait(_publishers(call)) if delivered is not None else 0.0
+            if not seconds:
+                return position, 0.0
+            waits[topic] = position, seconds
+        return min(waits.values(), key=lambda wait: wait[1])
+
+    def _take(self, queue: _Queue, position: int = 0) -> NodeCall:
+        call, weight = queue.take(position)
         self._held.give_back(queue.incarnation.host, weight)
         return call
 
@@ -133,7 +184,15 @@ class Delivery:
     async def _work(self, incarnation: Incarnation) -> None:
         try:
             while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
-                await self._deliver(incarnation, self._take(queue))
+                position, seconds = self._next(queue)
+                if seconds:
+                    await asyncio.sleep(seconds)
+                    continue
+                call = self._take(queue, position)
+                await self._deliver(incarnation, call)
+                if call.method == _LISTS:
+                    lists = self._lists.setdefault(incarnation.key, {})
+                    lists.setdefault(str(call.parameters[0]), _DeliveredList()).follow(_publishers(call))
             self._queues.pop(incarnation.key, None)
         finally:
             self._workers.pop(incarnation.key, None)
@@ -159,3 +218,9 @@ class Delivery:
             _log.info("a node rejected a call", node=incarnation.name, call=call.method, why=failure)
         else:
             self._troubled(incarnation, call, failure)
+
+
+def _publishers(call: NodeCall) -> frozenset[object]:
+    """Return the publishers of a list; any other call has none."""
+    publishers = call.parameters[1] if call.method == _LISTS else ()
+    return frozenset(publishers if isinstance(publishers, list) else ())

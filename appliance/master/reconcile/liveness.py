@@ -1,10 +1,11 @@
 """Check nodes every few seconds, and at once after a failure.
 
-A node is *lost* in three cases: its API refuses connections twice in a row, another process answers at its address, or
-there is no answer for `silent` seconds. A lost node is unregistered at the ROS master, as `rosnode cleanup` does, and
-becomes a shadow that keeps its registrations. If its API answers again, the registrations are restored, because a ROS 1
-node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a host look lost, so
-a lost node is checked more often at first.
+A node is *lost* in three cases: its API refuses connections several times in a row, another process answers at its
+address, or there is no answer for `silent` seconds. Refusals do not count while the robot's firewalls may shut out this
+appliance (`shut_out`, on one of two appliances). A lost node is unregistered at the ROS master, as `rosnode cleanup`
+does, and becomes a shadow that keeps its registrations. If its API answers again, the registrations are restored,
+because a ROS 1 node never registers twice. A firewall that shuts out the appliance for a moment makes all nodes of a
+host look lost, so a lost node is checked more often at first.
 """
 
 import asyncio
@@ -60,7 +61,6 @@ _LOOK_AGAIN_SECONDS = 0.3
 _RECENT_SECONDS = 30.0  # after a loss, during which the node is checked every `_RECENTLY_LOST_SECONDS`
 _RECENTLY_LOST_SECONDS = 0.5
 _MADE_UP_SECONDS = 1.0  # between two repetitions for a node that keeps failing
-_APART_SECONDS = 0.3  # rospy uses only the last of the lists that arrive together
 
 
 @dataclass(slots=True)
@@ -113,6 +113,11 @@ class Watchlist:
         nodes, self._nodes = self._nodes, {}
         return list(nodes.values())
 
+    def has_missed(self, node: Incarnation) -> bool:
+        """Whether a node missed an update."""
+        missed = self._missed.get(node.key)
+        return missed is not None and bool(missed.topics or missed.parameters)
+
     def to_make_up(self, node: Incarnation) -> MissedUpdates | None:
         """Return and clear the missed updates of a node.
 
@@ -131,7 +136,10 @@ class Watchlist:
 
 @dataclass(eq=False)
 class Liveness:
-    """Check nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts' nodes."""
+    """Check nodes. Hosts take turns, so that hanging nodes of one host do not delay checks of other hosts' nodes.
+
+    A node that refuses `refusals` connections in a row is lost, unless `shut_out()`.
+    """
 
     registry: Registry
     graph: RosGraph
@@ -142,13 +150,14 @@ class Liveness:
     nodes: NodeApiClient
     settings: LivenessSection
     quota_class: InitVar[Callable[[Address], QuotaClass]]
+    refusals: int
+    shut_out: Callable[[], bool]
 
     def __post_init__(self, quota_class: Callable[[Address], QuotaClass]) -> None:
         self._answered: dict[str, float] = {}
         # For each node: the time of its last registration, and the process id that first answered afterwards.
         self._processes: dict[str, tuple[float, int]] = {}
         self._checks: dict[str, asyncio.Task[None]] = {}
-        self._reminding: set[asyncio.Task[None]] = set()
         self._turns = Turns(PROBES.bounds, quota_class)
 
     async def run(self) -> None:
@@ -208,7 +217,7 @@ class Liveness:
         try:
             await self._call(incarnation)
         except (RefusedError, UnreachedError):
-            presence = Presence.GONE
+            presence = Presence.SILENT if self.shut_out() else Presence.GONE
         except (UnansweredError, BrokenOffError):
             presence = Presence.SILENT
         except CallFailedError:
@@ -243,14 +252,15 @@ class Liveness:
         since = self._answered.setdefault(incarnation.key, now)
         if there:
             self._answered[incarnation.key] = now
-        if incarnation.life is Life.LIVE:
-            refused = there is None
-            if refused or (not there and now - since >= self.settings.silent):
-                self._lose(incarnation, why)
-            elif there:
-                self._make_up(incarnation)
-        else:
-            self._look_at_retired(incarnation, answered=bool(there), refused=there is None)
+        refused = there is None and not self.shut_out()
+        if incarnation.life is not Life.LIVE:
+            self._look_at_retired(incarnation, answered=bool(there), refused=refused)
+        elif refused or (not there and now - since >= self.settings.silent):
+            self._lose(incarnation, why)
+        elif there:
+            self._make_up(incarnation)
+        elif there is None or self.watchlist.has_missed(incarnation):
+            asyncio.get_running_loop().call_later(_RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     def _make_up(self, incarnation: Incarnation) -> None:
         """Send a node the updates that it missed. It drops the publishers first to which it is not connected."""
@@ -258,34 +268,18 @@ class Liveness:
         if missed is None:
             return
         absent = {topic: publishers for _, topic, publishers in self.graph.absent([incarnation])}
-        # The first effect of a renewal is the list without the absent publishers.
-        dropped = [
-            self.graph.renew(incarnation, topic, absent[topic])[0]
-            for topic in sorted(missed.topics & absent.keys())
-        ]
-        self.enactor.carry_out(dropped)
-        reminding = asyncio.get_running_loop().create_task(
-            self._remind(incarnation, missed.topics, _APART_SECONDS if dropped else 0.0)
-        )
-        self._reminding.add(reminding)
-        reminding.add_done_callback(self._reminding.discard)
+        for topic in sorted(missed.topics):
+            self.enactor.carry_out(self.graph.renew(incarnation, topic, absent.get(topic, ())))
         if missed.parameters:
             self.enactor.carry_out(self.graph.tell_parameters(incarnation))
 
-    async def _remind(self, incarnation: Incarnation, topics: Collection[str], seconds: float) -> None:
-        """Send a node its lists of publishers after some seconds, unless it is lost again."""
-        await asyncio.sleep(seconds)
-        if self.registry.by_key(incarnation.key) is incarnation and incarnation.life is Life.LIVE:
-            for topic in sorted(topics):
-                self.enactor.carry_out(self.graph.remind(incarnation, topic))
-
     async def _ask(self, incarnation: Incarnation) -> tuple[bool | None, str]:
         """Return whether a node answers (None: the node refuses connections), and the reason if it does not."""
-        for attempt in (1, 2):
+        for attempt in range(1, self.refusals + 1):
             try:
                 await self._call(incarnation)
             except RefusedError as error:
-                if attempt == 2:
+                if attempt == self.refusals:
                     return None, f"{incarnation.name}: {error}"
                 await asyncio.sleep(_LOOK_AGAIN_SECONDS)
             except CallFailedError as error:

@@ -7,11 +7,16 @@ open. If the port was closed for a while (the appliance was restarted), roscpp g
 So a subscriber that is still absent after the first reminders gets a list without the publisher, and then a list with
 the publisher again. A subscriber without a grant is handled in the same way: the policy withdrew and restored the
 topic, and the subscriber or control missed this.
+
+Whatever the reason, a subscriber is reminded in this way as long as it is absent: after `_LASTING_SECONDS`, then at
+growing intervals. So no interruption ends a subscription for good.
 """
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from appliance.base import clock
 from appliance.channel.messages import Message
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
@@ -20,17 +25,47 @@ from appliance.master.reconcile.enactor import Enactor
 from appliance.specifications.allocation import TOPIC, Move, Resource
 
 _GENTLE = 2  # the reminders before a subscriber must drop the publisher and connect again
+_LASTING_SECONDS = 5.0
+_LONGEST_SECONDS = 600.0
 _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # the seconds before each check
 
 
+@dataclass(frozen=True, slots=True)
+class _Absence:
+    """A subscriber of a topic that is not connected: the time of its next reminder, and the pause before it."""
+
+    due: float
+    pause: float
+
+
 class Reminders:
-    """Check whether all subscribers are connected again after a relay was attached."""
+    """Check whether all subscribers are connected: always, and at shorter intervals after a relay was attached."""
 
     def __init__(self, registry: Registry, graph: RosGraph, enactor: Enactor) -> None:
         self._registry = registry
         self._graph = graph
         self._enactor = enactor
         self.round: asyncio.Task[None] | None = None
+        self._absences: dict[tuple[str, str], _Absence] = {}
+
+    async def run(self) -> None:
+        """Remind all subscribers that stay absent, until cancelled."""
+        while True:
+            await asyncio.sleep(_LASTING_SECONDS)
+            self.remind_lasting()
+
+    def remind_lasting(self) -> None:
+        """Remind each subscriber whose absence has lasted."""
+        before, self._absences, now = self._absences, {}, clock.now()
+        for subscriber, topic, publishers in list(self._graph.absent(self._registry.live())):
+            absence = before.get((subscriber.key, topic)) or _Absence(
+                now + _LASTING_SECONDS, _LASTING_SECONDS
+            )
+            if now >= absence.due:
+                pause = min(2 * absence.pause, _LONGEST_SECONDS)
+                absence = _Absence(now + pause, pause)
+                self._enactor.carry_out(self._graph.renew(subscriber, topic, publishers))
+            self._absences[subscriber.key, topic] = absence
 
     def begin(self) -> None:
         """Start the checks from the beginning."""

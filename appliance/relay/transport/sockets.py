@@ -11,8 +11,9 @@ from appliance.relay.loop import HANGUP, READ, WRITE, EventLoop
 # some systems, large messages over loopback and a bridge are about half as fast as with cubic or reno.
 _CONGESTION = (b"cubic", b"reno")
 # A firewall that shuts out the appliance for a moment resets only the peer's end of a connection. A publisher's end is
-# then noticed by the next probe. Unanswered probes end a connection after more than two minutes.
-_KEEPALIVE = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 15), (socket.TCP_KEEPCNT, 9))
+# then noticed by the next probe, soon after an interruption that lost earlier ones. Unanswered probes end a connection
+# after more than two minutes.
+_KEEPALIVE = ((socket.TCP_KEEPIDLE, 2), (socket.TCP_KEEPINTVL, 2), (socket.TCP_KEEPCNT, 67))
 _READ_SIZE = 64 << 10
 
 

@@ -109,6 +109,22 @@ async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
     assert post.lost == []
 
 
+async def test_a_publisher_is_added_some_time_after_its_removal() -> None:
+    """rospy uses only the last of lists that arrive together; other topics and growing lists do not wait."""
+    post = Post()
+    post.node.answers.set()
+    for publishers in ([], ["a"], ["a", "b"], ["a"], ["a", "b", "c"]):
+        post.push("/t", publishers=publishers)
+    post.push("/other", publishers=["a"])
+    times, began = dict[int, float](), asyncio.get_running_loop().time()
+    while len(post.node.heard) < 6:
+        await asyncio.sleep(0.01)
+        times.setdefault(len(post.node.heard), asyncio.get_running_loop().time() - began)
+    assert post.node.heard == ["/t", "/other", "/t", "/t", "/t", "/t"]
+    assert [count for count, at in times.items() if at < 0.25] == [2]
+    assert [count for count, at in times.items() if at < 0.55] == [2, 5]
+
+
 async def test_a_host_loses_only_its_own_calls() -> None:
     """A guest's queues fill all memory: the robot loses no call, even if its queue is the longest."""
     post = Post(queued=Bounds(400_000, 400_000, 0, 0))

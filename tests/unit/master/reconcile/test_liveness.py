@@ -10,6 +10,7 @@ from appliance.base.clock import using
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.reconcile import liveness
+from appliance.master.reconcile.liveness import Presence
 from appliance.rpc.xmlrpc_client import RefusedError
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
@@ -86,6 +87,29 @@ async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytes
                 await asyncio.sleep(0)
     finally:
         running.cancel()
+
+
+async def test_a_refusal_of_a_robot_that_shuts_out_is_no_death(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It keeps its registrations, is asked again soon, and gets what it missed; a later refusal counts."""
+    monkeypatch.setattr(liveness, "_LOOK_AGAIN_SECONDS", 0.0)
+    world = ControlParts(silent=3600.0)
+    await world.round()
+    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
+    await world.register(ear, Kind.SUBSCRIPTION, "/t")
+    await world.register(mouth, Kind.PUBLICATION, "/t")
+    world.deliveries.told.clear()
+    world.shut_out, world.clients.gone = True, {"/ear"}
+    assert (await world.liveness.probe(ear)).presence is Presence.SILENT
+    world.watchlist.cut_off(ear, "/t")
+    world.liveness.look_at_watched()
+    await world.settle()
+    assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
+    world.shut_out, world.clients.gone = False, set()
+    await asyncio.sleep(2 * liveness._RECENTLY_LOST_SECONDS)
+    assert len(world.deliveries.told) == 2
+    world.clients.gone = {"/ear"}
+    await world.look(ear)
+    assert world.lives == [Life.SHADOW, Life.LIVE]
 
 
 async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

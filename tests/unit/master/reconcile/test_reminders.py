@@ -5,10 +5,12 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.base import clock
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reconcile import reminders
 from appliance.master.reconcile.reminders import Reminders
 from roswire.uris import parse_node_uri
+from tests.support.virtual_clock import VirtualClock
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
@@ -61,3 +63,25 @@ async def test_reminded_until_back(
     await looks.round
     gentle, anew = ("/ear", "/chatter", list[str]()), ("/ear", "/chatter", ["key of /mouth"])
     assert told.reminded == [gentle] * reminded + [anew] * renewed
+
+
+async def test_a_lasting_absence_ends_with_a_reminder() -> None:
+    """However long it lasts: a subscriber that is absent is reminded at growing intervals, a new one not at once."""
+    registry = Registry()
+    for name, kind in (
+        ("/ear", Kind.SUBSCRIPTION),
+        ("/other", Kind.SUBSCRIPTION),
+        ("/mouth", Kind.PUBLICATION),
+    ):
+        node(registry, name, kind)
+    told, times = Told(10_000), list[float]()
+    machine = VirtualClock()
+    with clock.using(machine):
+        looks = Reminders(registry, cast(Any, told), cast(Any, told))
+        for second in range(0, 3000, 5):
+            before = len(told.reminded)
+            looks.remind_lasting()
+            times += [second] * (len(told.reminded) - before)
+            machine.advance(5.0)
+    assert times == [5, 15, 35, 75, 155, 315, 635, 1235, 1835, 2435]
+    assert told.reminded[0] == ("/ear", "/chatter", ["key of /mouth"])

@@ -1,0 +1,19 @@
+"""The times in which a refused connection does not mean that a node of the robot has ended."""
+
+from appliance.base import clock
+from appliance.control.robot_admission import RobotAdmission
+from tests.support.virtual_clock import VirtualClock
+
+
+def test_doubt_lasts_until_the_followers_have_asked_again() -> None:
+    """After a takeover, during a gap in the witness's answers, and for some time after it."""
+    machine, doubts = VirtualClock(), list[bool]()
+    with clock.using(machine):
+        admission = RobotAdmission()
+        for second in range(12):
+            doubts.append(admission.in_doubt())
+            for _ in range(4):
+                machine.advance(0.25)
+                if second not in (5, 6):
+                    admission.note_answer(clock.since_boot())
+    assert doubts == [True, True, *[False] * 4, True, True, True, True, False, False]
