@@ -8,7 +8,7 @@ names of a host get such a connection, the action's server first: it also publis
 it after it has begun to serve the subscriber, so the subscriber gets everything that the publisher sends from then on.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
 from appliance.relay.context import RelayContext
@@ -54,7 +54,7 @@ class ActionServers:
 
 
 class NamedSubscribers:
-    """The extra connections to one publisher of one topic, while its main connection is open."""
+    """The extra connections to one publisher of one topic, while its main connection is open (`open` to `close`)."""
 
     def __init__(self, context: RelayContext, topic: str, host: str) -> None:
         self._context = context
@@ -65,10 +65,20 @@ class NamedSubscribers:
         self._accepted: Mapping[str, str] = {}
         self._streams: dict[str, BufferedSocket] = {}
         self._retry: LoopTimer | None = None
+        self._announcing: LoopTimer | None = None
 
-    def update(self, names: frozenset[str], address: tuple[str, int], accepted: Mapping[str, str]) -> None:
-        """Set the subscribers that are served now, the publisher's address, and the type that it has accepted."""
-        self._wanted, self._address, self._accepted = names, address, accepted
+    def open(self, address: tuple[str, int], accepted: Mapping[str, str]) -> None:
+        """Set the publisher's address, and the type that it has accepted."""
+        self._address, self._accepted = address, accepted
+
+    def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
+        """Show these subscribers, as they are after this turn of the loop, if the publisher looks for names."""
+        if self._address is not None and looks_for_names(type_name) and self._announcing is None:
+            self._announcing = self._context.loop.after(0, lambda: self._show(names()))
+
+    def _show(self, names: frozenset[str]) -> None:
+        self._announcing = None
+        self._wanted = names
         for name in [stream for stream in self._streams if stream not in names]:
             self._streams.pop(name).close()
         self._open_missing()
@@ -79,9 +89,10 @@ class NamedSubscribers:
         for stream in self._streams.values():
             stream.close()
         self._streams.clear()
-        if self._retry is not None:
-            self._retry.cancel()
-            self._retry = None
+        for timer in (self._retry, self._announcing):
+            if timer is not None:
+                timer.cancel()
+        self._retry = self._announcing = None
 
     def _open_missing(self) -> None:
         self._retry = None

@@ -17,6 +17,7 @@ from appliance.relay.transport.frames import Scratch
 from appliance.relay.transport.memory import RelayMemory
 from roswire.tcpros import HeaderParser
 
+GOAL = "actionlib_tutorials/FibonacciActionGoal"
 TOPIC = "/fibonacci/goal"
 ACCEPTED = {"type": "a/FibonacciActionGoal", "md5sum": "*"}
 
@@ -96,13 +97,13 @@ def test_each_subscriber_is_seen_under_its_own_name_and_goes_when_it_leaves(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
     """Each name has one connection. When a subscriber leaves, its connection closes and the others stay."""
-    address = publisher.getsockname()
-    presences.update(frozenset({"/one", "/other"}), address, ACCEPTED)
+    presences.open(publisher.getsockname(), ACCEPTED)
+    presences.announce(lambda: frozenset({"/one", "/other"}), GOAL)
     seen = dict(
         sorted((header["callerid"], sock) for sock, header in (accept(loop, publisher) for _ in "ab"))
     )
     assert list(seen) == ["/one", "/other"]
-    presences.update(frozenset({"/other"}), address, ACCEPTED)
+    presences.announce(lambda: frozenset({"/other"}), GOAL)
     turn_until(loop, lambda: ended(seen["/one"]))
     assert not ended(seen["/other"])
     for sock in seen.values():
@@ -114,7 +115,8 @@ def test_a_presence_that_breaks_is_made_again(
     loop: EventLoop, presences: NamedSubscribers, publisher: socket.socket
 ) -> None:
     """If the publisher closes the connection, it is opened again under the same name."""
-    presences.update(frozenset({"/one"}), publisher.getsockname(), ACCEPTED)
+    presences.open(publisher.getsockname(), ACCEPTED)
+    presences.announce(lambda: frozenset({"/one"}), GOAL)
     first, _header = accept(loop, publisher)
     first.close()
     second, header = accept(loop, publisher)
@@ -125,7 +127,7 @@ def test_a_presence_that_breaks_is_made_again(
 @pytest.mark.parametrize(
     ("type_name", "named"),
     [
-        ("actionlib_tutorials/FibonacciActionGoal", True),
+        (GOAL, True),
         ("actionlib_msgs/GoalID", True),
         ("actionlib_msgs/GoalStatusArray", False),
         ("std_msgs/String", False),

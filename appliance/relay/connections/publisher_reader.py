@@ -1,0 +1,264 @@
+"""Read one publisher's frames into its topic, no faster than its subscribers and the other publishers permit.
+
+    WATCHED --quantum used up, or frames undelivered--> LEFT --queued--> QUEUED --next turn--> WATCHED
+
+In WATCHED the loop reports new data, and the pump passes simple frames on automatically. In LEFT and QUEUED, received
+data is left, and nothing is read. A pause stops each of these; the data stays in the kernel's buffer.
+"""
+
+import os
+import socket
+from collections.abc import Callable
+from enum import Enum, auto
+
+from appliance.channel.messages.relay_link import Violation
+from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.context import RelayContext
+from appliance.relay.loop import READ, LoopTimer
+from appliance.relay.transport.frames import SMALL, Batch, FrameReceiver
+from appliance.relay.transport.memory import HeldBytes, StallDetector
+from appliance.relay.transport.pump import JUDGED, RECEIVED, UNARMED, Left
+from roswire.errors import LimitExceededError, PeerError
+
+Lost = Callable[[str, Violation], None]
+"""Takes the reason why a connection to a publisher cannot go on, and the kind of violation."""
+
+
+class _State(Enum):
+    WATCHED = auto()
+    LEFT = auto()
+    QUEUED = auto()
+    CLOSED = auto()
+
+
+class PublisherReader:
+    """The open connection to a publisher, behind its header of `header_size` bytes. `lost` is called once.
+
+    `since`: when the connection opened.
+    """
+
+    def __init__(
+        self,
+        context: RelayContext,
+        topic: RelayedTopic,
+        sock: socket.socket,
+        *,
+        payer: str,
+        header_size: int,
+        lost: Lost,
+    ) -> None:
+        memory = context.memory.frames.of(topic.host)
+        self.since = context.loop.clock()
+        self._context = context
+        self._loop = context.loop
+        self._topic = topic
+        self._socket = sock
+        self._payer = payer
+        self._lost = lost
+        self._receiver = FrameReceiver(context.scratch, context.limits.message_bytes, memory)
+        self._buffer = self._receiver.buffer
+        self._pumped = context.loop.pump.connection()
+        self._stall = StallDetector(context.limits.stall_seconds)
+        self._state = _State.WATCHED
+        self._pause: LoopTimer | None = None
+        self._received_at = 0.0  # of the data that is left
+        self._rest: Batch | None = None
+        self._early = b""  # data that arrived with the header
+        self._held = HeldBytes(memory)
+        self._header = HeldBytes(memory)
+        self._header.set(header_size)
+        self._watch()
+
+    def start(self, early: bytes) -> None:
+        """Take data that arrived with the publisher's header."""
+        self._early = early
+        self._take_early()
+
+    def pause(self, seconds: float) -> None:
+        """Stop reading until `resume`, for at most `seconds`."""
+        if self._pause is None:
+            self._loop.unwatch(self._socket.fileno())
+            self._pause = self._loop.after(seconds, self._topic.relieve)
+
+    def resume(self) -> None:
+        """Go on reading."""
+        if self._pause is None:
+            return
+        self._pause.cancel()
+        self._pause = None
+        if self._state is _State.WATCHED:
+            self._watch()
+        else:
+            self._queue()
+
+    def check_stall(self) -> None:
+        """Report as lost a publisher that holds memory for a message and sends nothing of it; called once a second."""
+        self._receiver.trim_buffer()
+        is_read = self._pause is None and self._state is _State.WATCHED
+        held = self._receiver.unfinished if is_read else 0
+        if self._stall.seen(held, self._loop.clock()):
+            seconds = self._context.limits.stall_seconds
+            reason = f"{held} bytes of a message arrived, then no data for {seconds:g} s"
+            self._lost(reason, "limit exceeded")
+
+    def disarm(self) -> None:
+        """Take the next frames from the pump, with the incomplete one."""
+        torn = self._pumped.disarm()
+        if torn:
+            self._receiver.resume(torn)
+
+    def close(self) -> None:
+        """Close the connection; what is left is lost."""
+        self._state = _State.CLOSED
+        if self._pause is not None:
+            self._pause.cancel()
+        self._loop.discard(self._socket)
+        self._rest, self._early = None, b""
+        self._held.set(0)
+        self._header.set(0)
+        self._pumped.disarm()
+        self._receiver.abandon()
+
+    def _watch(self) -> None:
+        self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer, self._pumped)
+
+    def _ready(self, _events: int) -> None:
+        left = self._pumped.step()
+        if left is None:
+            return
+        self.disarm()
+        if left.kind == UNARMED:
+            try:
+                count = self._socket.recv_into(self._buffer())
+            except BlockingIOError:
+                return
+            except OSError as error:
+                self._received(-(error.errno or 0))
+            else:
+                self._received(count)
+        elif left.kind == RECEIVED:
+            self._received(left.end)
+        else:
+            self._go_on_behind(left)
+        self._arm()
+
+    def _received(self, count: int) -> None:
+        """Take received bytes; 0 is the end of the connection, a negative number the number of an error."""
+        if count > 0:
+            self._take(count)
+        elif count:
+            self._lost(f"the connection to the publisher broke: {os.strerror(-count)}", "")
+        else:
+            self._lost("the publisher closed the connection", "")
+
+    def _go_on_behind(self, left: Left) -> None:
+        """Process whole frames further than the pump has done."""
+        batch = self._receiver.found(left.size, left.end, left.messages)
+        batch.judged, batch.answer = left.judged, left.answer
+        if left.kind == JUDGED:
+            rest = self._topic.received(batch, left.since)
+        else:
+            rest = None
+            self._topic.sent(batch, left.since, left.number, left.sent)
+        self._received_at = left.since
+        self._continue(rest)
+
+    def _arm(self) -> None:
+        """Leave the next frames to the pump if they need only the common work."""
+        if self._state is not _State.WATCHED or self._early or not self._receiver.small:
+            return
+        simple = self._topic.simple()
+        if simple is not None:
+            torn = self._receiver.hand_over()
+            self._pumped.arm(self._socket.fileno(), self._topic, *simple, torn=torn)
+
+    def _take(self, count: int) -> None:
+        since = self._loop.clock()
+        try:
+            batch = self._receiver.received(count)
+        except PeerError as error:
+            self._lost(str(error), violation_of(error))
+            return
+        if batch is not None:
+            rest = self._topic.received(batch, since)
+            if rest is not None or self._receiver.more or self._topic.undelivered:
+                self._received_at = since
+                self._continue(rest)
+
+    def _continue(self, rest: Batch | None) -> None:
+        """Process received data until the quantum is used up; read from the publisher only when all is processed."""
+        receiver = self._receiver
+        while self._state is not _State.CLOSED:
+            over = receiver.more and (self._pause is not None or self._loop.over())
+            if rest is not None or over or self._topic.undelivered:
+                self._leave(rest)
+                return
+            if not receiver.more:
+                self._read_on()
+                return
+            try:
+                batch = receiver.following()
+            except PeerError as error:
+                self._lost(str(error), violation_of(error))
+                return
+            rest = None if batch is None else self._topic.received(batch, self._received_at)
+
+    def _leave(self, rest: Batch | None) -> None:
+        """Keep these frames, and all other received data, for the publisher's next turn."""
+        if self._state is _State.CLOSED:
+            return
+        self._rest = rest
+        self._held.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
+        self._receiver.set_aside()
+        if self._state is _State.WATCHED:
+            self._state = _State.LEFT
+            self._loop.unwatch(self._socket.fileno())
+        self._queue()
+
+    def _queue(self) -> None:
+        if self._pause is None and self._state is _State.LEFT:
+            self._state = _State.QUEUED
+            self._loop.later(self._go_on, self._payer)
+
+    def _go_on(self) -> None:
+        if self._state is not _State.QUEUED:
+            return
+        self._state = _State.LEFT
+        if self._pause is not None:
+            return
+        self._topic.hand_out()
+        if self._topic.undelivered or self._pause is not None:
+            self._leave(self._rest)
+            return
+        rest, self._rest = self._rest, None
+        self._held.set(0)
+        if rest is not None:
+            rest = self._topic.go_on(self._context.scratch.hold(rest), self._received_at)
+        self._continue(rest)
+
+    def _read_on(self) -> None:
+        if self._state is not _State.WATCHED:
+            self._state = _State.WATCHED
+            if self._pause is None:
+                self._watch()
+            self._take_early()
+
+    def _take_early(self) -> None:
+        while self._early and self._state is _State.WATCHED:
+            buffer = self._buffer()
+            count = min(len(self._early), len(buffer))
+            buffer[:count] = self._early[:count]
+            self._early = self._early[count:]
+            self._take(count)
+
+
+def header_refusal(context: RelayContext, host: str, size: int) -> str:
+    """Return why a header of `size` bytes of this host should not be kept; empty if it may."""
+    if size > SMALL and context.memory.frames.of(host).refusal(size):
+        return "the relay has no memory left for headers of this host"
+    return ""
+
+
+def violation_of(error: PeerError) -> Violation:
+    """Return the kind of violation that an error of a peer is."""
+    return "limit exceeded" if isinstance(error, LimitExceededError) else "malformed"
