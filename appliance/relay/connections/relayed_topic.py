@@ -25,11 +25,14 @@ publisher is read as long as one subscriber keeps up.
 """
 
 from collections.abc import Callable, Collection, Mapping
-from typing import Protocol
+from dataclasses import dataclass
+from enum import Enum, auto
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
 from appliance.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
+from appliance.relay.connections.latched_message import LatchedMessage
+from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
 from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
@@ -37,54 +40,7 @@ from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version
 from appliance.relay.transport.rate_limit import Part, PublicationRateLimit, RateAllowance
 
-_ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers of a host that a publisher may see by name, over one connection each
-
-
-class TopicSubscriber(Protocol):
-    """A subscriber, as its topic uses it."""
-
-    host: str
-    """The address it comes from."""
-
-    caller_id: str
-    """The caller id that it claims."""
-
-    missed: bool
-    """Whether its rate limit dropped the last message for it."""
-
-    behind_since: float | None
-    """When its queue first became so long that it is behind; None once it has caught up completely."""
-
-    def greet(self, header: Mapping[str, str]) -> bool:
-        """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
-
-    def deliver(self, batch: Batch) -> int:
-        """Send or queue the batch; return how many messages are dropped."""
-
-    def accepted(self, batch: Batch, sent: int) -> int:
-        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
-
-    @property
-    def descriptor(self) -> int:
-        """The socket to which the next batch is just sent; -1 if it needs other work (a limit, a queue)."""
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether no more data should be kept for its host."""
-
-    @property
-    def full(self) -> bool:
-        """Whether its queue has reached its bounds."""
-
-    def trim(self) -> int:
-        """Drop messages beyond the bounds, oldest first; return how many."""
-
-    def check_stall(self) -> None:
-        """Cut the connection if it makes no progress; called once a second."""
-
-    def cut(self, reason: str) -> None:
-        """Close its connection."""
 
 
 class Upstream:
@@ -135,6 +91,24 @@ Through = Callable[[Batch], Batch | None]
 """Passes frames through monitors; returns the frames that are passed on, or None."""
 
 
+class TopicState(Enum):
+    """The publisher of a topic. LOST: its connection is closed, and served subscribers have read its header."""
+
+    UNKNOWN = auto()
+    OPEN = auto()
+    PAUSED = auto()
+    LOST = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class _Monitoring:
+    """How messages pass monitors (`through` is None: past them), and whether monitors need the topic."""
+
+    through: Through | None = None
+    call: Callable[[], ModuleCall | None] = _no_call
+    wanted: bool = False
+
+
 class RelayedTopic:
     """A topic of an incarnation at `host`, with its subscribers; `share` counts the memory of its kept messages.
 
@@ -172,39 +146,22 @@ class RelayedTopic:
         self._grace = grace
         self._clock = clock
         self._share = share
-        self.flow = PublicationRateLimit(share, limited)
-        self._make_room = make_room
-        self._refused = refused
         self._recorder = recorded
-        self.over = over
-        self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = (
-            None  # a batch, and the subscribers that still need it
-        )
-        self._recording: RingStream | ExcludedStream | None = None
-        self._unkept: LatchRefused | None = None
-        self._fresh_until = clock() + (APPEARED if fresh else -1)
-        self._header: dict[str, str] | None = None
-        # Dicts, not lists: thousands of subscribers may end in one turn, and each removal must be cheap.
-        self._waiting: dict[TopicSubscriber, None] = {}
-        self._served: dict[TopicSubscriber, None] = {}
-        self._row: tuple[TopicSubscriber, ...] | None = (
-            None  # the served subscribers as a tuple, made on demand
-        )
-        self._latched: Batch | None = None
-        self._latching = False
-        self._withheld = False
-        self._startup_replay: StartupReplay | None = None
-        self._paused = False
-        self._connected = False
-        self.through: Through | None = None
-        self._taps: tuple[Callable[[Batch], None], ...] = ()
-        self._wanted = False
-        self._reported = True
+        self.flow = PublicationRateLimit(share, limited)
         self.plain = Version()
         """Changes whenever the pump may have to leave the next frames to Python (see `simple`)."""
         self.counters = Traffic()
-        self._call: Callable[[], ModuleCall | None] = _no_call
-        self._dropped = 0
+        self._latch = LatchedMessage(share, make_room, lambda size: refused(LatchRefused(key, topic, size)))
+        self._served = ServedSubscribers(over)
+        self._state = TopicState.UNKNOWN
+        self._header: dict[str, str] | None = None  # as subscribers get it; None while UNKNOWN
+        self._waiting: dict[TopicSubscriber, None] = {}
+        self._monitoring = _Monitoring()
+        self._taps: tuple[Callable[[Batch], None], ...] = ()
+        self._recording: RingStream | ExcludedStream | None = None
+        self._fresh_until = clock() + (APPEARED if fresh else -1)
+        self._startup_replay: StartupReplay | None = None
+        self._reported = True
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
@@ -223,8 +180,7 @@ class RelayedTopic:
     def leave(self, member: TopicSubscriber) -> None:
         """Remove a subscriber whose connection is closed."""
         self._waiting.pop(member, None)
-        self._served.pop(member, None)
-        self._row = None
+        self._served.remove(member)
         self.differs()
         self.announce()
         self._reported = False
@@ -244,8 +200,8 @@ class RelayedTopic:
         """
         self._taps += (tap,)
         self.differs()
-        if latched and self._latched is not None:
-            tap(self._latched)
+        if latched and self._latch.batch is not None:
+            tap(self._latch.batch)
         if self.upstream is not None:
             self.upstream.connect()
 
@@ -264,16 +220,16 @@ class RelayedTopic:
 
         The answer holds until `plain` or the monitors' preparation changes.
         """
-        if self._latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
+        if self._latch.is_latching or self._taps or self.flow.limits or len(self._served) > SUBSCRIBERS:
             return None
-        if self._recording is not None or self._startup_replay is not None or self._waits is not None:
+        if self._recording is not None or self._startup_replay is not None or self._served.undelivered:
             return None
         call = None
-        if self.through is not None:
-            call = self._call()
+        if self._monitoring.through is not None:
+            call = self._monitoring.call()
             if call is None:
                 return None
-        descriptors = [member.descriptor for member in self._each()]
+        descriptors = [member.descriptor for member in self._served.row]
         return None if -1 in descriptors else (descriptors, call)
 
     @property
@@ -288,7 +244,7 @@ class RelayedTopic:
 
     @property
     def _is_wanted(self) -> bool:
-        return bool(self._waiting or self._served or self._wanted or self._taps)
+        return bool(self._waiting or self._served or self._monitoring.wanted or self._taps)
 
     def _spare_unwanted(self) -> None:
         if not self._is_wanted and self.upstream is not None:
@@ -306,13 +262,9 @@ class RelayedTopic:
         With `wanted`, the topic stays connected for monitors even without a subscriber. `call` returns how the pump
         passes small frames through them (None: it cannot now).
         """
-        self.through = through
-        self._call = call
+        before, self._monitoring = self._monitoring, _Monitoring(through, call, wanted)
         self.differs()
-        if wanted == self._wanted:
-            return
-        self._wanted = wanted
-        if self.upstream is None:
+        if wanted == before.wanted or self.upstream is None:
             return
         if wanted:
             self.upstream.connect()
@@ -322,15 +274,15 @@ class RelayedTopic:
         """Begin to serve, because the publisher has answered with its header."""
         header = to_subscriber(header, self.name, self.topic)
         before, self._header = self._header, header
-        self._latching = header.get("latching", "0") == "1"
+        self._latch.is_latching = header.get("latching", "0") == "1"
+        self._state = TopicState.OPEN
         self.differs()
-        self._connected = True
         self._end_recording()
         if self._recorder is not None:
             self._recording = self._recorder.open(self.topic, self.host, header)
         self._listen()
         if before is not None and _identity(before) != _identity(header):
-            for member in self._each():
+            for member in self._served.row:
                 member.cut("the publisher returned with a different type")
         waiting, self._waiting = self._waiting, {}
         for member in waiting:
@@ -342,17 +294,15 @@ class RelayedTopic:
     @property
     def lacks_latched(self) -> bool:
         """Whether monitors have held back messages of a latching publisher, and no message is latched now."""
-        return self._latching and self._withheld and self._latched is None
+        return self._latch.is_lacking
 
     def upstream_closed(self) -> None:
         """Forget the upstream's state, but keep the subscribers (see the module docstring)."""
         self._end_recording()
         self.hand_out(divided=False)
-        self._latch(None)
+        self._latch.forget()
         self.flow.forget()
-        self._withheld = False
-        self._paused = False
-        self._connected = False
+        self._state = TopicState.LOST
         self._forget_startup_replay()
         self._forget_header()
 
@@ -372,7 +322,7 @@ class RelayedTopic:
         self._reported = False
         passing: Batch | None = batch
         if self.flow.limits:
-            passing = self.flow.passing(batch, self._clock(), latching=self._latching)
+            passing = self.flow.passing(batch, self._clock(), latching=self._latch.is_latching)
         return self._take(batch, passing, since)
 
     def sent(self, batch: Batch, since: float, number: int, sent: int) -> None:
@@ -382,12 +332,7 @@ class RelayedTopic:
         """
         self.counters.add(batch.messages, len(batch.view))
         self._reported = False
-        members = self._each()
-        self._waits = batch, members[number + 1 :]
-        self._dropped += members[number].accepted(batch, sent)
-        behind = members[number].behind_since is not None
-        self.hand_out()
-        if behind:
+        if self._served.go_on_behind(batch, number, sent):
             self._pause_or_trim()
         self.counters.delayed(self._clock() - since, batch.messages)
 
@@ -402,7 +347,7 @@ class RelayedTopic:
             return None if passing is None else self._admit(passing, since)
         # Record after subscribers got the batch, to delay nothing; copy it first: monitors may change it in place.
         whole = batch
-        if self.through is not None and recording.keeps:
+        if self._monitoring.through is not None and recording.keeps:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
             whole.first = batch.first
         passes = 0 if passing is None else passing.messages
@@ -421,10 +366,11 @@ class RelayedTopic:
 
     def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
         """Give a batch to monitors and subscribers; return the part that monitors had no time for."""
-        left = batch if self.through is None else self.through(batch)
+        through = self._monitoring.through
+        left = batch if through is None else through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
-            self._withheld = True
+            self._latch.withheld = True
         else:
             self._pass_on(left, divided=divided)
             if self._served:
@@ -443,42 +389,29 @@ class RelayedTopic:
     def _pass_on(self, batch: Batch, *, divided: bool) -> None:
         for tap in self._taps:
             tap(batch)
-        if self._latching:
-            self._latch(batch)
+        if self._latch.is_latching:
+            self._latch.keep(batch)
         if self._startup_replay is not None:
             now = self._clock()
             if self._startup_replay.over(now) or not self._startup_replay.add(batch, now):
                 self._forget_startup_replay()
-        self.hand_out(divided=False)  # the previous batch
-        self._waits = batch, self._each()
-        self.hand_out(divided=divided)
+        if self._served.send(batch, divided=divided):
+            self._pause_or_trim()
 
     @property
     def undelivered(self) -> int:
         """Return the bytes of a batch that some subscribers get at the publisher's next turn (`hand_out`)."""
-        return 0 if self._waits is None else len(self._waits[0].view)
+        return self._served.undelivered
 
     def hand_out(self, *, divided: bool = True) -> None:
         """Send subscribers the waiting batch; if `divided`, stop when the quantum is used up."""
-        if self._waits is None:
-            return
-        (batch, members), self._waits = self._waits, None
-        congested = False
-        for number, member in enumerate(members):
-            if divided and number and not number % _ROW and self.over():
-                kept = Batch(batch.keep(), batch.messages, batch.last, owned=True, stride=batch.stride)
-                self._waits = kept, members[number:]
-                break
-            if member in self._served:
-                self._dropped += member.deliver(batch)
-                congested = congested or member.behind_since is not None
-        if congested:
+        if self._served.hand_out(divided=divided):
             self._pause_or_trim()
 
     def relieve(self) -> None:
         """Resume reading the publisher after a pause."""
-        if self._paused:
-            self._paused = False
+        if self._state is TopicState.PAUSED:
+            self._state = TopicState.OPEN
             if self.upstream is not None:
                 self.upstream.resume()
 
@@ -499,33 +432,29 @@ class RelayedTopic:
             self._admit(waiting, now, divided=False)
         if self._startup_replay is not None and self._startup_replay.over(now):
             self._forget_startup_replay()
-        for member in self._each():
-            if self._latched is not None and member.missed:
-                self._dropped += member.deliver(self._latched)
-            if member.full:
-                self._dropped += member.trim()
-                self._reported = False
-            member.check_stall()
+        if self._latch.batch is not None:
+            for member in self._served.row:
+                if member.missed:
+                    self._served.deliver(self._latch.batch, member)
+        if self._served.trim(stalled=True):
+            self._reported = False
 
     @property
     def latched(self) -> int:
         """Return the bytes of the latched message."""
-        return 0 if self._latched is None else len(self._latched.view)
+        return self._latch.size
 
     def give_up_latched(self) -> None:
         """Drop the latched message in favour of a host that holds less memory."""
-        size = self.latched
-        self._latch(None)
-        self._keep_not(size)
+        self._latch.give_up()
 
     def repeat(self) -> None:
         """Report to a new control which latched message is not kept."""
-        if self._unkept is not None:
-            self._refused(self._unkept)
+        self._latch.repeat()
 
     def traffic(self) -> TopicTraffic | None:
         """Return the counters since the last call; None if nothing has changed."""
-        if self._reported and not self.counters.messages and not self._dropped:
+        if self._reported and not self.counters.messages and not self._served.has_dropped:
             return None
         messages, size, counts, seconds = self.counters.take()
         row = TopicTraffic(
@@ -533,31 +462,30 @@ class RelayedTopic:
             self.topic,
             messages,
             size,
-            self._dropped,
+            self._served.take_dropped(),
             len(self._served),
             counts,
             seconds,
             "" if self._header is None else self._header.get("md5sum", ""),
         )
-        self._dropped = 0
         self._reported = True
         return row
 
     def _serve(self, member: TopicSubscriber, header: Mapping[str, str]) -> None:
         if not member.greet(header):
             return
-        self._served[member] = self._row = None
+        self._served.add(member)
         self.differs()
         self.announce()
         self._reported = False
-        if self._latched is not None:
-            self._dropped += member.deliver(self._latched)
-        elif self._unkept is not None:
-            if self.upstream is not None and not self._share.refusal(self._unkept.size):
+        if self._latch.batch is not None:
+            self._served.deliver(self._latch.batch, member)
+        elif self._latch.is_refused:
+            if self.upstream is not None and self._latch.is_asked_again:
                 self.upstream.request_latched()
         elif self._startup_replay is not None and not self._startup_replay.over(self._clock()):
             for batch in self._startup_replay.give(member.caller_id):
-                self._dropped += member.deliver(batch)
+                self._served.deliver(batch, member)
         self.relieve()
 
     def _listen(self) -> None:
@@ -565,8 +493,8 @@ class RelayedTopic:
         now = self._clock()
         if (
             now <= self._fresh_until
-            and self._wanted
-            and not self._latching
+            and self._monitoring.wanted
+            and not self._latch.is_latching
             and not (self._waiting or self._served)
         ):
             self._startup_replay = StartupReplay(self._share, now)
@@ -579,8 +507,8 @@ class RelayedTopic:
 
     def _forget_header(self) -> None:
         """Drop the header if there is no connection and no subscriber that has read it."""
-        if not self._connected and not self._served:
-            self._header = None
+        if self._state is TopicState.LOST and not self._served:
+            self._state, self._header = TopicState.UNKNOWN, None
 
     def announce(self) -> None:
         """Show the publisher its subscribers, if it looks for their names."""
@@ -596,47 +524,17 @@ class RelayedTopic:
                 names.add(member.caller_id)
         return frozenset().union(*of_host.values())
 
-    def _each(self) -> tuple[TopicSubscriber, ...]:
-        """Return the served subscribers; the tuple stays the same while some of them end."""
-        if self._row is None:
-            self._row = tuple(self._served)
-        return self._row
-
-    def _latch(self, batch: Batch | None) -> None:
-        """Keep the last message of a batch if its publisher's host has the memory; with None, drop the kept message."""
-        if self._latched is not None:
-            self._share.add(-len(self._latched.view))
-            self._latched = None
-        if batch is None:
-            self._unkept = None
-            return
-        size = len(batch.view) - batch.find_last()
-        if self._share.refusal(size):
-            self._make_room(size)
-        if self._share.refusal(size):
-            self._keep_not(size)
-        else:
-            self._unkept = None
-            self._share.add(size)
-            self._latched = batch.keep_last()
-
-    def _keep_not(self, size: int) -> None:
-        before, self._unkept = self._unkept, LatchRefused(self.key, self.topic, size)
-        if before is None:
-            self._refused(self._unkept)
-
     def _pause_or_trim(self) -> None:
         """Pause the publisher if all subscribers have just fallen behind; else trim the full queues."""
-        since = [member.behind_since for member in self._each() if member.behind_since is not None]
+        since = [member.behind_since for member in self._served.row if member.behind_since is not None]
         if since and len(since) == len(self._served) and self.upstream is not None:
             left = max(since) + self._grace - self._clock()
             if left > 0:
-                self._paused = True
+                if self._state is TopicState.OPEN:
+                    self._state = TopicState.PAUSED
                 self.upstream.pause(left)
                 return
-        for member in self._each():
-            if member.full:
-                self._dropped += member.trim()
+        self._served.trim()
 
 
 def _identity(header: Mapping[str, str]) -> tuple[str | None, ...]:

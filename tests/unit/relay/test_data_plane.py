@@ -44,6 +44,7 @@ from appliance.channel.messages import (
 from appliance.relay.connections.admission import missing
 from appliance.relay.connections.upstream import PublisherConnection
 from appliance.relay.grant_table import GrantTable
+from appliance.relay.loop import EventLoop
 from appliance.relay.relay_limits import MIB
 from appliance.relay.transport.frames import Batch
 from roswire.tcpros import (
@@ -726,13 +727,13 @@ def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Some subscribers get a message in later turns of the publisher; each gets all messages in order and once."""
+    monkeypatch.setattr(EventLoop, "over", lambda _loop: True)
     world = World(replace(LIMITS, connections=400, connections_per_host=100))
     publisher, first = world.subscribed()
     others = [world.connect(encode_header(ASK)) for _ in range(39)]
     for subscriber in others:
         world.gets_header(subscriber)
     topic, _ = world.engine.topics["k", "/chatter"]
-    monkeypatch.setattr(topic, "over", lambda: True)
     messages = [encode_frame(f"{number}".encode() * 9) for number in range(5)]
     held = world.held
     publisher.send(messages[0])

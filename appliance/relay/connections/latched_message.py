@@ -1,0 +1,87 @@
+"""The last message of a latching publisher, kept in the memory of the publisher's host."""
+
+from collections.abc import Callable
+
+from appliance.relay.transport.frames import Batch
+from appliance.relay.transport.memory import HostMemory
+
+
+class LatchedMessage:
+    """The message that late subscribers of one topic get, or none; `share` counts its memory.
+
+    `make_room(size)` tries to free that many bytes of other hosts. `refused(size)` is called when a message is not kept
+    while the one before was, or there was none.
+    """
+
+    def __init__(
+        self, share: HostMemory, make_room: Callable[[int], None], refused: Callable[[int], None]
+    ) -> None:
+        self._share = share
+        self._make_room = make_room
+        self._refused = refused
+        self._refused_size: int | None = None
+        self.batch: Batch | None = None
+        self.is_latching = False
+        """Whether the publisher latches."""
+        self.withheld = False
+        """Whether monitors have held back a message of this publisher."""
+
+    @property
+    def size(self) -> int:
+        """Return its bytes."""
+        return 0 if self.batch is None else len(self.batch.view)
+
+    @property
+    def is_lacking(self) -> bool:
+        """Whether monitors have held back messages of a latching publisher, and no message is latched now."""
+        return self.is_latching and self.withheld and self.batch is None
+
+    @property
+    def is_asked_again(self) -> bool:
+        """Whether a message was not kept for which there is memory now: the publisher can send it again."""
+        return self._refused_size is not None and not self._share.refusal(self._refused_size)
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the publisher's last message is not kept."""
+        return self._refused_size is not None
+
+    def keep(self, batch: Batch) -> None:
+        """Keep the last message of a batch if its publisher's host has the memory."""
+        self._free()
+        size = len(batch.view) - batch.find_last()
+        if self._share.refusal(size):
+            self._make_room(size)
+        if self._share.refusal(size):
+            self._refuse(size)
+        else:
+            self._refused_size = None
+            self._share.add(size)
+            self.batch = batch.keep_last()
+
+    def forget(self) -> None:
+        """Drop the message, because its publisher is gone."""
+        self._free()
+        self._refused_size = None
+        self.withheld = False
+
+    def give_up(self) -> None:
+        """Drop the message in favour of a host that holds less memory."""
+        size = self.size
+        self._free()
+        self._refuse(size)
+
+    def repeat(self) -> None:
+        """Report again which message is not kept."""
+        if self._refused_size is not None:
+            self._refused(self._refused_size)
+
+    def _free(self) -> None:
+        if self.batch is not None:
+            self._share.add(-len(self.batch.view))
+            self.batch = None
+
+    def _refuse(self, size: int) -> None:
+        before, self._refused_size = self._refused_size, size
+        if before is None:
+            self._refused(size)

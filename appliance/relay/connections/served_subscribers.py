@@ -1,0 +1,154 @@
+"""The served subscribers of one topic, and the batch that some of them still have to get.
+
+Once the quantum of a publisher is used up (`over`), the remaining subscribers get the batch in the publisher's next
+turn, before more data is read.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Protocol
+
+from appliance.relay.transport.frames import Batch
+
+_ROW = 16  # subscribers between two readings of the processor time
+
+
+class TopicSubscriber(Protocol):
+    """A subscriber, as its topic uses it."""
+
+    host: str
+    """The address it comes from."""
+
+    caller_id: str
+    """The caller id that it claims."""
+
+    missed: bool
+    """Whether its rate limit dropped the last message for it."""
+
+    behind_since: float | None
+    """When its queue first became so long that it is behind; None once it has caught up completely."""
+
+    def greet(self, header: Mapping[str, str]) -> bool:
+        """Answer with the publisher's header, or refuse a different type; return whether the subscriber is served."""
+
+    def deliver(self, batch: Batch) -> int:
+        """Send or queue the batch; return how many messages are dropped."""
+
+    def accepted(self, batch: Batch, sent: int) -> int:
+        """Like `deliver`, after the pump has sent the first `sent` bytes (negative: the number of an error)."""
+
+    @property
+    def descriptor(self) -> int:
+        """The socket to which the next batch is just sent; -1 if it needs other work (a limit, a queue)."""
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no more data should be kept for its host."""
+
+    @property
+    def full(self) -> bool:
+        """Whether its queue has reached its bounds."""
+
+    def trim(self) -> int:
+        """Drop messages beyond the bounds, oldest first; return how many."""
+
+    def check_stall(self) -> None:
+        """Cut the connection if it makes no progress; called once a second."""
+
+    def cut(self, reason: str) -> None:
+        """Close its connection."""
+
+
+class ServedSubscribers:
+    """The subscribers, in the order in which they came."""
+
+    def __init__(self, over: Callable[[], bool]) -> None:
+        self._over = over
+        # A dict, not a list: thousands of subscribers may end in one turn, and each removal must be cheap.
+        self._members: dict[TopicSubscriber, None] = {}
+        self._row: tuple[TopicSubscriber, ...] | None = None
+        self._waits: tuple[Batch, tuple[TopicSubscriber, ...]] | None = None
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._members)
+
+    def __iter__(self) -> Iterator[TopicSubscriber]:
+        return iter(self._members)
+
+    @property
+    def row(self) -> tuple[TopicSubscriber, ...]:
+        """Return the subscribers; the tuple stays the same while some of them end."""
+        if self._row is None:
+            self._row = tuple(self._members)
+        return self._row
+
+    def add(self, member: TopicSubscriber) -> None:
+        """Serve a subscriber from the next batch on."""
+        self._members[member] = self._row = None
+
+    def remove(self, member: TopicSubscriber) -> None:
+        """Remove a subscriber whose connection is closed."""
+        self._members.pop(member, None)
+        self._row = None
+
+    @property
+    def undelivered(self) -> int:
+        """Return the bytes of the batch that some subscribers still have to get."""
+        return 0 if self._waits is None else len(self._waits[0].view)
+
+    def deliver(self, batch: Batch, member: TopicSubscriber) -> None:
+        """Send one subscriber a batch."""
+        self._dropped += member.deliver(batch)
+
+    def send(self, batch: Batch, *, divided: bool) -> bool:
+        """Send all of them a batch, after the previous one; return whether a subscriber is behind."""
+        behind = self.hand_out(divided=False)
+        self._waits = batch, self.row
+        return self.hand_out(divided=divided) or behind
+
+    def go_on_behind(self, batch: Batch, number: int, sent: int) -> bool:
+        """Send the rest of a batch that the pump has passed to the first `number` subscribers.
+
+        The next one has accepted `sent` bytes (negative: the number of an error). Return whether one is behind.
+        """
+        row = self.row
+        self._waits = batch, row[number + 1 :]
+        self._dropped += row[number].accepted(batch, sent)
+        return self.hand_out(divided=True) or row[number].behind_since is not None
+
+    def hand_out(self, *, divided: bool) -> bool:
+        """Send the waiting batch; if `divided`, stop when the quantum is used up. Return whether one is behind."""
+        if self._waits is None:
+            return False
+        (batch, members), self._waits = self._waits, None
+        behind = False
+        for number, member in enumerate(members):
+            if divided and number and not number % _ROW and self._over():
+                kept = Batch(batch.keep(), batch.messages, batch.last, owned=True, stride=batch.stride)
+                self._waits = kept, members[number:]
+                break
+            if member in self._members:
+                self._dropped += member.deliver(batch)
+                behind = behind or member.behind_since is not None
+        return behind
+
+    def trim(self, *, stalled: bool = False) -> bool:
+        """Trim the full queues, and cut subscribers that make no progress (`stalled`); return whether one was full."""
+        full = False
+        for member in self.row:
+            if member.full:
+                self._dropped += member.trim()
+                full = True
+            if stalled:
+                member.check_stall()
+        return full
+
+    @property
+    def has_dropped(self) -> bool:
+        """Whether messages were dropped since `take_dropped`."""
+        return bool(self._dropped)
+
+    def take_dropped(self) -> int:
+        """Return how many messages were dropped since the last call."""
+        dropped, self._dropped = self._dropped, 0
+        return dropped
