@@ -369,8 +369,27 @@ def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
             assert page.evaluate(rows, page_of(some[::-1])) == expected
 
 
+def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[..., Reader]) -> None:
+    """What matters has a row for each kind of denial and of a monitor's action; another search keeps their order."""
+    entries = [denial(number, f"/arm{number % 3}") for number in range(1, 40)] + [
+        drop(40),
+        denial(41, "/leg"),
+        drop(42),
+    ]
+    reader = opened()
+    reader.page.route(re.compile(r"/v1/audit\?"), lambda route: route.fulfill(json=page_of(entries)))
+    page = reader.go("audit")
+    rows = page.locator("tbody tr")
+    expect(rows).to_have_count(2)
+    expect(rows.nth(0)).to_contain_text("2 times")
+    for text in ("40 times", "/leg", "and 3 more"):
+        expect(rows.nth(1)).to_contain_text(text)
+    page.get_by_label("Text", exact=True).fill("arm")
+    expect(rows).to_have_count(42)
+
+
 def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:
-    """A row has the count, the times and the last value, and opens the newest full record; its button, also by keyboard, shows each."""
+    """A row has count, times and last value, and opens the newest full record; its button shows each, also by keyboard."""
     drops = [drop(2), drop(3, "7 more in the same second", count=7), drop(4)]
     reader = opened()
     reader.page.route(

@@ -3,7 +3,7 @@
  * One stream serves all views; it keeps the last records, newest first.
  */
 
-import { compared } from "./audit/rows.js";
+import { compared, isDenial } from "./audit/rows.js";
 import { follow } from "./events.js";
 import { get } from "./rest.js";
 import { createStore } from "./store.js";
@@ -51,11 +51,6 @@ function heard(/** @type {string} */ event, /** @type {AuditRecord} */ record) {
   if (isDoing(record)) change.doings = added(notable.get().doings, record);
   if (record.severity === "alarm") change.incidents = added(notable.get().incidents, record);
   if (Object.keys(change).length) notable.update(change);
-}
-
-/** Whether a record is a denial, or would be one if the policy were enforced. @param {AuditRecord} record */
-export function isDenial(record) {
-  return record.decision === "deny" || record.decision === "would deny";
 }
 
 /** Whether a record is an action of a monitor, and not an operator's change of a monitor. @param {AuditRecord} record */

@@ -3,9 +3,11 @@
 import { useCallback, useEffect, useRef, useState } from "../html.js";
 import { follow } from "../events.js";
 import { get, queryText } from "../rest.js";
-import { compared } from "./rows.js";
+import { byHostAndKind, compared, grouped } from "./rows.js";
 
 const PAGE = 100;
+const FEW_ROWS = 20; // with fewer rows of a page, older pages follow at once
+const MOST_PAGES = 5;
 const KEPT = 2000; // records kept while following; pages that the user fetched come on top
 const PAUSE = 250; // milliseconds after the last key of a search
 
@@ -18,6 +20,17 @@ export function askedOf(/** @type {Record<string, string>} */ { looks, ...filter
   const matters = !looks && Object.keys(filter).every((name) => name === "since" || name === "until");
   if (matters) return { ...filter, severity: "notice", looks: "0" };
   return looks || filter.event || filter.category ? filter : { ...filter, looks: "0" };
+}
+
+/** Whether a filter asks for all hosts' denials: then they are rows by host and kind. @param {Record<string, string>} filter */
+export function asksForAll(filter) {
+  return Object.entries(filter).every(([name, value]) => name === "since" || name === "until" || (name === "decision" && value !== "allow"));
+}
+
+/** @param {Record<string, string>} filter @param {any[]} records */
+export function rowsOf(filter, records) {
+  const rows = grouped(records);
+  return asksForAll(filter) ? byHostAndKind(rows) : rows;
 }
 
 /** @param {Record<string, string>} filter @param {boolean} following */
@@ -34,8 +47,15 @@ export function useRecords(filter, following) {
     const timer = setTimeout(async () => {
       try {
         const page = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, equality: 1 }, controller.signal);
-        const { cursor, notes = [] } = page;
-        setState({ records: compared(page), cursor, notes, most: KEPT, error: null, loading: false });
+        const { notes = [] } = page;
+        let { cursor } = page;
+        const records = compared(page);
+        for (let pages = 1; pages < MOST_PAGES && cursor && rowsOf(filter, records).length < FEW_ROWS; pages += 1) {
+          const older = await get("/v1/audit", { ...askedOf(filter), limit: PAGE, cursor, equality: 1 }, controller.signal);
+          records.push(...compared(older));
+          cursor = older.cursor;
+        }
+        setState({ records, cursor, notes, most: KEPT, error: null, loading: false });
       } catch (error) {
         if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
       }

@@ -12,6 +12,11 @@ import { Icon } from "../parts/icon.js";
 
 const SECOND = 19; // characters of a time, to its second
 
+/** Whether a record is a denial, or would be one if the policy were enforced. @param {Record<string, any>} record */
+export function isDenial(record) {
+  return record.decision === "deny" || record.decision === "would deny";
+}
+
 /** The records of a page, each with its equality. @param {{records: any[], equality: any[]}} page */
 export function compared({ records, equality }) {
   return records.map((one, at) => ({ ...one, equality: equality[at] }));
@@ -44,6 +49,39 @@ export function grouped(records) {
     }
   }
   return rows;
+}
+
+/**
+ * Denials of a host in one row for each kind (publish, subscribe, …), and a monitor's actions in one row for each kind,
+ * host and topic, at the place of the newest: a host that makes several calls in turn is a few rows. All other rows stay.
+ * @param {Row[]} rows the newest first
+ */
+export function byHostAndKind(rows) {
+  /** @type {Map<string, Row>} */
+  const known = new Map();
+  return rows.flatMap((row) => {
+    const key = kindOf(row.first);
+    if (!key) return [row];
+    const newer = known.get(key);
+    if (!newer) {
+      const own = { ...row };
+      known.set(key, own);
+      return [own];
+    }
+    Object.assign(newer, { records: [...newer.records, ...row.records], first: row.first, count: newer.count + row.count });
+    return [];
+  });
+}
+
+/** @param {any} record */
+function kindOf({ decision, event, host, category, resource, detail, ...record }) {
+  if (isDenial({ decision }) && host) return JSON.stringify([decision, host, category]);
+  return category === "monitor" && detail.monitor && !detail.who ? JSON.stringify([event, detail.monitor, host, resource, record.severity]) : null;
+}
+
+/** How many other resources a row's records have than the one that it shows. @param {Row} row */
+export function othersOf({ records }) {
+  return new Set(records.map((one) => one.resource)).size - 1;
 }
 
 /** The record that a row shows and opens: the newest that is not just a number of repetitions. @param {Row} row */

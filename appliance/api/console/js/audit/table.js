@@ -6,7 +6,7 @@ import { Outcome, requested } from "../parts/badge.js";
 import { actor, Given } from "../parts/given.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
-import { Count, Range, shownOf } from "./rows.js";
+import { Count, othersOf, Range, shownOf } from "./rows.js";
 
 /** @param {{rows: import("./rows.js").Row[], opened: (row: import("./rows.js").Row) => boolean, toggle: (row: import("./rows.js").Row) => void, chosen: string, filter: Record<string, string>}} given */
 export function RecordTable({ rows, opened, toggle, chosen, filter }) {
@@ -17,13 +17,13 @@ export function RecordTable({ rows, opened, toggle, chosen, filter }) {
       const time = html`<${Range} row=${row} />`;
       const count = html`<${Count} row=${row} open=${open} toggle=${() => toggle(row)} />`;
       return [
-        html`<${Row} key=${row.first.id} record=${shownOf(row)} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
+        html`<${Row} key=${row.first.id} record=${shownOf(row)} others=${othersOf(row)} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
         open && row.records.map((one) => html`<${Row} key=${`each ${one.id}`} record=${one} time=${html`<${Moment} at=${one.time} />`} reason=${one.reason} part chosen=${is(one)} filter=${filter} />`),
       ];
     })}</tbody></table></div>`;
 }
 
-function Row(/** @type {{record: any, time: any, count?: any, reason: string, part?: boolean, chosen: boolean, filter: Record<string, string>}} */ { record, time, count, reason, part = false, chosen, filter }) {
+function Row(/** @type {{record: any, others?: number, time: any, count?: any, reason: string, part?: boolean, chosen: boolean, filter: Record<string, string>}} */ { record, others = 0, time, count, reason, part = false, chosen, filter }) {
   const open = () => go(auditPath(filter, record.id));
   const link = (/** @type {MouseEvent} */ event) => {
     event.preventDefault();
@@ -37,7 +37,7 @@ function Row(/** @type {{record: any, time: any, count?: any, reason: string, pa
     <td><${Given} value=${record.event === "decision" ? requested(record) : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
     <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono /></td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Given} value=${record.host} most=${40} mono /></td>
-    <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono /></td>
+    <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono />${others > 0 && html` <span class="muted small nowrap">and ${others} more</span>`}</td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
     <td data-label="Reason" class=${`wide-only reason${reason ? "" : " bare"}`}><${Given} value=${reason} most=${240} /></td></tr>`;
 }

@@ -3,9 +3,9 @@
 import { html } from "../html.js";
 import { Moment } from "../moments.js";
 import { counted } from "../numbers.js";
-import { isDenial } from "../notable.js";
 import { go } from "../router.js";
 import { auditPath } from "./filters.js";
+import { isDenial } from "./rows.js";
 
 const GRAVE = new Set(["alarm", "warning"]);
 

@@ -7,12 +7,13 @@ import { Empty, Failure, Loading } from "../parts/notice.js";
 import { go, place } from "../router.js";
 import { useKeys } from "../shortcuts.js";
 import { useStore } from "../store.js";
+import { DeniedHosts } from "./denied_hosts.js";
 import { auditPath, filterOf, Filters } from "./filters.js";
 import { Presets } from "./presets.js";
 import { Evidence, Export, Verify } from "./proof.js";
 import { RecordPanel } from "./record.js";
-import { useRecords } from "./records.js";
-import { grouped, shownOf } from "./rows.js";
+import { asksForAll, rowsOf, useRecords } from "./records.js";
+import { shownOf } from "./rows.js";
 import { RecordTable } from "./table.js";
 import { Timeline } from "./timeline.js";
 
@@ -21,7 +22,7 @@ export function Audit() {
   const filter = filterOf(query);
   const [following, setFollowing] = useState(false);
   const { records, cursor, notes, error, loading, standing, older, again } = useRecords(filter, following);
-  const rows = useMemo(() => grouped(records ?? []), [records]);
+  const rows = useMemo(() => rowsOf(filter, records ?? []), [records]);
   const [open, setOpen] = useState(/** @type {Set<string>} */ (new Set())); // ids of records whose row is open
   const opened = (/** @type {import("./rows.js").Row} */ row) => row.records.length > 1 && row.records.some((one) => open.has(one.id));
   const toggle = (/** @type {import("./rows.js").Row} */ row) => {
@@ -37,6 +38,7 @@ export function Audit() {
     <${Presets} filter=${filter} />
     <${Filters} filter=${filter} record=${chosen} />
     ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Following is interrupted: ${standing.reason} Retrying automatically.</div>`}
+    ${filter.decision === "deny" && asksForAll(filter) && html`<section class="panel spaced" aria-labelledby="denied-hosts"><div class="panel-head"><h2 id="denied-hosts">Denied hosts</h2></div><${DeniedHosts} since=${filter.since} until=${filter.until} mark=${records?.[0]?.sequence ?? 0} /></section>`}
     <div class=${`audit-grid${chosen ? " with-record" : ""}`}>
       <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
         ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}

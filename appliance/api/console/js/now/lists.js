@@ -1,6 +1,7 @@
 /** The latest denials and actions of monitors, live. */
 
-import { Count, grouped, Range, shownOf } from "../audit/rows.js";
+import { DeniedHosts } from "../audit/denied_hosts.js";
+import { byHostAndKind, Count, grouped, othersOf, Range, shownOf } from "../audit/rows.js";
 import { html, useState } from "../html.js";
 import { isSelftest } from "../graph/model.js";
 import { Moment } from "../moments.js";
@@ -18,7 +19,7 @@ export function Refusals() {
   return html`<section class="panel" aria-labelledby="refusals"><div class="panel-head"><h2 id="refusals">Recently denied</h2>
       <span class="end"><${Link} to="/console/audit?decision=deny&since=1d" class="small">All in the audit log</${Link}></span></div>
     ${denials === null ? html`<${Loading} />` : !denials.length ? html`<${Empty} icon="check" title="Nothing was denied in the last day">Requests that the policy denies appear here at once.</${Empty}>`
-      : html`<${List} records=${denials} what=${denied} />`}</section>`;
+      : html`<${DeniedHosts} since="1h" title=" in the last hour" mark=${denials[0].sequence} /><${List} records=${denials} what=${denied} />`}</section>`;
 }
 
 export function Doings() {
@@ -30,7 +31,7 @@ export function Doings() {
 }
 
 function List(/** @type {{records: any[], what: (row: import("../audit/rows.js").Row, count: any) => any}} */ { records, what }) {
-  return html`<ul class="event-list">${grouped(records).slice(0, SHOWN).map((row) => html`<${Entry} key=${row.first.id} row=${row} what=${what} />`)}</ul>`;
+  return html`<ul class="event-list">${byHostAndKind(grouped(records)).slice(0, SHOWN).map((row) => html`<${Entry} key=${row.first.id} row=${row} what=${what} />`)}</ul>`;
 }
 
 function Entry(/** @type {{row: import("../audit/rows.js").Row, what: (row: import("../audit/rows.js").Row, count: any) => any}} */ { row, what }) {
@@ -44,7 +45,7 @@ function denied(/** @type {import("../audit/rows.js").Row} */ row, /** @type {an
   const { value } = row;
   const one = shownOf(row);
   return html`<span class="event-badge"><${Badge} word=${one.decision} /></span><div class="event-body">
-    <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${isSelftest(one) ? "rosrv selftest" : one.resource ? requested(one) : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" />${count}</div>
+    <div><${Given} value=${one.caller_id} most=${60} mono none="no name" /> <span class="muted">of</span> <${Given} value=${one.host} mono none="no address" /> <span class="muted"><${Given} value=${isSelftest(one) ? "rosrv selftest" : one.resource ? requested(one) : one.event} none="" /></span> <${Given} value=${one.resource} most=${80} mono none="" />${othersOf(row) > 0 && html` <span class="muted">and ${othersOf(row)} more</span>`}${count}</div>
     <div class="event-reason"><${Link} to=${`/console/audit/${one.id}`}><${Given} value=${value || one.reason || one.event} most=${220} /></${Link}></div></div>`;
 }
 

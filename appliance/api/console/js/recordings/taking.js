@@ -2,8 +2,8 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { take } from "../audit/proof.js";
+import { isDenial } from "../audit/rows.js";
 import { Moment } from "../moments.js";
-import { isDenial } from "../notable.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Icon } from "../parts/icon.js";
