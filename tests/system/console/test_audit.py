@@ -389,7 +389,7 @@ def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[
 
 
 def test_equal_records_are_one_row_that_opens(opened: Callable[..., Reader]) -> None:
-    """A row has count, times and last value, and opens the newest full record; its button shows each, also by keyboard."""
+    """A row has count, times and last value, and opens the newest full record; its button shows each."""
     drops = [drop(2), drop(3, "7 more in the same second", count=7), drop(4)]
     reader = opened()
     reader.page.route(
