@@ -297,13 +297,16 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
             return await asyncio.to_thread(explained, record, known, in_full)
 
     @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
-    async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:
-        """Return the smallest change of the policy in force that grants what this record says was refused."""
+    async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
+        """Return the smallest change of the policy in force that grants what this record says was refused.
+
+        `tool`: the change also has all other rights that the stock tool of the record needs, such as rostopic.
+        """
         shown = await desk.record(bearer, record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
             try:
-                return await asyncio.to_thread(granted, shown.entry.record, known)
+                return await asyncio.to_thread(granted, shown.entry.record, known, whole_tool=tool)
             except UngrantableError as error:
                 raise ProblemError(409, "not-by-a-policy", str(error)) from None
 

@@ -29,6 +29,7 @@ from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import needs_node
+from appliance.policy.stock_tools import stock_tool
 
 _GRANTED = (
     "the policy in force has every right that it needs: it was denied for its recorded reason, or before this"
@@ -60,10 +61,19 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
     )
 
 
-def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
-    """Return the policy change that allows the denied request of a record. Raises `UngrantableError` if none does."""
-    known = PolicyContext.of(msgspec.structs.asdict(current))
-    found = grant(current.text, current.file, known, asked_of(record))
+def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = False) -> Granted:
+    """Return the policy change that allows the denied request of a record. Raises `UngrantableError` if none does.
+
+    `whole_tool`: the change also has all other rights that the stock tool of the record needs.
+    """
+    known, asked = PolicyContext.of(msgspec.structs.asdict(current)), asked_of(record)
+    tool = stock_tool(asked.request.caller_id)
+    if whole_tool:
+        if tool is None:
+            raise UngrantableError(f"{asked.request.caller_id or 'the caller'} is not a stock tool of ROS")
+        asked = asked.with_tool(tool)
+    found = grant(current.text, current.file, known, asked)
+    needs = [] if tool is None else grant(found.text, current.file, known, asked.with_tool(tool)).added
     return Granted(
         revision=current.revision,
         reason=record.reason,
@@ -71,6 +81,8 @@ def granted(record: AuditRecord, current: PolicyKnown) -> Granted:
         diff=found.diff(current.text, current.file),
         text=found.text,
         findings=found.findings("policy", known) if found.added else [],
+        tool=tool.name if tool is not None else "",
+        tool_needs=list(needs),
     )
 
 

@@ -6,7 +6,7 @@
     4. flags
 
 All mistakes are reported at once, each with its location. For an unknown key, the nearest known key is also suggested.
-With a file, its relative paths and the relative defaults (`policies/default.ini`) are below the file's folder; all other
+With a file, its relative paths and relative defaults (`policies/default.ini`) are below the file's folder; all other
 paths, and without a file the defaults, are below the working directory.
 """
 

@@ -2,14 +2,17 @@
 
 Each missing right changes one line. If the section has a line with the exact key, the host is added to it. Otherwise, a
 new line is added for this key. It lists the host and all hosts of the deciding rule, so the rights of other hosts do
-not change. Comments, order and blanks of the text stay.
+not change. Comments, order and blanks of the text stay. The key for the anonymous name of a stock tool is a pattern
+(`/rostopic_*`), because its numbers change with each run.
 """
 
 import difflib
 import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
+from appliance.policy.anonymous_names import key_of
 from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.keys import levels
@@ -20,8 +23,9 @@ from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
+from appliance.policy.stock_tools import StockTool, stock_tool
 
-_MOST_LINES = 8  # the most lines that one grant may change
+_MOST_LINES = 8  # the most lines that one grant may change, besides one for each right
 
 
 class UngrantableError(Exception):
@@ -35,6 +39,10 @@ class DecidedRequest:
     request: Request
     rights: list[Right]
     takeover: bool = False
+
+    def with_tool(self, tool: StockTool) -> Self:
+        """Return the request with all rights that a stock tool on its host needs."""
+        return replace(self, rights=[*tool.rights(self.request.host), *self.rights])
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,12 +78,13 @@ def grant(text: str, file: str, known: PolicyContext, asked: DecidedRequest) -> 
     if block is not None:
         raise UngrantableError(f"no line of a policy grants it: {block.reason}")
     added: list[str] = []
+    most = _MOST_LINES + len(asked.rights)
     while (
         missing := next((right for right in asked.rights if not _granted(policy, right)), None)
     ) is not None:
         reason = decide_right(policy, missing).reason
-        if len(added) == _MOST_LINES:
-            raise UngrantableError(f"more than {_MOST_LINES} lines would have to change: {reason}")
+        if len(added) == most:
+            raise UngrantableError(f"more than {most} lines would have to change: {reason}")
         text, line = _changed(policy, text, missing, word)
         added.append(line)
         try:
@@ -117,7 +126,7 @@ def _sections(text: str) -> list[SectionText]:
 def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
     """Add a line, or a word to a line. Return the new text and the line."""
     request = right.request
-    rule, key = decide_right(policy, right).rule, request.resource
+    rule, key = decide_right(policy, right).rule, _key(request)
     name = BY_CATEGORY[request.category].name
     section = next((section for section in _sections(text) if section.name.text == name), None)
     itself = policy.decide(request)
@@ -141,6 +150,12 @@ def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, s
         return _with_word(text, entry, word)
     holders = [] if section is None or rule is None else _holders(section, rule.key)
     return _with_line(text, section, name, f"{written} = {' '.join(dict.fromkeys([*holders, word]))}")
+
+
+def _key(request: Request) -> str:
+    name = request.resource
+    tool = stock_tool(f"/{levels(name)[0]}") if request.category in (Category.NODE, Category.OFFER) else None
+    return name if tool is None else key_of(name)
 
 
 def _below(name: str, rule: Rule | None) -> str:

@@ -13,12 +13,12 @@ The result is written for engineers: every line names the nodes that used the ri
 together on several lines become a group. A parameter's key is left out if the key above it has the same hosts.
 """
 
-import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from appliance.policy.actions import BadWordError, check_resource
+from appliance.policy.anonymous_names import key_of
 from appliance.policy.commands import ALIASES
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
@@ -26,8 +26,6 @@ from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS
 from roswire.names import is_global_name, searched
 
-# The suffixes of rospy (process id and milliseconds) and of roscpp (nanoseconds).
-_ANONYMOUS = re.compile(r"_[0-9]++_[0-9]{10,}+$|_[0-9]{15,}+$")
 _SHOWN_NODES = 3
 
 
@@ -72,7 +70,7 @@ def learn(observations: Iterable[Observation], robot: Collection[Address | Netwo
             right.used += 1
             right.hosts.add(canonical_address(request.host))
             if is_global_name(request.caller_id):
-                right.nodes.add(_without_numbers(request.caller_id))
+                right.nodes.add(key_of(request.caller_id))
     _hand_down(rights)
     return LearnedPolicy("".join(_text(_needful(rights), robot)), requests, left_out)
 
@@ -102,11 +100,7 @@ def _key(request: Request) -> str:
         return ALIASES.get(request.resource, request.resource)
     if request.category in PARAMETERS:
         return request.resource.rstrip("/") + "/**"
-    return _without_numbers(request.resource)
-
-
-def _without_numbers(name: str) -> str:
-    return "/".join(_ANONYMOUS.sub("_*", level) for level in name.split("/"))
+    return key_of(request.resource)
 
 
 def _hand_down(rights: dict[tuple[Category, str], _Right]) -> None:

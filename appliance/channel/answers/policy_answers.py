@@ -102,3 +102,7 @@ class Granted(msgspec.Struct, frozen=True, kw_only=True):
     diff: Annotated[list[str], doc("lines of the unified diff")]
     text: Annotated[str, doc("the whole changed policy, ready to be loaded")]
     findings: Annotated[list[str], doc("why it would be rejected: the test cases that it fails")]
+    tool: Annotated[str, doc("the stock tool that was denied, such as rostopic; empty: it is not one")] = ""
+    tool_needs: Annotated[
+        list[str], doc("the lines that this tool also needs, which `?tool=1` adds to the change")
+    ] = []

@@ -1,5 +1,6 @@
 """`rosrv policy grant` and `rosrv audit why`: explain an audit record, and grant a denied request."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -17,7 +18,7 @@ from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, usage_error, write_told
 from appliance.cli.policy.live_verbs import say_loaded
-from rosmop.tool.terminal import printable, say
+from rosmop.tool.terminal import counted, printable, say
 
 
 @speaks
@@ -69,10 +70,16 @@ def grant(
     write: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the changed policy to this file")
     ] = None,
+    tool: Annotated[
+        bool,
+        typer.Option("--tool", help="Grant all that the denied stock tool needs, such as rostopic"),
+    ] = False,
     load: Annotated[bool, typer.Option("--load", help="Bring the changed policy into force")] = False,
     confirm_within: ConfirmWithin = None,
 ) -> None:
     """Show the smallest policy change that would allow a denied request.
+
+    A stock tool makes several calls, one after the other; with --tool the change allows all of them.
 
     The change is checked with the policy's tests. Only --write and --load change anything. Exit status 1 if no rule
     can grant the request or a test fails.
@@ -82,11 +89,11 @@ def grant(
     within = seconds_within(confirm_within, "policy")
     if within is not None and not load:
         raise usage_error("--confirm-within needs --load")
-    found = _granted(appliance, record)
+    found = _granted(appliance, record, tool=tool)
     if appliance.as_json:
         say_json(found)
     else:
-        _show(found)
+        _show(found, record)
     if found.findings or not found.added:
         raise typer.Exit(1)
     if write is not None:
@@ -109,7 +116,7 @@ def _with_ends_of(file: Path, text: str) -> bytes:
     return text.encode().replace(b"\n", ends)
 
 
-def _show(found: Granted) -> None:
+def _show(found: Granted, record: str) -> None:
     say(f"denied: {printable(found.reason)}")
     if not found.added:
         say(
@@ -120,12 +127,15 @@ def _show(found: Granted) -> None:
         say(printable(line), {"+": "green", "-": "red"}.get(line[:1], ""))
     for finding in found.findings:
         say(printable(finding), "red")
+    if found.tool_needs:
+        more = counted(len(found.tool_needs), "more line")
+        say(f"{found.tool} needs {more} to work: rosrv policy grant {shlex.quote(record)} --tool", "yellow")
 
 
-def _granted(appliance: Appliance, record: str) -> Granted:
+def _granted(appliance: Appliance, record: str, *, tool: bool) -> Granted:
     """Compute the change in this program, or over REST in the appliance."""
     if appliance.place is not None:
-        return msgspec.convert(_over_rest(appliance, record, "grant"), Granted)
+        return msgspec.convert(_over_rest(appliance, record, "grant", tool=tool), Granted)
     from appliance.api.dry_run_policy import granted  # noqa: PLC0415  not for every verb
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
@@ -133,7 +143,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
         found = _entry(appliance, record).record
         known = appliance.ask_or_exit(PolicyWanted())
         try:
-            return granted(found, known)
+            return granted(found, known, whole_tool=tool)
         except UngrantableError as error:
             fail(str(error), 1)
 
@@ -149,7 +159,7 @@ def _unknown(record: str) -> NoReturn:
     fail(f"no record in the log has the id {record!a}; list them: rosrv audit search", 1)
 
 
-def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
+def _over_rest(appliance: Appliance, record: str, what: str, *, tool: bool = False) -> dict[str, Any]:
     from appliance.cli.connection.audit_over_rest import ID  # noqa: PLC0415  as below
     from appliance.cli.connection.rest_session import RestProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
@@ -157,7 +167,9 @@ def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
         _unknown(record)
     with Errors():
         try:
-            return appliance.rest.call("GET", f"/v1/audit/{record}/{what}")
+            return appliance.rest.call(
+                "GET", f"/v1/audit/{record}/{what}", params={"tool": "1"} if tool else None
+            )
         except RestProblemError as problem:
             if problem.status == 404:
                 _unknown(record)

@@ -1,6 +1,7 @@
 """The smallest change that grants a denied request, and grants no other host anything."""
 
 import ipaddress
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.rights import decide, rights_of, rights_of_call
+from appliance.policy.rights import Right, decide, decide_right, rights_of, rights_of_call
+from appliance.policy.stock_tools import stock_tool
 from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value
 
@@ -199,3 +201,42 @@ def test_failing_cases_are_reported() -> None:
     [finding] = found.findings("p.ini", known)
     assert finding.startswith("p.tests.yaml:2:")
     assert "expected deny" in finding
+
+
+TOOLS = (
+    "/rostopic",
+    "/rosnode",
+    "/rosservice",
+    "/rosparam-47",
+    "/record_1700000000000000000",
+    "/play_1700000000000000000",
+)
+
+
+@pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
+@pytest.mark.parametrize("caller", TOOLS)
+def test_a_stock_tool_gets_all_that_it_needs(file: Path, caller: str) -> None:
+    """One change allows all calls, also those of the next run with another name, and gives no other host a right."""
+    tool = stock_tool(caller)
+    assert tool is not None
+    text, denied = file.read_text(encoding="utf-8"), Request(HOST, caller, Category.SUBSCRIBE, "/speed")
+    found = grant(text, "p.ini", KNOWN, DecidedRequest(denied, [Right(denied)]).with_tool(tool))
+    before, after = compiled(text), compiled(found.text)
+    for right in tool.rights(HOST):
+        assert decide_right(after, right).allowed
+        other = Right(replace(right.request, host=OTHER))
+        assert decide_right(after, other).allowed is decide_right(before, other).allowed
+    again = Request(HOST, f"/{tool.name}_99_1800000000000", Category.SUBSCRIBE, "/speed")
+    assert decide(after, rights_of(again)).allowed is tool.node
+    for harmful in ("shutdown", "setParam", "deleteParam", "monitorControl", "getRVState"):
+        call = request(Category.COMMAND, harmful)
+        assert after.decide(call).allowed is before.decide(call).allowed
+
+
+@pytest.mark.parametrize("name", ["/record", "/cmd_1_1700000000000", "/arm"])
+def test_a_name_that_is_no_tools_is_granted_alone(name: str) -> None:
+    """A host that invents a name with numbers gets no pattern such as /cmd_*, which would also match /cmd_vel."""
+    assert stock_tool(name) is None
+    wanted = Request(HOST, name, Category.NODE, name)
+    found = grant("[Nodes]\n/x = 10.0.0.1\n", "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))
+    assert found.added == (f"{name} = 10.0.0.9",)

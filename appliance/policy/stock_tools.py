@@ -1,0 +1,57 @@
+"""List the rights that the stock tools of ROS need before they do what the user asked for. No I/O.
+
+A tool on a host without rights is denied one call after the other, and reports only the first one. The calls are those
+that the tools of Debian 12 made with all their verbs that only read.
+"""
+
+from dataclasses import dataclass
+
+from appliance.policy.anonymous_names import key_of
+from appliance.policy.model import Address, Category, Request
+from appliance.policy.rights import Right, rights_of
+
+_READ = ("/use_sim_time", "/tcp_keepalive")
+_LOG_LEVEL = ("get_loggers", "set_logger_level")
+
+
+@dataclass(frozen=True, slots=True)
+class StockTool:
+    """A tool: the calls that it makes under its own name, and whether it also starts an anonymous node."""
+
+    name: str
+    calls: tuple[str, ...]
+    node: bool = True
+
+    def rights(self, host: Address) -> list[Right]:
+        """Return the rights that the tool needs on this host, without those on topics and services of its user."""
+        name = f"/{self.name}_1_1000000000"
+        asked = [(Category.COMMAND, call) for call in self.calls]
+        if self.node:
+            asked += [(Category.NODE, name), (Category.PUBLISH, "/rosout")]
+            asked += [(Category.OFFER, f"{name}/{service}") for service in _LOG_LEVEL]
+            asked += [(Category.READ, key) for key in _READ]
+            asked += [(Category.COMMAND, call) for call in ("hasParam", "subscribeParam", "unsubscribeParam")]
+        return [right for what, word in asked for right in rights_of(Request(host, name, what, word))]
+
+
+_TOOLS = (
+    StockTool("rostopic", ("getPid", "getSystemState", "getTopicTypes", "getPublishedTopics", "lookupNode")),
+    StockTool(
+        "rosnode",
+        ("getPid", "getSystemState", "getPublishedTopics", "lookupNode", "getBusInfo"),
+        node=False,
+    ),
+    StockTool("rosservice", ("getSystemState", "lookupService")),
+    StockTool("rosparam", ("getParam", "getParamNames", "hasParam", "searchParam"), node=False),
+    StockTool("record", ("getPublishedTopics",)),
+    StockTool("play", ()),
+)
+
+
+def stock_tool(caller_id: str) -> StockTool | None:
+    """Return the tool that calls under this name: `/rostopic`, `/rostopic_4711_1700000000000`, `/rosparam-4711`."""
+    key = key_of(caller_id)
+    own = key.removeprefix("/").removesuffix("_*").partition("-")[0]
+    if key == caller_id and not own.startswith("ros"):
+        return None  # a node with a usual name, such as /record
+    return next((tool for tool in _TOOLS if tool.name == own), None)
