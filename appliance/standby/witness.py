@@ -15,6 +15,8 @@ This file runs alone, with the standard library of Python 3.5 to 3.12 and the pr
 3. Every start waits one expiry before the first grant. After a reboot both appliances are shut out; a renewal of the
    holder admits it again, since no other appliance has had a grant.
 4. A damaged or missing lease shuts out both appliances, until an operator runs `begin`.
+5. A full disk prevents no change: the file of the lease keeps its size. Twice a minute another file beside it is
+   written, and each answer says why that failed: a disk that cannot be written would prevent the next takeover.
 
 The firewall translates one fixed address to the holder, and rejects all other traffic of the appliance that is not the
 holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
@@ -43,6 +45,7 @@ import stat
 import struct
 import subprocess
 import sys
+import threading
 import time
 from typing import Any, Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple
 
@@ -79,6 +82,8 @@ _CONFIDENCE = 0.9  # of the time that an answer has left
 _CLOCK_BOOTTIME = 7  # runs while the computer sleeps; Python 3.5 does not name it
 _MOST_FOLLOWERS = 32
 _LINES, _LINES_SECONDS = 20, 10.0
+_COPY = 4096  # bytes of each of the two copies of the lease: a block of the disk
+_DISK_SECONDS, _SLOW_SECONDS = 30.0, 5.0  # between two checks of the disk; that a write may take
 _ESTABLISHED = ("01", "04", "05", "06", "08")  # in /proc/net/tcp: all states in which the peer may still send
 _MAPPED = "0000000000000000FFFF0000"  # an IPv4 address in /proc/net/tcp6
 
@@ -157,7 +162,12 @@ def is_count(value: object) -> bool:
 
 
 class LeaseFile:
-    """The lease on the disk, which is replaced as a whole."""
+    """The lease on the disk: two copies in a file that keeps its size, so that no change needs free space.
+
+    A change overwrites the first copy, then the second one. A crash leaves at most one of them incomplete, and the
+    other one is right: the change was not answered before both were written. The file of an earlier version has one
+    copy; the first change replaces it.
+    """
 
     def __init__(self, path: str, names: Tuple[str, ...]) -> None:
         self.path = path
@@ -185,23 +195,39 @@ class LeaseFile:
         """Return the lease. Raises `WitnessError` if it is missing or damaged."""
         try:
             with open(self.path, "rb") as file:
-                content = file.read(4096)
-            code, _, text = content.partition(b"\n")
-            if code.decode("ascii") != hashlib.sha256(text).hexdigest():
-                raise ValueError("its checksum is wrong")
-            body = json.loads(text.decode("ascii"))
-            record = LeaseRecord(body["epoch"], body["holder"], tuple(body["in_sync"]), body["boot"])
-            if not (is_count(record.epoch) and record.in_sync and set(record.in_sync) <= set(self._names)):
-                raise ValueError("it does not fit the settings")
-            if record.holder and record.holder not in record.in_sync:
-                raise ValueError("its holder is not in sync")
+                content = file.read(2 * _COPY + 1)
+            if len(content) != 2 * _COPY:
+                return self._record(content)
+            try:
+                return self._record(content[:_COPY])
+            except (ValueError, KeyError, TypeError):
+                return self._record(content[_COPY:])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise WitnessError(
                 "the lease %s cannot be used: %s; both appliances are shut out. Run: witness.py begin --in-sync NAMES"
                 " --epoch N, with the appliances that have all data and an epoch greater than both appliances show"
                 % (self.path, error)
             ) from error
+
+    def _record(self, copy: bytes) -> LeaseRecord:
+        """Return the lease in a copy. Raises `ValueError`, `KeyError`, `TypeError`."""
+        code, _, text = copy.rstrip(b" ").partition(b"\n")
+        if code.decode("ascii") != hashlib.sha256(text).hexdigest():
+            raise ValueError("its checksum is wrong")
+        body = json.loads(text.decode("ascii"))
+        record = LeaseRecord(body["epoch"], body["holder"], tuple(body["in_sync"]), body["boot"])
+        if not (is_count(record.epoch) and record.in_sync and set(record.in_sync) <= set(self._names)):
+            raise ValueError("it does not fit the settings")
+        if record.holder and record.holder not in record.in_sync:
+            raise ValueError("its holder is not in sync")
         return record
+
+    def has_room(self) -> bool:
+        """Whether a change needs no free space."""
+        try:
+            return os.stat(self.path).st_size == 2 * _COPY
+        except OSError:
+            return False
 
     def write(self, record: LeaseRecord) -> None:
         """Save the lease. Raises `WitnessError` if the old one stays; any other error leaves it uncertain."""
@@ -212,24 +238,102 @@ class LeaseFile:
             "boot": record.boot,
         }
         text = json.dumps(body, sort_keys=True).encode("ascii")
-        content = hashlib.sha256(text).hexdigest().encode("ascii") + b"\n" + text
+        copy = (hashlib.sha256(text).hexdigest().encode("ascii") + b"\n" + text).ljust(_COPY)
+        if self.has_room():
+            self._overwrite(copy)
+        else:
+            self._replace(2 * copy)
+
+    def _overwrite(self, copy: bytes) -> None:
+        try:
+            descriptor = os.open(self.path, os.O_WRONLY)
+        except OSError as error:
+            raise self._unsaved(error) from error
+        try:
+            for offset in (0, _COPY):
+                if os.pwrite(descriptor, copy, offset) != _COPY:
+                    raise OSError("the lease %s was written in part" % self.path)
+                os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def _replace(self, content: bytes) -> None:
         folder, new = os.path.dirname(os.path.abspath(self.path)), self.path + ".new"
         try:
-            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-            try:
-                if os.write(descriptor, content) != len(content):
-                    raise OSError("the disk is full")
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(new)
+            write_synced(new, content)
         except OSError as error:
-            raise WitnessError("the lease %s cannot be saved: %s" % (self.path, error)) from error
+            with contextlib.suppress(OSError):
+                os.unlink(new)
+            raise self._unsaved(error) from error
         os.rename(new, self.path)
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+    def _unsaved(self, error: OSError) -> WitnessError:
+        return WitnessError("the lease %s cannot be saved: %s" % (self.path, error))
+
+
+def write_synced(path: str, content: bytes) -> None:
+    """Write a file, in place if it exists, and sync it to the disk. Raises `OSError`."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT, 0o600)
+    try:
+        if os.write(descriptor, content) != len(content):
+            raise OSError("the disk is full")
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class DiskCheck:
+    """The regular check that the disk of the lease can be written, in a thread: a slow disk delays no answer.
+
+    The check overwrites a file beside the lease, which keeps its size.
+    """
+
+    def __init__(self, lease: LeaseFile, clock: Callable[[], float]) -> None:
+        self._lease = lease
+        self._clock = clock
+        self._began = None  # type: Optional[float]
+        self._failure = ""
+
+    def start(self) -> None:
+        """Check until the process ends."""
+        threading.Thread(target=self._check_always, daemon=True).start()
+
+    def _check_always(self) -> None:
+        while True:
+            self.check()
+            select.select([], [], [], _DISK_SECONDS)
+
+    def check(self) -> None:
+        """Write the file."""
+        self._began = self._clock()
+        try:
+            write_synced(self._lease.path + ".check", b" " * _COPY)
+            self._failure = ""
+        except OSError as error:
+            self._failure = "the disk of the lease %s cannot be written: %s" % (
+                self._lease.path,
+                error.strerror or error,
+            )
+        self._began = None
+
+    def trouble(self) -> str:
+        """Return why a change of the lease would fail; an empty text: it would not."""
+        began = self._began
+        if began is not None and self._clock() - began > _SLOW_SECONDS:
+            return "the disk of the lease %s takes more than %d s for a write" % (
+                self._lease.path,
+                _SLOW_SECONDS,
+            )
+        if not (self._failure or self._lease.has_room()):
+            return "the file %s has no room for the next change: free space on its disk" % self._lease.path
+        return self._failure
 
 
 class Witness:
@@ -254,6 +358,7 @@ class Witness:
         self._boot = boot
         self._clock = clock
         self._expires = clock() + EXPIRY
+        self.trouble = ""  # why the next change of the lease would not be saved
         # Within one boot the rules of an earlier process stay, so that its end alone changes nothing.
         self.admitted = record.holder if record is not None and record.boot == boot else ""
         admit(self.admitted)
@@ -395,6 +500,7 @@ class WitnessGate:
             holder=record.holder if record is not None else "",
             in_sync=list(record.in_sync) if record is not None else [],
             expired=not self._witness.left(),
+            trouble=self._witness.trouble[:200].encode("ascii", "replace").decode("ascii"),
         )
         if name not in self._appliances:
             admitted = self._witness.admitted
@@ -982,6 +1088,8 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
         record=record, save=lease.write, admit=enforcement.admit, boot=boot, clock=time.monotonic
     )
     gate = WitnessGate(witness, settings.appliances, os.urandom(16).hex(), settings.followers)
+    disk = DiskCheck(lease, time.monotonic)
+    disk.start()
     with RequestSockets(settings.listen) as requests:
         log.add("the witness answers at %s:%d and uses %s" % (*settings.listen, backend))
         rejected = 0
@@ -990,9 +1098,23 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
                 for _ in range(most):
                     if not _answer_one(one, gate, requests):
                         break
-            if enforcement.go_on(witness.enforce_again) and gate.rejected > rejected:
+            if not enforcement.go_on(witness.enforce_again):
+                continue
+            _note_trouble(witness, lease, disk, log)
+            if gate.rejected > rejected:
                 log.add("%d requests without a valid authentication code" % (gate.rejected - rejected))
                 rejected = gate.rejected
+
+
+def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
+    """Keep why the next change of the lease would not be saved, for the answers; make room for it if there is none."""
+    if witness.record is not None and not lease.has_room():
+        with contextlib.suppress(WitnessError):  # reported as the trouble
+            lease.write(witness.record)
+    trouble = disk.trouble() if witness.record is not None else ""
+    if trouble != witness.trouble:
+        log.add(trouble or "the lease can be saved again")
+    witness.trouble = trouble
 
 
 class RequestSockets:

@@ -17,6 +17,7 @@ from appliance.standby.witness import (
     REQUEST,
     AppliancePeer,
     BoundedLog,
+    DiskCheck,
     LeaseFile,
     LeaseFirewall,
     LeaseRecord,
@@ -198,7 +199,7 @@ def test_an_answer_repeats_session_and_number() -> None:
     """It has the lease as it is after the request."""
     assert answered(Robot().expired(), request()) == {
         "boot": "nonce", "session": "mine", "number": 1, "ok": True, "reason": "", "epoch": 2, "holder": "a",
-        "in_sync": ["a", "b"], "expired": False,
+        "in_sync": ["a", "b"], "expired": False, "trouble": "",
     }  # fmt: skip
 
 
@@ -288,12 +289,59 @@ def test_a_request_to_an_earlier_start_changes_nothing() -> None:
 
 
 def test_the_lease_survives_on_the_disk(tmp_path: Path) -> None:
-    """It is replaced as a whole, and readable only by its owner."""
+    """It is readable only by its owner. A change needs no free space: the file stays, with its size."""
     file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    assert not file.has_room()
+    stats = []
     for record in (LeaseRecord(7, "a", ("a",), "x"), LeaseRecord(8, "b", BOTH, "x")):
         file.write(record)
         assert file.read() == record
-    assert (tmp_path / "lease").stat().st_mode & 0o777 == 0o600
+        stats.append((tmp_path / "lease").stat())
+    before, after = stats
+    assert (after.st_ino, after.st_size, after.st_mode & 0o777) == (before.st_ino, before.st_size, 0o600)
+
+
+@pytest.mark.parametrize(("end", "epoch"), [(0, 7), (100, 7), (4096, 8), (4196, 8), (8192, 8)])
+def test_a_crash_leaves_the_old_lease_or_the_new_one(tmp_path: Path, end: int, epoch: int) -> None:
+    """A change overwrites two copies in turn; `end` is where the power was cut."""
+    path, made = tmp_path / "lease", []
+    file = LeaseFile(str(path), BOTH)
+    for number in (7, 8):
+        file.write(LeaseRecord(number, "a" * (number == 8), BOTH, "x"))
+        made.append(path.read_bytes())
+    path.write_bytes(made[1][:end] + made[0][end:])
+    assert file.read().epoch == epoch
+
+
+def test_the_lease_of_an_earlier_version_is_read_and_gets_room(tmp_path: Path) -> None:
+    """The file had one copy and no padding."""
+    file, record = LeaseFile(str(tmp_path / "lease"), BOTH), LeaseRecord(7, "a", BOTH, "x")
+    file.write(record)
+    (tmp_path / "lease").write_bytes((tmp_path / "lease").read_bytes()[:4096].rstrip())
+    assert file.read() == record and not file.has_room()
+    file.write(record._replace(epoch=8))
+    assert file.read().epoch == 8 and file.has_room()
+
+
+def test_a_disk_that_cannot_be_written_is_reported_in_each_answer(tmp_path: Path) -> None:
+    """Before the next takeover needs it; also a disk that does not answer, and a file without room."""
+    now = [0.0]
+    file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    disk = DiskCheck(file, lambda: now[0])
+    assert "has no room for the next change" in disk.trouble()
+    file.write(FIRST)
+    disk.check()
+    assert disk.trouble() == ""
+    (tmp_path / "lease.check").unlink()
+    (tmp_path / "lease.check").symlink_to("/dev/full")
+    disk.check()
+    assert (
+        disk.trouble() == f"the disk of the lease {tmp_path}/lease cannot be written: No space left on device"
+    )
+    robot = granted()
+    robot.witness.trouble = disk.trouble()
+    answer = answered(robot, request(do="look", epoch=2))
+    assert answer is not None and answer["trouble"] == disk.trouble()
 
 
 @pytest.mark.parametrize(
