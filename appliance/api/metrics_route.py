@@ -203,6 +203,10 @@ def _standby(state: StandbyState | None) -> dict[str, _Samples]:
         "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
         "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
         "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
+        "rosrv_standby_other_witness_age_seconds": [((), seen)]
+        if (seen := other.witness_seconds) is not None
+        else [],
+        "rosrv_standby_witness_trouble": [((), bool(state.witness.trouble))],
         "rosrv_standby_both_active": [((), both_active(state))] if active else [],
         # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
         "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],

@@ -37,6 +37,10 @@ def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[Sta
         yield _away(state, lasting) if not other.connected else _behind(other, lasting)
     if is_silent(state.witness):
         yield _silent(state.witness)
+    elif is_blind(other):
+        yield _blind(state)
+    elif state.witness.trouble:
+        yield _unsaved(state.witness)
 
 
 def both_active(state: StandbyState) -> bool:
@@ -48,6 +52,11 @@ def both_active(state: StandbyState) -> bool:
 def is_silent(witness: WitnessSeen) -> bool:
     """Whether the witness does not answer."""
     return witness.answered_seconds is None or witness.answered_seconds >= SILENT_SECONDS
+
+
+def is_blind(other: OtherAppliance) -> bool:
+    """Whether the other appliance is connected, but the witness does not answer it."""
+    return other.connected and other.witness_seconds is not None and other.witness_seconds >= SILENT_SECONDS
 
 
 def lag_of(other: OtherAppliance) -> str:
@@ -104,3 +113,20 @@ def _silent(witness: WitnessSeen) -> StandbyTrouble:
         " systemctl status rosrv-witness"
     )
     return StandbyTrouble("warning", "witness-silent", text)
+
+
+def _blind(state: StandbyState) -> StandbyTrouble:
+    other, witness = state.other, state.witness
+    text = (
+        f"the witness on the robot ({witness.address}) has not answered the standby {other.name} ({other.address}) for"
+        f" {lasting(other.witness_seconds or 0)}, so the standby cannot take over; check the network between both"
+    )
+    return StandbyTrouble("alarm", "standby-blind", text)
+
+
+def _unsaved(witness: WitnessSeen) -> StandbyTrouble:
+    text = (
+        f"the witness on the robot ({witness.address}) could not save a takeover: {witness.trouble}; correct"
+        " that on the robot"
+    )
+    return StandbyTrouble("alarm", "witness-disk", text)

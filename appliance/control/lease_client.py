@@ -10,6 +10,7 @@ from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 
 _HAND_OVER_SECONDS = 5.0
+_SERVES_SECONDS = 0.5
 
 
 class HandOverError(Exception):
@@ -43,6 +44,12 @@ class LeaseClient:
         if self._present:
             self._present = False
             self.send(messages.ControlUnready())
+
+    async def report_service(self, obstacle: Callable[[], str]) -> None:
+        """Report until cancelled that this process serves, or why it cannot: if reports stop, it does not."""
+        while True:
+            self.send(messages.ControlServes(obstacle()))
+            await asyncio.sleep(_SERVES_SECONDS)
 
     def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
         """Call `changed` with the last report, if there is one, and with each later report."""

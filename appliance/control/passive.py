@@ -36,6 +36,7 @@ from appliance.standby.replica_sync import ReplicaSync
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_receiver import ReplicationReceiver
 from appliance.standby.replication_transport import follow_at
+from appliance.standby.witness import EXPIRY
 from appliance.store.state_file import SCHEMA
 from appliance.store.writer_thread import StoreError
 
@@ -131,11 +132,14 @@ class PassiveControl:
             self._complete = True
             self._state_presence()
 
+        reason = ""
         while True:
             try:
                 await self._replica_sync.run(lambda: self._receiver.followed, complete)
             except (StoreError, OSError) as error:
-                _log.error("the copy of the state is not on the disk", reason=str(error))
+                if reason != str(error):
+                    reason = str(error)
+                    _log.error("the copy of the state is not on the disk", reason=reason)
                 await asyncio.sleep(_AGAIN_SECONDS)
 
     @property
@@ -165,6 +169,7 @@ class PassiveControl:
             waiting_seconds=None,
             reason="" if self._connected else self._reason,
             trouble_seconds=None if self._connected else round(clock.now() - self._away_since, 3),
+            witness_seconds=None,
         )
         wait = self._settings.availability.wait
         return state_of(
@@ -181,6 +186,12 @@ class PassiveControl:
         """Ask the active appliance to hand over. Raises `HandOverError` if that is not possible now."""
         if self._check.obstacle:
             raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
+        lease = self._lease.state
+        if lease is None or lease.answered is None or clock.since_boot() - lease.answered > EXPIRY:
+            raise HandOverError(
+                f"the witness on the robot ({self._membership.witness}) does not answer this appliance, so it could not"
+                " take over; check the network between the two"
+            )
         try:
             await self._receiver.want_switchover()
         except ReplicationError as error:

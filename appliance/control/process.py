@@ -202,6 +202,18 @@ class _Control:
             "warnings": [str(warning) for warning in base.policies.current.warnings[:_WARNINGS]],
         }
         base.lifeline.say(messages.Ready(detail))
+        if base.pair is not None:
+            reports = run_always(
+                "the reports to the lease", partial(base.pair.lease.report_service, self._obstacle)
+            )
+            self._tasks.append(asyncio.get_running_loop().create_task(reports))
+
+    def _obstacle(self) -> str:
+        """Return why this appliance cannot serve now; empty: it can."""
+        failed = self._base.audit.failed
+        if failed is None or self._base.settings.audit.on_audit_failure != "deny":
+            return ""
+        return f"nothing is granted, because the audit log cannot be written: {failed}"
 
     async def end(self) -> None:
         base, parts, ends = self._base, self._parts, self._parts.endpoints

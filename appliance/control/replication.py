@@ -122,6 +122,7 @@ def state_of(
             else round(now - lease.answered, 3),
             holder=lease.holder if lease is not None else "",
             refusal=lease.refusal if lease is not None else "the process `lease` has not reported yet",
+            trouble=lease.trouble if lease is not None else "",
         ),
         obstacle=obstacle,
     )
@@ -151,8 +152,9 @@ class Replication:
     ) -> None:
         """`folder` is closed to other users: it gets the certificate and the key of the link.
 
-        After a takeover the earlier active appliance is away or still restarting, and the first answers would wait for
-        it in vain. So its removal is requested at once (`taken_over`).
+        After a takeover (`taken_over`) the earlier active appliance is away or still restarting, and the first answers
+        would wait for it in vain. So its removal is requested as soon as this appliance serves; until then, it may
+        take the lease back.
         """
         self._membership = membership
         self._lease = lease
@@ -168,7 +170,8 @@ class Replication:
         self._unserved = ""  # why no standby can connect
         self._trouble_since: float | None = None
         self.admission = RobotAdmission()
-        self._absent = taken_over and wait == "standby"
+        self._taken_over = taken_over and wait == "standby"
+        self._absent = False  # whether the first answers would wait for the other appliance in vain
         self._tasks: set[asyncio.Task[None]] = set()
         self._reported: messages.ReplicationReported | None = None
         lease.listen(self._lease_changed)
@@ -186,7 +189,7 @@ class Replication:
 
     async def run(self) -> None:
         """Serve the standby until cancelled. While the port is in use, try again."""
-        self._lease.present()
+        self.begin()
         loop = asyncio.get_running_loop()
         tasks = [
             loop.create_task(run_always("the report of the replication", self._report_always)),
@@ -198,6 +201,12 @@ class Replication:
         finally:
             for task in tasks:
                 task.cancel()
+
+    def begin(self) -> None:
+        """Report that nodes are served from now on."""
+        self._lease.present()
+        self._absent, self._taken_over = self._taken_over, False
+        self.report()
 
     def close(self) -> None:
         """Keep no further changes for the standby; a change that is not answered yet gets no answer."""
@@ -233,6 +242,7 @@ class Replication:
         """Return the state of both appliances."""
         lag, lease, now = self.sender.lag(), self._lease.state, asyncio.get_running_loop().time()
         waiting, trouble = lag.waiting_since, self._trouble_since
+        witnessed = lease.other_witnessed if lease is not None else None
         other = OtherAppliance(
             name=self._membership.other,
             address=self._membership.other_address,
@@ -243,6 +253,7 @@ class Replication:
             waiting_seconds=None if waiting is None else round(now - waiting, 3),
             reason="" if self._connected() else self._unserved or lag.reason or "it does not answer",
             trouble_seconds=None if trouble is None else round(now - trouble, 3),
+            witness_seconds=None if witnessed is None else round(clock.since_boot() - witnessed, 3),
         )
         return state_of(
             self._membership,
@@ -272,6 +283,9 @@ class Replication:
         obstacle = self.sender.lag().obstacle
         if obstacle:
             raise HandOverError(f"{self._membership.other} cannot take over: {obstacle}")
+        lease = self._lease.state
+        if lease is not None and lease.handover_obstacle:
+            raise HandOverError(lease.handover_obstacle)
 
     async def hand_over(self) -> None:
         """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""

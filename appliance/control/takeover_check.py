@@ -1,9 +1,9 @@
 """Check on a standby that control could start if this appliance took over now.
 
 The check calls the functions by which the start of control reads the stored policy, specifications, hosts and nodes,
-makes the certificate of the link and opens the port of the ROS master. It changes nothing. It runs at the start, when
-the active appliance brings another policy or other specifications into force, and every `_AGAIN_SECONDS`, because the
-appliance's own files and ports may change.
+makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of the state. It runs
+at the start, when the active appliance brings another policy or other specifications into force, and every
+`_AGAIN_SECONDS`, because the appliance's own files, disk and ports may change.
 
 While the check fails, this appliance does not claim the lease. It still follows the active appliance and promises not
 to claim, and stays in the in-sync set: once the cause is gone, it takes over with all data.
@@ -11,7 +11,10 @@ to claim, and stays in the in-sync set: once the cause is gone, it takes over wi
 
 import asyncio
 import contextlib
+import os
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import structlog
 
@@ -41,6 +44,7 @@ STATE_ERRORS = (PolicyRefusedError, SpecificationsRefusedError, StoreError, OSEr
 """The errors of a stored state or an own file that control cannot start with."""
 
 _AGAIN_SECONDS = 15.0
+_ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)
 
 _log = structlog.get_logger()
 
@@ -99,6 +103,7 @@ class TakeoverCheck:
     async def _load(self) -> None:
         """Read what a takeover reads. Raises any error that would end it."""
         settings = self._settings
+        await asyncio.to_thread(_require_room, self._folder)
         last = await asyncio.to_thread(self._load_state)
         await specifications_at_start(
             last,
@@ -131,3 +136,13 @@ class TakeoverCheck:
         if self._compiled is None or self._compiled[0] != sources:
             self._compiled = (sources, await self._compile(sources, site_keys))
         return self._compiled[1]
+
+
+def _require_room(folder: Path) -> None:
+    """Raise `OSError` if the disk of the state cannot take the first records and changes after a takeover."""
+    disk = os.statvfs(folder)
+    free = disk.f_bavail * disk.f_frsize
+    if free < _ROOM:
+        raise OSError(f"{folder}: {free} bytes are free on its disk, {_ROOM} are wanted: free space")
+    with tempfile.TemporaryFile(dir=folder) as file:  # it has no name, so nothing stays
+        file.write(b"\0")

@@ -15,6 +15,8 @@ This module reads no clock and no socket. Its owner passes the time with each me
    is none. A passive appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
 6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
    It waits for the standby again before it asks the witness to add it.
+7. The active appliance gives its lease up only if the other one could claim it at once: that one has all data and could
+   serve, the witness answers it, and can save the grant. Each promise has what the other one knows of this.
 """
 
 from collections.abc import Sequence
@@ -49,7 +51,10 @@ class WitnessRequest:
 
 @dataclass(frozen=True)
 class WitnessAnswer:
-    """An answer of the witness, with the lease after the request. `expired`: no appliance has renewed it in time."""
+    """An answer of the witness, with the lease after the request.
+
+    `expired`: no appliance has renewed it in time. `trouble`: why the witness could not save the next grant.
+    """
 
     ok: bool
     reason: str
@@ -57,6 +62,7 @@ class WitnessAnswer:
     holder: str
     in_sync: frozenset[str]
     expired: bool
+    trouble: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,11 +76,17 @@ class PromiseRequest:
 
 @dataclass(frozen=True)
 class ClaimPromise:
-    """The promise not to claim for one expiry; it repeats the request."""
+    """The promise not to claim for one expiry; it repeats the request.
+
+    `able`: the sender could serve after a takeover. `unheard`: the seconds since it sent the last request that the
+    witness answered. An appliance of an earlier version leaves both out.
+    """
 
     epoch: int
     session: str
     number: int
+    able: bool = True
+    unheard: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -110,6 +122,10 @@ class ApplianceLease:
         self._asked: dict[int, float] = {}
         self._number = 0
         self._started = self._heard = now - EXPIRY
+        self._witnessed_at = self._started  # sending time of the last request that the witness answered
+        self._trouble = ""
+        self._other_able = True
+        self._other_witnessed: float | None = None
         self._next_removal = now
         self._expired = False
         self._last_add = 0
@@ -131,6 +147,22 @@ class ApplianceLease:
     def heard(self) -> float | None:
         """Return the time of the last request of this appliance that the other one answered; None: no answer yet."""
         return self._heard if self._heard > self._started else None
+
+    @property
+    def other_witnessed(self) -> float | None:
+        """Return the time of the last answer of the witness to the other appliance, by its promises; None: unknown."""
+        return self._other_witnessed
+
+    def handover_obstacle(self, now: float) -> str:
+        """Return why the other appliance could not claim at once if this one gave the lease up; empty: it could."""
+        other = self._other
+        if self.answers_alone or now - self._heard > SILENCE:
+            return f"{other} is not ready to take over; wait until it answers and has all data"
+        if not self._other_able:
+            return f"{other} could not serve after a takeover; `rosrv standby status` there says why"
+        if self._other_witnessed is None or now - self._other_witnessed > EXPIRY:
+            return f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
+        return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
 
     def is_active(self, now: float) -> bool:
         """Whether this appliance may decide, relay and answer."""
@@ -188,7 +220,8 @@ class ApplianceLease:
 
     def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
         """Take an answer of the witness to a request of this process."""
-        self.refusal = answer.reason
+        self.refusal, self._trouble = answer.reason, answer.trouble
+        self._witnessed_at = max(self._witnessed_at, request.sent)
         if self.epoch and answer.epoch - self.epoch > FARTHEST:
             self.refusal = (
                 f"the witness has epoch {answer.epoch}, this appliance {self.epoch}: if an operator chose that of the"
@@ -236,10 +269,13 @@ class ApplianceLease:
                     self._promised_to = (
                         message  # an earlier request that arrives late is not the last promise
                     )
-                return (ClaimPromise(message.epoch, message.session, message.number),)
+                unheard = now - self._witnessed_at
+                return (ClaimPromise(message.epoch, message.session, message.number, self.ready, unheard),)
             case ClaimPromise(epoch, session, number):
                 asked = self._asked.get(number)
                 if session == self._session and epoch == self.held and asked is not None:
+                    if asked >= self._heard:
+                        self._other_able, self._other_witnessed = message.able, asked - message.unheard
                     self._heard = max(self._heard, asked)
                     if self.is_active(now) and number > self._void_number:
                         self._valid_until = max(self._valid_until, asked + CONFIDENCE)
@@ -260,10 +296,9 @@ class ApplianceLease:
         """Become passive, and let the other appliance claim at once. Raises `LeaseError`."""
         if not self.is_active(now):
             raise LeaseError("this appliance is not active; give the order to the other one")
-        if self.answers_alone or now - self._heard > SILENCE:
-            raise LeaseError(
-                f"{self._other} is not ready to take over; wait until it answers and has all data"
-            )
+        obstacle = self.handover_obstacle(now)
+        if obstacle:
+            raise LeaseError(obstacle)
         self._valid_until = now
         self._void_sequence, self._void_number = self._sequence, self._number
         self._switching_until, self._released = now + 2 * EXPIRY, False

@@ -4,8 +4,9 @@ The process does nothing else, so neither a busy nor a restarted control loses t
 the supervisor. If no further extension arrives, the supervisor ends the processes that serve the robot. So the
 appliance also becomes passive if this process hangs or dies. The epoch is on the disk before it is used.
 
-This appliance claims only while its control is present. If control is away for long, the other appliance takes over.
-The control of a standby also withdraws its presence while it could not serve (`control/takeover_check.py`).
+This appliance claims only while its control is present. The control of a standby also withdraws its presence while it
+could not serve (`control/takeover_check.py`). If the control of an active appliance does not serve
+(`service_watch.py`), the lease is given to the other appliance, provided that that one could claim and serve.
 """
 
 import asyncio
@@ -33,14 +34,15 @@ from appliance.standby.lease import (
 )
 from appliance.standby.membership import Membership, load_membership
 from appliance.standby.peer_link import PeerChannel
-from appliance.standby.witness import HIGHEST
+from appliance.standby.service_watch import ServiceWatch
+from appliance.standby.witness import HIGHEST, write_synced
 from appliance.standby.witness_link import WitnessChannel
 
 EPOCH = "epoch"
 _CONTROL_SECONDS = 1.0
-_AWAY_SECONDS = 10.0  # a killed control is back after a second
 _LARGEST = 2048
 _BATCH = 64  # datagrams between two ticks
+_EPOCH_BYTES = 32  # less than a sector of a disk, which is written as a whole or not at all
 
 _log = structlog.get_logger()
 
@@ -78,7 +80,7 @@ class LeaseProcess:
         self.asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._report = messages.ReplicationReported(0, False, None)
         self._present = False
-        self._absent_since = clock.since_boot()
+        self._service = ServiceWatch()
         self._permission = 0
         self._alone = False
         self._held = 0.0
@@ -122,17 +124,28 @@ class LeaseProcess:
                 current = False
         self._alone = lease.answers_alone
         lease.ready = self._present
-        if not self._present and now - self._absent_since > _AWAY_SECONDS and lease.is_active(now):
-            with contextlib.suppress(LeaseError):  # the other appliance is not ready, either
-                self._after(lease.switch_over(now))
+        self._give_away(now)
         caught_up = current and report.caught_up
         self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
+
+    def _give_away(self, now: float) -> None:
+        """Let the other appliance take over if this one holds the lease, but does not serve."""
+        fault = self._service.fault(now, active=self._lease.is_active(now))
+        if not fault:
+            return
+        with contextlib.suppress(LeaseError):  # the other appliance could not serve, either
+            due = self._lease.switch_over(now)
+            self._service.given_away()
+            _log.error(
+                "the lease is given to the other appliance, because this one does not serve", reason=fault
+            )
+            self._after(due)
 
     def _after(self, due: Outgoing) -> None:
         """Store the epoch, send what is due, and report the state."""
         epoch = self._lease.epoch
         if epoch != self._stored:
-            write_whole(self._epoch_file, f"{epoch}\n".encode(), 0o600)
+            store_epoch(self._epoch_file, epoch)
             self._stored = epoch
         for message in due:
             to = self._membership
@@ -200,6 +213,9 @@ class LeaseProcess:
             refusal=lease.refusal,
             answered=self._answered,
             heard=lease.heard,
+            other_witnessed=lease.other_witnessed,
+            handover_obstacle=lease.handover_obstacle(now) if active else "",
+            trouble=answer.trouble if answer is not None else "",
         )
         if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
             self._told, self._told_at = state, now
@@ -207,14 +223,11 @@ class LeaseProcess:
 
     def control_linked(self) -> None:
         """A new control waits for the standby until it gets a new permission."""
-        self._withdraw()
+        self._present = False
+        self._service.linked()
         self._report = messages.ReplicationReported(self._permission, False, None)
         self._told = None
         self._wake.set()
-
-    def _withdraw(self) -> None:
-        if self._present:
-            self._present, self._absent_since = False, clock.since_boot()
 
     def control_said(self, message: Any) -> None:
         """Take a message of control."""
@@ -226,7 +239,9 @@ class LeaseProcess:
             case messages.ControlPresent():
                 self._present = True
             case messages.ControlUnready():
-                self._withdraw()
+                self._present = False
+            case messages.ControlServes(obstacle):
+                self._service.reported(clock.since_boot(), obstacle)
             case messages.HandOverWanted():
                 self._hand_over()
             case _:
@@ -252,3 +267,12 @@ def stored_epoch(path: Path) -> int:
     if not text.isdecimal() or int(text) > HIGHEST:
         raise ValueError(f"{path} does not contain an epoch: rosrv standby repair")
     return int(text)
+
+
+def store_epoch(path: Path, epoch: int) -> None:
+    """Save the epoch; a file that exists is overwritten, which needs no free space. Raises `OSError`."""
+    content = f"{epoch:<{_EPOCH_BYTES - 1}}\n".encode()
+    if path.exists() and path.stat().st_size == _EPOCH_BYTES:
+        write_synced(str(path), content)
+    else:
+        write_whole(path, content, 0o600)

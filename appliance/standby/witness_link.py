@@ -26,6 +26,7 @@ class _AnswerBody(msgspec.Struct, frozen=True):
     holder: str = ""
     in_sync: frozenset[str] = frozenset()
     expired: bool = False
+    trouble: str = ""
 
 
 class WitnessChannel:
@@ -71,7 +72,9 @@ class WitnessChannel:
         if body.stale:
             self._boot, self._number = body.boot, max(self._number, body.last)
             return None
-        answer = WitnessAnswer(body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired)
+        answer = WitnessAnswer(
+            body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired, body.trouble
+        )
         return request, answer
 
 

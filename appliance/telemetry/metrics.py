@@ -157,6 +157,14 @@ METRICS = (
         "time since the last answer of the witness; +Inf if it never answered",
     ),
     _gauge(
+        "rosrv_standby_other_witness_age_seconds",
+        "time since the witness last answered the standby; only on the active appliance, once the standby has reported",
+    ),
+    _gauge(
+        "rosrv_standby_witness_trouble",
+        "1 while the witness could not save a takeover, such as on a disk that cannot be written",
+    ),
+    _gauge(
         "rosrv_standby_both_active",
         "1 while this appliance is active, but the witness names the other; only on the active appliance",
     ),

@@ -24,6 +24,12 @@ class OtherAppliance(msgspec.Struct, frozen=True):
         float | None,
         doc("how long it has been away, or (on the active appliance) not in sync; null: neither"),
     ]
+    witness_seconds: Annotated[
+        float | None,
+        doc(
+            "on the active appliance: seconds since the witness last answered the other one; null: not known"
+        ),
+    ]
 
 
 class WitnessSeen(msgspec.Struct, frozen=True):
@@ -33,6 +39,7 @@ class WitnessSeen(msgspec.Struct, frozen=True):
     answered_seconds: Annotated[float | None, doc("seconds since its last answer; null: it never answered")]
     holder: Annotated[str, doc("the appliance that has the lease; empty: none yet")]
     refusal: Annotated[str, doc("why it refused the last request; empty: it did not")]
+    trouble: Annotated[str, doc("why it could not save a takeover, such as a full disk; empty: it could")]
 
 
 class StandbyState(msgspec.Struct, frozen=True):

@@ -20,7 +20,9 @@ class LeaseState(Message):
     `until` is the time (seconds of CLOCK_BOOTTIME) to which this appliance may answer; 0: it is passive. `epoch` is the
     highest that it knows. `alone`: the witness has removed the other appliance from the in-sync set. `permission`
     counts these messages with `alone`. `answered` and `heard` are the times of the last answer of the witness and the
-    last message of the other appliance, None if there was none.
+    last message of the other appliance, None if there was none. `other_witnessed` is the time of the last answer of
+    the witness to the other appliance, None if that is unknown. `handover_obstacle` is why the other appliance could
+    not claim if this one gave the lease up now; `trouble` is why the witness could not save a takeover.
     """
 
     until: float
@@ -32,6 +34,9 @@ class LeaseState(Message):
     refusal: str
     answered: float | None
     heard: float | None
+    other_witnessed: float | None
+    handover_obstacle: str
+    trouble: str
 
 
 class HandOverAnswered(Message):
@@ -67,6 +72,12 @@ class ControlUnready(Message):
     """Control stands by, but could not serve: this appliance does not claim until the next `ControlPresent`."""
 
 
+class ControlServes(Message):
+    """Control of an active appliance serves the robot; with an obstacle: it runs, but cannot serve. Sent repeatedly."""
+
+    obstacle: str
+
+
 class HandOverWanted(Message):
     """Control has stored everything on the standby, and wants it to take over."""
 
@@ -78,5 +89,6 @@ LeaseLink = (
     | EpochSeen
     | ControlPresent
     | ControlUnready
+    | ControlServes
     | HandOverWanted
 )

@@ -71,6 +71,20 @@ def test_a_healthy_appliance_has_none() -> None:
         ("standby", PAIR | {"obstacle": "other keys"}, "standby-unready", "alarm", "system"),
         (
             "standby",
+            PAIR | {"other": {"connected": True, "witness_seconds": 5.0}},
+            "standby-blind",
+            "alarm",
+            "system",
+        ),
+        (
+            "standby",
+            PAIR | {"witness": {"answered_seconds": 0.1, "trouble": "full"}},
+            "witness-disk",
+            "alarm",
+            "system",
+        ),
+        (
+            "standby",
             PAIR | {"witness": {"answered_seconds": 0.1, "holder": "b"}},
             "both-active",
             "alarm",

@@ -196,10 +196,12 @@ def standby_samples(page: bytes) -> dict[str, float]:
 def test_two_appliances_are_measured() -> None:
     """The active appliance has the lag of the standby; a single appliance has no sample, so that no alert fires."""
     assert standby_samples(rendered(body(), CALLS)) == {}
-    other = {"name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400}
+    other = {
+        "name": "b", "connected": True, "behind_changes": 12, "behind_bytes": 3400, "witness_seconds": 7.5,
+    }  # fmt: skip
     state = example(
         StandbyState, name="a", role="active", epoch=4, other=other, obstacle="other keys",
-        witness={"answered_seconds": 0.25, "holder": "b"},
+        witness={"answered_seconds": 0.25, "holder": "b", "trouble": "full"},
     )  # fmt: skip
     answer = body()
     status = msgspec.structs.replace(answer.status, standby=state)
@@ -212,6 +214,8 @@ def test_two_appliances_are_measured() -> None:
         "behind_changes": 12,
         "behind_bytes": 3400,
         "witness_age_seconds": 0.25,
+        "other_witness_age_seconds": 7.5,
+        "witness_trouble": 1,
         "both_active": 1,
         "takeovers_total": 4,
     }
@@ -227,6 +231,7 @@ def test_a_standby_has_its_own_metrics() -> None:
         "connected": 0,
         "obstacle": 0,
         "witness_age_seconds": float("inf"),
+        "witness_trouble": 0,
         "takeovers_total": 4,
     }
     unknown = msgspec.structs.replace(state, epoch=0)

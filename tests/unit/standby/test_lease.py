@@ -130,9 +130,9 @@ def test_it_does_not_claim_while_its_promise_lasts() -> None:
     """A grant that is on its way waits until the promise ends."""
     lease = Lease().later(EXPIRY)
     claim = lease.request("claim")
-    assert list(lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))) == [
-        ClaimPromise(1, "theirs", 7)
-    ]
+    (promise,) = lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))
+    assert isinstance(promise, ClaimPromise)
+    assert (promise.epoch, promise.session, promise.number) == (1, "theirs", 7)
     assert lease.later(0.3).operations() == ["look"]
     lease.answered(claim)
     assert not lease.active()
@@ -357,6 +357,36 @@ def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
     with pytest.raises(LeaseError, match="b is not ready to take over"):
         lease.lease.switch_over(lease.now)
     assert lease.active()
+
+
+@pytest.mark.parametrize(
+    ("able", "silence", "trouble", "reason"),
+    [
+        (True, 0.3, "", ""),
+        (False, 0.3, "", "b could not serve after a takeover"),
+        (True, EXPIRY + 0.4, "", "the witness on the robot does not answer b"),
+        (True, 0.3, "the disk is full", "the witness could not save the takeover: the disk is full"),
+    ],
+)
+def test_a_lease_is_given_up_only_to_an_appliance_that_could_claim_it(
+    able: bool, silence: float, trouble: str, reason: str
+) -> None:
+    """The standby reports with each promise whether it could serve, and since when the witness is silent."""
+    standby = Lease().later(EXPIRY)
+    standby.answered(standby.request("claim"), ok=False, holder="a")
+    standby.lease.ready = able
+    lease = active_lease()
+    lease.answered(lease.later(0.3).request("renew"), trouble=trouble)
+    asked = asked_by(lease.later(0.3))
+    for promise in standby.lease.received(standby.later(silence).now, asked):
+        lease.lease.received(lease.now, promise)  # type: ignore[arg-type]  # a promise
+    assert reason in lease.lease.handover_obstacle(lease.now)
+    if reason:
+        with pytest.raises(LeaseError, match=reason):
+            lease.lease.switch_over(lease.now)
+    else:
+        lease.lease.switch_over(lease.now)
+    assert lease.active() == bool(reason)
 
 
 # ---- The datagrams

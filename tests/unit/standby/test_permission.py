@@ -107,7 +107,7 @@ class Pair:
             MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
         )
         self.lease.control_linked()
-        self.client.present()
+        self.control.begin()
 
     def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
         """Let one thing happen."""

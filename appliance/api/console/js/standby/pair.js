@@ -11,7 +11,7 @@ import { useStore } from "../store.js";
 import { SwitchOver } from "./switch.js";
 
 const SILENT = 5; // seconds, as in channel/standby_summary.py
-const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent"];
+const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent", "standby-blind", "witness-disk"];
 
 /** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */
 export function Pair({ state, orders = false }) {
@@ -41,6 +41,7 @@ function Name(/** @type {{name: string, address: string, more?: string}} */ { na
 function Follower(/** @type {{other: any, obstacle: string}} */ { other, obstacle }) {
   if (!other.connected) return html`<${Away} other=${other} />`;
   if (obstacle) return html`<${Obstacle} text=${obstacle} />`;
+  if (other.witness_seconds >= SILENT) return html`<${Obstacle} text=${`the witness has not answered it for ${lasting(other.witness_seconds)}`} />`;
   if (other.in_sync) return html`<${Badge} word="in sync" tone="allow" /><div class="muted small">can take over</div>`;
   const lag = other.behind_changes ? `${counted(other.behind_changes, "change")}, ${counted(other.behind_bytes, "byte")}` : "the last changes";
   return html`<${Badge} word="behind" tone="warn" /><div class="muted small">lacks ${lag}; cannot take over</div>`;

@@ -1,0 +1,68 @@
+"""Judge whether the control of an active appliance serves the robot, by its reports and by times alone.
+
+An appliance that holds the lease and does not serve is worse than none: the other one sees a healthy holder. So the
+lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready after a start.
+
+The first start after a takeover has `START_SECONDS`. Each time that the lease is given away, all limits are doubled
+until this appliance has served for a minute: two appliances on busy machines must not pass the lease back and forth.
+"""
+
+from appliance.standby.witness import EXPIRY
+
+OBSTACLE_SECONDS = EXPIRY  # a log that another process locks for a moment is no obstacle
+SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
+START_SECONDS = 5.0
+_STEADY_SECONDS = 60.0
+_MOST_DOUBLINGS = 5
+
+
+class ServiceWatch:
+    """The reports of control while this appliance is active."""
+
+    def __init__(self) -> None:
+        self._active = False
+        self._linked = False
+        self._served = 0.0  # time of the last report without an obstacle; at first of the activation
+        self._steady_since: float | None = None
+        self._serves = False  # whether the present control has served
+        self._obstacle = ""
+        self._obstacle_since = 0.0
+        self._doublings = 0
+
+    def linked(self) -> None:
+        """Note that control has a new link, or none."""
+        self._serves, self._obstacle = False, ""
+
+    def reported(self, now: float, obstacle: str) -> None:
+        """Take a report of control; an empty obstacle: it serves."""
+        if not obstacle:
+            self._served, self._serves = now, True
+            self._steady_since = now if self._steady_since is None else self._steady_since
+            if now - self._steady_since > _STEADY_SECONDS:
+                self._doublings = 0
+        else:
+            self._steady_since = None
+            self._obstacle_since = self._obstacle_since if self._obstacle else now
+        self._obstacle = obstacle
+
+    def fault(self, now: float, *, active: bool) -> str:
+        """Return why the lease should be given away; empty: it should not."""
+        if active and not self._active:
+            self._served, self._steady_since = now, None
+            self.linked()
+        self._active = active
+        if not active:
+            return ""
+        scale = 1 << self._doublings
+        if self._obstacle:
+            late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
+            return self._obstacle if late else ""
+        silent = now - self._served
+        if silent <= scale * (SILENT_SECONDS if self._serves else START_SECONDS):
+            return ""
+        what = "has not reported" if self._serves else "has not been ready"
+        return f"control {what} for {silent:.1f} s"
+
+    def given_away(self) -> None:
+        """Note that the lease was given away."""
+        self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)

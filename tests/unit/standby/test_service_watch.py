@@ -1,0 +1,60 @@
+"""Tests of `appliance.standby.service_watch`: when an active appliance does not serve."""
+
+from appliance.standby.service_watch import (
+    OBSTACLE_SECONDS,
+    SILENT_SECONDS,
+    START_SECONDS,
+    ServiceWatch,
+)
+
+
+def serving() -> ServiceWatch:
+    """Return the watch of an appliance that is active at 100 s, and serves from 102 s on."""
+    watch = ServiceWatch()
+    assert watch.fault(100.0, active=True) == ""
+    watch.linked()
+    watch.reported(102.0, "")
+    return watch
+
+
+def test_a_start_has_some_seconds() -> None:
+    """After that, another appliance should serve. A passive appliance owes nothing."""
+    watch = ServiceWatch()
+    assert watch.fault(90.0, active=False) == watch.fault(100.0, active=True) == ""
+    assert watch.fault(100.0 + START_SECONDS, active=True) == ""
+    assert watch.fault(100.1 + START_SECONDS, active=True) == "control has not been ready for 5.1 s"
+    assert watch.fault(200.0, active=False) == ""
+
+
+def test_a_control_that_hangs_and_one_that_starts_again() -> None:
+    """A hanging control is noticed before the supervisor kills it; a killed one has the time of a start."""
+    watch = serving()
+    assert watch.fault(102.0 + SILENT_SECONDS, active=True) == ""
+    assert watch.fault(102.1 + SILENT_SECONDS, active=True) == "control has not reported for 4.1 s"
+    watch.linked()
+    assert watch.fault(102.0 + START_SECONDS, active=True) == ""
+    assert "not been ready" in watch.fault(102.1 + START_SECONDS, active=True)
+
+
+def test_an_obstacle_that_lasts() -> None:
+    """A full disk is reported again and again; one that ends in time changes nothing."""
+    watch = serving()
+    for now in (103.0, 102.9 + OBSTACLE_SECONDS):
+        watch.reported(now, "full")
+        assert watch.fault(now, active=True) == ""
+    assert watch.fault(103.1 + OBSTACLE_SECONDS, active=True) == "full"
+    watch.reported(105.0, "")
+    assert watch.fault(105.0, active=True) == ""
+
+
+def test_two_appliances_do_not_pass_the_lease_back_and_forth() -> None:
+    """Each time, the limits are doubled, until this appliance has served for a minute."""
+    watch = serving()
+    watch.given_away()
+    for active in (False, True):
+        assert watch.fault(200.0, active=active) == ""
+    assert watch.fault(200.0 + 2 * START_SECONDS, active=True) == ""
+    assert watch.fault(200.1 + 2 * START_SECONDS, active=True)
+    for now in range(210, 280):
+        watch.reported(float(now), "")
+    assert watch.fault(279.1 + SILENT_SECONDS, active=True)
