@@ -23,6 +23,9 @@ fi
 for file in witness.py witness.json remove.sh rosrv-witness-shut.service "$unit.service"; do
     [ -s "$file" ] || die "$file is missing: copy the whole folder of the kit"
 done
+# A small installation of Python lacks modules; the services would then never start.
+said=$(/usr/bin/python3 -I witness.py --help 2>&1) \
+    || die "/usr/bin/python3 cannot run witness.py ($(echo "$said" | tail -n 1)): sudo apt install python3"
 
 # A file is complete before it gets its name: a boot after a power cut must find the boot rule.
 put() {

@@ -241,6 +241,16 @@ def test_an_incomplete_kit_changes_nothing(site: RobotSite) -> None:
     assert site.robot.run("test", "-e", "/etc/rosrv/witness.py", check=False).returncode
 
 
+def test_a_python_that_cannot_run_the_program_changes_nothing(site: RobotSite) -> None:
+    """A small installation lacks modules such as hmac; the error names the module and the remedy."""
+    program = site.kit / "witness" / "witness.py"
+    program.write_text("import hmac_that_is_missing\n" + program.read_text())
+    done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
+    assert done.returncode == 1 and "No module named 'hmac_that_is_missing'" in done.stderr
+    assert "sudo apt install python3" in done.stderr
+    assert site.robot.run("test", "-e", "/etc/rosrv/witness.py", check=False).returncode
+
+
 def test_damaged_settings_can_be_removed(site: RobotSite) -> None:
     """The rules go, although the program cannot read its settings."""
     robot = site.robot
