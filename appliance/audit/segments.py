@@ -16,7 +16,7 @@ Invariants:
 
 import hashlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Annotated, NamedTuple, Protocol
 
@@ -193,13 +193,13 @@ def _line(columns: StoredColumns, previous: bytes, digest: bytes, end: SignedChe
 
 
 class SegmentReader:
-    """A reader that verifies a segment with the raw public key `key`, and yields its records; iterate once.
+    """A reader that verifies a segment with one of the raw public keys `keys`, and yields its records; iterate once.
 
     `most_bytes` is the largest segment. Iteration raises `SegmentError`, and what reading `file` raises. A record that
     was yielded is proven only when the iteration has ended; `summary` is available then.
     """
 
-    def __init__(self, file: LineReader, key: bytes, most_bytes: int) -> None:
+    def __init__(self, file: LineReader, keys: Collection[bytes], most_bytes: int) -> None:
         """Read and verify the header. Raises `SegmentError`."""
         self._file = file
         self._left = most_bytes
@@ -209,7 +209,7 @@ class SegmentReader:
         try:
             self.header = msgspec.json.decode(line, type=SegmentHeader)
             wrong = (
-                "not in its one valid spelling" if self.header.line() != line else _fault(self.header, key)
+                "not in its one valid spelling" if self.header.line() != line else _fault(self.header, keys)
             )
         except _NOT_A_RECORD as error:
             wrong = str(error)
@@ -269,15 +269,19 @@ class SegmentReader:
         return self._done.summary(self.header)
 
 
-def _fault(header: SegmentHeader, key: bytes) -> str | None:
-    """Return why the checkpoints are not two consecutive ones of a log that `key` signed, or None."""
+def _fault(header: SegmentHeader, keys: Collection[bytes]) -> str | None:
+    """Return why the checkpoints are not two consecutive ones of a log that one of `keys` signed, or None."""
     begin, end = header.begin, header.end
     if header.segment != 1:
         return f"version {header.segment} is not known; update the collector"
+    known = sorted(key.hex() for key in keys)
+    if end.key not in known:
+        return f"checkpoint {end.number} is signed with {end.key[:64]}, expected is {' or '.join(known)}"
+    key = bytes.fromhex(end.key)
     for checkpoint in filter(None, (begin, end)):
         name = f"checkpoint {checkpoint.number}"
-        if checkpoint.key != key.hex():
-            return f"{name} is signed with {checkpoint.key[:64]}, expected is {key.hex()}"
+        if checkpoint.key != end.key:
+            return f"{name} is signed with {checkpoint.key[:64]}, expected is {end.key}"
         signature = bytes.fromhex(checkpoint.signature)
         if signature.hex() != checkpoint.signature or not signature_is_valid(
             key, signature, checkpoint.text()

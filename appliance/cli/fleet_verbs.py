@@ -28,7 +28,7 @@ from appliance.configuration.fleet_membership import (
     settings_of,
 )
 from appliance.ipsec.signer import PUBLIC_KEY_FILE
-from appliance.signing.own_certificate import make_own_certificate
+from appliance.signing.own_certificate import make_own_certificate, untimely
 from appliance.supervisor.users import account_of
 from rosmop.tool.terminal import refused, say
 
@@ -150,8 +150,12 @@ def _prepared(folder: Path, invitation: Invitation) -> str:
 
 
 def _is_for(folder: Path, token: str) -> bool:
-    """Whether `folder` has the key and the certificate of an earlier try with this token. Raises `OSError`."""
+    """Whether `folder` has the key and a certificate of an earlier try with this token. Raises `OSError`.
+
+    A certificate that is not valid now was made before the clock was corrected: no collector has enrolled it.
+    """
     try:
-        return (folder / _USED_FOR).read_text(encoding="ascii") == token
-    except FileNotFoundError:
+        same = (folder / _USED_FOR).read_text(encoding="ascii") == token
+        return same and not untimely((folder / CERTIFICATE).read_bytes(), "this machine")
+    except (FileNotFoundError, ValueError):
         return False

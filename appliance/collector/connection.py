@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import httpcore
 
 from appliance.base import clock
-from appliance.base.input_files import path_for_library
+from appliance.base.input_files import path_for_library, read_given
+from appliance.signing.own_certificate import untimely
 
 _EXCHANGE_SECONDS = 60.0  # a collector answers late when a thousand robots ask at once
 _SILENT_SECONDS = 90.0  # the collector sends a comment on the event stream every 30 s
@@ -25,9 +26,11 @@ _SLOWEST_UPLOAD = 16_384  # bytes per second
 _PART = 16_384  # of a write: the deadline is checked between the parts
 _LARGEST_ANSWER = 65_536
 _LONGEST_TAG = 200
+_LONGEST_CERTIFICATE = 1 << 20
 _LONGEST_REASON = 500
 _NOT_MODIFIED = 304
 _EXPECTED = (200, 201, 204)
+_UNTIMELY = (9, 10)  # OpenSSL: a certificate is not yet valid, or has expired
 _FAILURES = (httpcore.TimeoutException, httpcore.NetworkError, httpcore.ProtocolError, OSError)
 
 
@@ -141,9 +144,16 @@ class CollectorConnection:
             ) as answer:
                 yield answer
         except _FAILURES as error:
-            reason = str(error) or "the connection ended"
+            reason, cause = str(error) or "the connection ended", error.__cause__
             if isinstance(error, httpcore.TimeoutException):
                 reason = f"the collector takes more than {self._deadline.seconds:g} s"
+            elif isinstance(cause, ssl.SSLCertVerificationError) and cause.verify_code in _UNTIMELY:
+                reason += f"; the clock of this machine shows {clock.utc_now():%Y-%m-%d %H:%M} UTC"
+            elif isinstance(error, httpcore.RemoteProtocolError) or "alert" in reason:
+                reason += (
+                    "; if it answers other robots, it rejects this certificate: see 'rosrv-fleet robot list', and"
+                    " compare the clocks"
+                )
             raise CollectorError(f"{self.url}/{path.partition('?')[0]}: {reason}") from error
 
     def _connected(self) -> httpcore.HTTPConnection:
@@ -276,13 +286,21 @@ def trusting_context(ca: Path) -> ssl.SSLContext:
 
 
 def robot_context(ca: Path, certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return the TLS context of a robot: it trusts only `ca`, and presents `certificate`. Raises `OSError`."""
+    """Return the TLS context of a robot: it trusts only `ca`, and presents `certificate`.
+
+    Raises `OSError`, and `CollectorError` for a certificate that is not valid now.
+    """
     context = trusting_context(ca)
     try:
         with path_for_library(certificate) as chain, path_for_library(key) as private:
             context.load_cert_chain(chain, private)
     except OSError as error:
         raise OSError(error.errno, f"cannot be used: {error.strerror or error}", str(certificate)) from error
+    fault = untimely(read_given(certificate, _LONGEST_CERTIFICATE), "this machine")
+    if fault:
+        raise CollectorError(
+            f"{certificate}: {fault}: correct the clock, or join again with a new invitation"
+        )
     return context
 
 

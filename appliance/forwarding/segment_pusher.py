@@ -9,6 +9,8 @@ Invariants:
    segment is harmless.
 5. Records that retention removed before they had a receipt are counted and reported (`missed`).
 6. If the log was restored from a copy, pushing continues from the last checkpoint that both have.
+7. While nothing waits, the robot states so every minute (`idle`): a robot without records is not a silent one. It does
+   not while a checkpoint waits for its signature or for a receipt. A standby that has no log yet is also idle.
 """
 
 import gzip
@@ -34,6 +36,8 @@ from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 
 _IDLE_SECONDS = 1.0
+_PRESENCE_SECONDS = 60.0
+_NO_LOG = "0" * 32
 _FIRST_PAUSE = 0.5
 _LONGEST_PAUSE = 60.0
 _LONGEST_ASKED = 3600.0
@@ -72,13 +76,13 @@ class SegmentPusher:
     clock: Callable[[], int] = clock.wall_ns
     progress: ForwardingReported = field(default_factory=ForwardingReported)
     _position: PushPosition | None = None
+    _presence_due: float = 0.0
     _failures: int = 0
 
     def step(self) -> float:
         """Push the next segment; return the seconds to wait before the next call."""
         try:
-            position = self._position or self._begin()
-            more = self._push_next(position)
+            more = self._push_next() if self._has_log() else self._state_presence(PushPosition(_NO_LOG))
         except (CollectorError, LogUnreadableError, OSError, ValueError) as error:
             return self._failed(error)
         if self._failures:
@@ -122,7 +126,28 @@ class SegmentPusher:
             return 0
         return kept.sequence if (kept.log, kept.number) == (log, number) else 0
 
-    def _push_next(self, position: PushPosition) -> bool:
+    def _has_log(self) -> bool:
+        """Whether there is a log, or was: only an appliance that was never active has none."""
+        return self.log.exists() or (self.folder / "position.json").exists()
+
+    def _state_presence(self, position: PushPosition) -> bool:
+        """State that nothing waits, unless that was stated lately; return False.
+
+        If the collector lacks the last segment, pushing begins again. Raises `CollectorError` and `ValueError`.
+        """
+        now = clock.now()
+        if now < self._presence_due:
+            return False
+        asked = f"v1/logs/{position.log}?upto={position.number}&idle=true"
+        head = msgspec.json.decode(self.collector.get(asked), type=StoredHead)
+        self._presence_due = now + _PRESENCE_SECONDS * (0.8 + 0.4 * self.jitter())
+        if head.number != position.number or (head.number and not head.hashes):
+            self._position = None
+        self.progress = msgspec.structs.replace(self.progress, trouble="")
+        return False
+
+    def _push_next(self) -> bool:
+        position = self._position or self._begin()
         log, _newest = _newest_signed(self.log)
         if log != position.log:
             self._position = None
@@ -134,7 +159,7 @@ class SegmentPusher:
             number = next_segment(self.log, position.number)
         if number is None:
             self._look(position)
-            return False
+            return self._state_presence(position)
         file = self.folder / "segment.gz"
         summary = self._write(file, number)
         if summary is None:

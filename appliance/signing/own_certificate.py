@@ -1,4 +1,7 @@
-"""Make a key and a certificate that is its own authority, for peers that trust exactly this certificate."""
+"""Make a key and a certificate that is its own authority, for peers that trust exactly this certificate.
+
+`untimely` compares the times of a certificate with the clock: a wrong clock is the usual reason why TLS rejects one.
+"""
 
 import datetime
 import ipaddress
@@ -43,3 +46,18 @@ def make_own_certificate(name: str, days: int, address: str | None = None) -> tu
         builder = builder.add_extension(extension, critical)
     certificate = builder.sign(private, hashes.SHA256()).public_bytes(Encoding.PEM)
     return private.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), certificate
+
+
+def untimely(pem: bytes, whose_clock: str) -> str:
+    """Return when a certificate (PEM) is valid and what the clock shows, if it is not valid now; empty if it is.
+
+    Raises `ValueError` for anything else than a certificate.
+    """
+    certificate, now = x509.load_pem_x509_certificate(pem), clock.utc_now()
+    begins, ends = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+    if begins <= now <= ends:
+        return ""
+    return (
+        f"the certificate is valid from {begins:%Y-%m-%d} to {ends:%Y-%m-%d}, and the clock of {whose_clock} shows"
+        f" {now:%Y-%m-%d %H:%M} UTC"
+    )

@@ -225,7 +225,7 @@ ROLES = (
     ),
     _ours(
         "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
-        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api",
+        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api", stands_by=True,
         inputs=lambda facts: facts.fleet_reads,
         sandbox=lambda facts: SandboxPlan(
             allowlist=True,

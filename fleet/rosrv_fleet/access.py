@@ -7,7 +7,8 @@ from collections.abc import Awaitable, Callable
 
 from fastapi import HTTPException, Request
 
-from rosrv_fleet.robots import Robot, Robots
+from rosrv_fleet.enrolment import Robot
+from rosrv_fleet.robots import Robots
 from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 
 PEER_CERTIFICATE = "peer_certificate"
@@ -29,11 +30,17 @@ def name_of(
     return named
 
 
+def certificate_of(request: Request) -> bytes | None:
+    """Return the verified client certificate (DER) of a request, if there is one."""
+    found: bytes | None = request.scope.get("state", {}).get(PEER_CERTIFICATE)
+    return found
+
+
 def robot_of(robots: Robots) -> Callable[[Request], Awaitable[Robot]]:
     """Return the dependency that identifies a robot; it answers 403 for any other caller."""
 
     async def identify(request: Request) -> Robot:
-        certificate = request.scope.get("state", {}).get(PEER_CERTIFICATE)
+        certificate = certificate_of(request)
         robot = None if certificate is None else robots.with_certificate(certificate)
         if robot is None:
             raise HTTPException(

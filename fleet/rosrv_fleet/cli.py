@@ -15,30 +15,30 @@ import typer
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import printable
 from appliance.base.timestamps import TimestampError
-from appliance.configuration.fleet_membership import Invitation
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
 from rosrv_fleet.config import FleetConfigError, load_config
 from rosrv_fleet.database import migrate
+from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.evidence.commands import evidence
 from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.filtering import searched
 from rosrv_fleet.indexer import NOT_INDEXABLE, index
-from rosrv_fleet.invitations import Invitations
+from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import configure_log
 from rosrv_fleet.receipt_key import ReceiptKeyError, make_receipt_key
-from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots, check_name, make_folder
+from rosrv_fleet.robot_commands import robot_app
+from rosrv_fleet.robots import Robots, make_folder
 from rosrv_fleet.rollouts.commands import rollout
 from rosrv_fleet.search import LARGEST_FLEET_PAGE, IndexDownError, SearchTooLongError, search_fleet
 from rosrv_fleet.search_sql import FleetFilter
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.server import serve
-from rosrv_fleet.server_certificate import ServerCertificateError, authority_of, make_certificate, url_of
+from rosrv_fleet.server_certificate import ServerCertificateError, make_certificate
 from rosrv_fleet.tokens import FleetRole, OperatorTokens, TokenError
 from rosrv_fleet.verification import LogProof, prove
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
-robot_app = typer.Typer(no_args_is_help=True, help="Enrol robots, renew and remove them.")
 token_app = typer.Typer(no_args_is_help=True, help="Make and remove tokens of operators.")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
@@ -50,15 +50,6 @@ _ERRORS = (
     SearchTooLongError, IndexDownError, OSError, ssl.SSLError, psycopg.Error,
 )  # fmt: skip
 _MOST_WAITING = 1000
-_LONGEST_HOURS = 24.0 * 30
-Config = Annotated[
-    Path, typer.Option("--config", envvar="ROSRV_FLEET_CONFIG", help="The collector's configuration file")
-]
-_DEFAULT = Path("/etc/rosrv-fleet/fleet.yaml")
-Name = Annotated[str, typer.Argument(help="Name of the robot")]
-InGroup = Annotated[str, typer.Option("--group", metavar="SITE/GROUP", help="Its robot group, for bundles")]
-Certificate = Annotated[Path, typer.Option("--certificate", help="The robot's client certificate (PEM)")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
 
 
 def main() -> None:
@@ -78,7 +69,7 @@ def init(
         str | None,
         typer.Option("--address", help="IP address at which robots reach the collector, for its certificate"),
     ] = None,
-    config: Config = _DEFAULT,
+    config: Config = DEFAULT_CONFIG,
 ) -> None:
     """Prepare the data folder, the collector's certificate and keys, and the database. Repeating it is harmless.
 
@@ -98,7 +89,7 @@ def init(
 
 
 @app.command("serve")
-def serve_collector(config: Config = _DEFAULT) -> None:
+def serve_collector(config: Config = DEFAULT_CONFIG) -> None:
     """Run the collector until a signal ends it.
 
     Example: rosrv-fleet serve --config fleet.yaml
@@ -106,127 +97,11 @@ def serve_collector(config: Config = _DEFAULT) -> None:
     serve(make_collector(load_config(config)))
 
 
-@robot_app.command("invite")
-def invite_robots(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of the robots")],
-    group: InGroup = "",
-    hours: Annotated[
-        float,
-        typer.Option("--hours", min=0.01, max=_LONGEST_HOURS, help="Hours until the invitations expire"),
-    ] = 24.0,
-    config: Config = _DEFAULT,
-) -> None:
-    """Print an invitation for each robot, one a line. A robot uses it once: `rosrv fleet join FILE`.
-
-    A newer invitation replaces an earlier one. For an enrolled robot, a join replaces its certificate; without --group
-    it keeps its group.
-
-    Example: rosrv-fleet robot invite arm7 --group site-a/arms > arm7.json
-    """
-    found = load_config(config)
-    if group:
-        RobotGroup.parse(group)
-    for name in names:
-        check_name(name)
-    collector, authority = url_of(found), authority_of(found.certificate)
-    receipt_key = make_receipt_key(found.data).read_text(encoding="ascii")
-    invitations = Invitations(found.data / "invitations")
-    enrolled = Robots(found.data / "robots").known()
-    for name in names:
-        own = group or (enrolled[name].group if name in enrolled else "")
-        pending, token = invitations.add(name, group, hours * 3600.0)
-        invitation = Invitation(
-            robot=name, group=own, collector=collector, authority=authority, receipt_key=receipt_key, token=token,
-            expires=pending.expires,
-        )  # fmt: skip
-        typer.echo(msgspec.json.encode(invitation).decode())
-
-
-@robot_app.command("add")
-def add_robot(
-    name: Name,
-    key: Annotated[Path, typer.Option("--key", help="The robot's control/audit.pub (PEM)")],
-    certificate: Certificate,
-    group: InGroup = "",
-    config: Config = _DEFAULT,
-) -> None:
-    """Enrol a robot: pin the key of its audit log, its client certificate and its group. No restart is needed.
-
-    A robot without a group gets no bundles.
-
-    Example: rosrv-fleet robot add arm7 --key arm7-audit.pub --certificate arm7.pem --group site-a/arms
-    """
-    robots, _invitations = _robots(config)
-    robot = robots.add(name, key.read_bytes(), certificate.read_bytes(), group)
-    typer.echo(f"{robot.name} is enrolled: log key {robot.key}, certificate SHA-256 {robot.fingerprint}")
-
-
-@robot_app.command("group")
-def move_robot(
-    name: Name,
-    group: Annotated[str, typer.Argument(metavar="SITE/GROUP", help="Its robot group, for bundles")],
-    config: Config = _DEFAULT,
-) -> None:
-    """Move a robot to a group: the robot then gets the bundles, and counts in the rollouts, of this group only.
-
-    Example: rosrv-fleet robot group arm7 site-a/arms
-    """
-    robots, _invitations = _robots(config)
-    robot = robots.move(name, group)
-    typer.echo(f"{robot.name} is in {robot.group}")
-
-
-@robot_app.command("renew")
-def renew_robot(name: Name, certificate: Certificate, config: Config = _DEFAULT) -> None:
-    """Replace a robot's client certificate. The earlier certificate and an invitation are rejected from now on.
-
-    Example: rosrv-fleet robot renew arm7 --certificate arm7-2027.pem
-    """
-    robots, invitations = _robots(config)
-    robots.named(name)
-    invitations.withdraw(name)  # first: otherwise the robot could join in between
-    robot = robots.renew(name, certificate.read_bytes())
-    typer.echo(f"{robot.name}: certificate SHA-256 {robot.fingerprint}")
-
-
-@robot_app.command("remove")
-def remove_robot(name: Name, config: Config = _DEFAULT) -> None:
-    """Reject a robot and its invitation from now on. Its segments stay and are still verified.
-
-    Example: rosrv-fleet robot remove arm7
-    """
-    robots, invitations = _robots(config)
-    robots.named(name)
-    invitations.withdraw(name)  # first: otherwise the robot could join in between
-    robots.remove(name)
-    typer.echo(f"{name} may connect no more; its segments stay")
-
-
-@robot_app.command("list")
-def list_robots(config: Config = _DEFAULT, *, as_json: Json = False) -> None:
-    """List the robots with their groups and certificates. Exit status 1 if the file of a robot is unreadable.
-
-    Example: rosrv-fleet robot list
-    """
-    robots, _invitations = _robots(config)
-    for robot in robots.known().values():
-        state = "enrolled" if robot.removed is None else "removed"
-        fields = {"name": robot.name, "state": state, "group": robot.group}
-        fields |= {"key": robot.key, "certificate": robot.fingerprint}
-        typer.echo(json.dumps(fields) if as_json else "  ".join(word or "-" for word in fields.values()))
-    raise typer.Exit(1 if robots.unreadable else 0)
-
-
-def _robots(config: Path) -> tuple[Robots, Invitations]:
-    data = load_config(config).data
-    return Robots(data / "robots"), Invitations(data / "invitations")
-
-
 @token_app.command("add")
 def add_token(
     name: Annotated[str, typer.Argument(help="Name of the holder")],
     role: Annotated[FleetRole, typer.Option("--role", help="The rights of the holder")] = FleetRole.VIEWER,
-    config: Config = _DEFAULT,
+    config: Config = DEFAULT_CONFIG,
 ) -> None:
     """Make a token and print it once.
 
@@ -237,7 +112,7 @@ def add_token(
 
 @token_app.command("remove")
 def remove_token(
-    name: Annotated[str, typer.Argument(help="Name of the holder")], config: Config = _DEFAULT
+    name: Annotated[str, typer.Argument(help="Name of the holder")], config: Config = DEFAULT_CONFIG
 ) -> None:
     """Remove a token. It is rejected immediately.
 
@@ -247,7 +122,7 @@ def remove_token(
 
 
 @token_app.command("list")
-def list_tokens(config: Config = _DEFAULT) -> None:
+def list_tokens(config: Config = DEFAULT_CONFIG) -> None:
     """List the holders of tokens and their roles.
 
     Example: rosrv-fleet token list
@@ -263,7 +138,7 @@ def _tokens(config: Path) -> OperatorTokens:
 @evidence.command("remove")
 def remove_evidence(
     evidence_id: Annotated[str, typer.Argument(metavar="ID", help="Its SHA-256, as in `evidence list`")],
-    config: Config = _DEFAULT,
+    config: Config = DEFAULT_CONFIG,
 ) -> None:
     """Remove an evidence bundle from the collector, on the collector's machine.
 
@@ -286,7 +161,7 @@ def search(
         int, typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, help="Largest number of records")
     ] = 100,
     cursor: Annotated[str | None, typer.Option("--cursor", help="Continue where a search ended")] = None,
-    config: Config = _DEFAULT,
+    config: Config = DEFAULT_CONFIG,
     *,
     as_json: Json = False,
 ) -> None:
@@ -322,7 +197,7 @@ def _note(text: str) -> None:
 @app.command()
 def verify(
     robot: Annotated[str | None, typer.Argument(help="Name of the robot; default: all")] = None,
-    config: Config = _DEFAULT,
+    config: Config = DEFAULT_CONFIG,
     *,
     as_json: Json = False,
 ) -> None:
@@ -363,7 +238,7 @@ def _print_proof(proof: LogProof, *, as_json: bool) -> None:
 
 
 @app.command()
-def reindex(config: Config = _DEFAULT) -> None:
+def reindex(config: Config = DEFAULT_CONFIG) -> None:
     """Rebuild the index from the stored segments. The collector may run; searches are incomplete until the end.
 
     Exit status 1 if a segment cannot be indexed or the file of a robot is unreadable; all others are indexed.
@@ -392,7 +267,7 @@ def _index_all(collector: Collector) -> tuple[int, int]:
             for place in collector.store.segments(robot.name, log):
                 try:
                     indexed += index(
-                        collector.database, collector.store, place, robot.public_key, collector.config
+                        collector.database, collector.store, place, robot.public_keys, collector.config
                     )
                 except NOT_INDEXABLE as error:
                     damaged += 1

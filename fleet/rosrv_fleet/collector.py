@@ -9,6 +9,7 @@ from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.evidence.store import EvidenceStore
 from rosrv_fleet.indexer import LANES, Indexer
+from rosrv_fleet.presence import RobotPresence
 from rosrv_fleet.quotas import RobotQuotas
 from rosrv_fleet.receipt_key import read_receipt_key
 from rosrv_fleet.retention import Pruner
@@ -39,6 +40,7 @@ class Collector:
     searches: Searches
     database: IndexDatabase
     robots: Robots
+    presence: RobotPresence
     tokens: OperatorTokens
     store: SegmentStore
     evidence: EvidenceStore
@@ -73,6 +75,7 @@ def make_collector(config: FleetConfig) -> Collector:
         searches=Searches(searching, limits.searches),
         database=database,
         robots=robots,
+        presence=RobotPresence(config.data / "heard"),
         tokens=OperatorTokens(config.data / "tokens.json"),
         store=store,
         evidence=EvidenceStore(config.data / "evidence"),

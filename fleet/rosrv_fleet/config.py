@@ -102,8 +102,8 @@ class FleetConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     `data` is the folder with robots, tokens, keys and segments. `listen` is HOST:PORT. `certificate` and `key` are the
     server's (PEM; by default server.pem and server.key in `data`, made by `rosrv-fleet init`). `database` is a libpq
-    connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent after `silent_seconds` without a
-    segment. Without `retention`, nothing is removed. Without `bundles`, robots get none.
+    connection string; libpq also reads PGPASSWORD and PGPASSFILE. A robot is silent if it was not heard for
+    `silent_seconds`. Without `retention`, nothing is removed. Without `bundles`, robots get none.
     """
 
     data: Path = _DATA

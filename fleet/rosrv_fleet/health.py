@@ -4,7 +4,7 @@ import msgspec
 
 from appliance.base import clock
 from rosrv_fleet.collector import Collector
-from rosrv_fleet.robots import Robot
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import StoreFullError
 
 _SECOND = 1e9
@@ -15,7 +15,9 @@ _MOST_MARKS = 1000
 class RobotState(msgspec.Struct, frozen=True, kw_only=True):
     """A robot: its newest segment (log, number, seconds since it arrived; None: none yet), and its problems.
 
-    `certificate_seconds` pass until its certificate ends.
+    `certificate_seconds` pass until the first certificate of its appliances ends. `heard_seconds` is the time since
+    each appliance pushed a segment, or stated that it has nothing to push; None: never. The robot is silent if one of
+    its appliances is.
     `gaps` is the number of places where segments are missing; `forks` the number of segments with equal numbers; both
     are counted up to 1,000.
     """
@@ -25,6 +27,7 @@ class RobotState(msgspec.Struct, frozen=True, kw_only=True):
     number: int | None = None
     age_seconds: float | None = None
     certificate_seconds: float
+    heard_seconds: dict[str, float | None]
     silent: bool
     gaps: int
     forks: int
@@ -66,20 +69,20 @@ def health_of(collector: Collector) -> FleetHealth:
 
 def _state(collector: Collector, robot: Robot, gaps: int, forks: int) -> RobotState:
     newest = collector.store.newest(robot.name)
-    now, silent_after = clock.wall_ns(), collector.config.silent_seconds
-    ends = robot.certificate_ends - now / _SECOND
-    if newest is None:
-        since_added = (now - robot.added) / _SECOND
-        return RobotState(
-            name=robot.name,
-            certificate_seconds=ends,
-            silent=since_added > silent_after,
-            gaps=gaps,
-            forks=forks,
-        )
-    received, place = newest
-    age = max(0.0, (now - received) / _SECOND)
+    now, presence = clock.wall(), collector.presence
+    heard = {name: presence.last(robot.name, name) for name in robot.connecting}
+    since = (
+        max(heard[name] or 0.0, one.added / _SECOND, presence.began) for name, one in robot.connecting.items()
+    )
+    arrived, place = (None, None) if newest is None else newest
     return RobotState(
-        name=robot.name, log=place.log, number=place.number, age_seconds=age, certificate_seconds=ends,
-        silent=age > silent_after, gaps=gaps, forks=forks,
-    )  # fmt: skip
+        name=robot.name,
+        log=place and place.log,
+        number=place and place.number,
+        age_seconds=None if arrived is None else max(0.0, now - arrived / _SECOND),
+        certificate_seconds=min(one.certificate_ends for one in robot.connecting.values()) - now,
+        heard_seconds={name: None if at is None else max(0.0, now - at) for name, at in heard.items()},
+        silent=now - min(since) > collector.config.silent_seconds,
+        gaps=gaps,
+        forks=forks,
+    )

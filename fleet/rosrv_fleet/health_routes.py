@@ -55,7 +55,12 @@ class _Source(MetricSource):
         health = self._health
         age = gauge("segment_age_seconds", "seconds since the robot's newest segment arrived")
         ends = gauge("certificate_seconds", "seconds until the robot's certificate ends")
-        silent = gauge("robot_silent", "1 while the robot sent nothing for silent_seconds")
+        silent = gauge("robot_silent", "1 while an appliance of the robot was not heard for silent_seconds")
+        heard = GaugeMetricFamily(
+            "rosrv_fleet_heard_seconds",
+            "seconds since an appliance pushed a segment or stated that nothing waits",
+            labels=["robot", "appliance"],
+        )
         gaps = gauge("gaps", "places where segments of the robot are missing")
         forks = gauge("forks", "segments of the robot with a number that another one has")
         for robot in health.robots:
@@ -63,9 +68,12 @@ class _Source(MetricSource):
                 age.add_metric([robot.name], robot.age_seconds)
             ends.add_metric([robot.name], robot.certificate_seconds)
             silent.add_metric([robot.name], robot.silent)
+            for appliance, seconds in robot.heard_seconds.items():
+                if seconds is not None:
+                    heard.add_metric([robot.name, appliance], seconds)
             gaps.add_metric([robot.name], robot.gaps)
             forks.add_metric([robot.name], robot.forks)
-        yield from (age, ends, silent, gaps, forks)
+        yield from (age, ends, silent, heard, gaps, forks)
         yield GaugeMetricFamily(
             "rosrv_fleet_waiting", "stored segments that the index does not have", health.waiting
         )

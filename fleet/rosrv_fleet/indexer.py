@@ -11,7 +11,7 @@ import gzip
 import threading
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from datetime import UTC, date, datetime, timedelta
@@ -26,8 +26,9 @@ from appliance.audit.chain import StoredColumns
 from appliance.audit.segments import SegmentError, SegmentReader
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.database import IndexDatabase, migrate
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.failures import failure_of
-from rosrv_fleet.robots import Robot, Robots
+from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import FileStamp, SegmentPlace, SegmentStore
 from rosrv_fleet.workers import Workers
 
@@ -135,7 +136,7 @@ class Indexer:
         if robot is None:
             self._set_aside(place, stamp, "its robot is not enrolled")
             return
-        work = self._workers.submit(_index_one, self._config, place, robot.public_key)
+        work = self._workers.submit(_index_one, self._config, place, robot.public_keys)
         try:
             work.result()
         except FileNotFoundError:
@@ -171,7 +172,7 @@ class Indexer:
 _database: IndexDatabase | None = None  # of this worker: a connection for all its segments
 
 
-def _index_one(config: FleetConfig, place: SegmentPlace, key: bytes) -> None:
+def _index_one(config: FleetConfig, place: SegmentPlace, keys: Collection[bytes]) -> None:
     """Index a segment, in a worker. Raises what `index` raises."""
     global _database  # noqa: PLW0603  a worker has nothing else that lives as long
     if _database is None:
@@ -180,11 +181,15 @@ def _index_one(config: FleetConfig, place: SegmentPlace, key: bytes) -> None:
         )
         _database.open()
     store = SegmentStore(config.data, config.limits.reserve_bytes)
-    index(_database, store, place, key, config)
+    index(_database, store, place, keys, config)
 
 
 def index(
-    database: IndexDatabase, store: SegmentStore, place: SegmentPlace, key: bytes, config: FleetConfig
+    database: IndexDatabase,
+    store: SegmentStore,
+    place: SegmentPlace,
+    keys: Collection[bytes],
+    config: FleetConfig,
 ) -> bool:
     """Write one segment and its records to the index, unless they are there; return whether.
 
@@ -198,7 +203,7 @@ def index(
     make_partition(database, day)
     try:
         with gzip.open(store.path(place)) as file, database.writing() as connection:
-            reader = SegmentReader(file, key, config.limits.segment_bytes)
+            reader = SegmentReader(file, keys, config.limits.segment_bytes)
             begin, end = reader.header.start[0], reader.header.end.sequence
             inserted = connection.execute(
                 "INSERT INTO segment (robot, log, number, hash, first, last, received, day)"

@@ -22,7 +22,8 @@ import msgspec
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.acts import recorded
-from rosrv_fleet.robots import EnrolmentError, changing
+from rosrv_fleet.enrolment import EnrolmentError
+from rosrv_fleet.robots import changing
 
 _TOKEN = re.compile("rosrv-join_[A-Za-z0-9_-]{43}")
 
@@ -40,6 +41,7 @@ class InvalidInvitationError(Exception):
 class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A robot that may join until `expires` (seconds since the epoch). `group` is SITE/GROUP, or empty.
 
+    `appliance` is the name of the appliance of a pair, or empty.
     `request` is the SHA-256 of the request that used the invitation, in hexadecimal; empty: none has.
     """
 
@@ -47,6 +49,7 @@ class PendingRobot(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     group: str
     expires: float
     request: str = ""
+    appliance: str = ""
 
 
 class Invitations:
@@ -58,12 +61,12 @@ class Invitations:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def add(self, name: str, group: str, seconds: float) -> tuple[PendingRobot, str]:
-        """Make an invitation that replaces earlier ones of the robot; return its token. Raises `OSError`."""
-        pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds)
+    def add(self, name: str, group: str, seconds: float, appliance: str = "") -> tuple[PendingRobot, str]:
+        """Make an invitation that replaces earlier ones of the appliance; return its token. Raises `OSError`."""
+        pending = PendingRobot(name=name, group=group, expires=clock.wall() + seconds, appliance=appliance)
         token = f"rosrv-join_{secrets.token_urlsafe(32)}"
         with changing(self._folder), recorded(self._folder.parent, "robot invite", name, group):
-            self._remove(name)
+            self._remove(name, appliance)
             self._keep(token, pending)
         return pending, token
 
@@ -75,11 +78,12 @@ class Invitations:
                 with recorded(self._folder.parent, "invitation withdraw", name):
                     self._remove(name)
 
-    def _remove(self, name: str) -> None:
-        """Remove the invitations of a robot, and expired ones."""
+    def _remove(self, name: str, appliance: str | None = None) -> None:
+        """Remove the invitations of a robot or of one of its appliances, and expired ones."""
         for file in self._folder.glob("*.json"):
             pending = _read(file)
-            if pending is None or pending.name == name or pending.expires <= clock.wall():
+            its = pending is not None and pending.name == name and appliance in (None, pending.appliance)
+            if pending is None or its or pending.expires <= clock.wall():
                 file.unlink()
 
     @contextmanager

@@ -14,9 +14,9 @@ from starlette.concurrency import run_in_threadpool
 from appliance.base import clock
 from appliance.configuration.fleet_membership import JOIN_PATH, JoinRequest
 from rosrv_fleet.collector import Collector
+from rosrv_fleet.enrolment import EnrolmentError, Robot, require_own_signature
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
 from rosrv_fleet.request_body import read_body
-from rosrv_fleet.robots import EnrolmentError, Robot, require_own_signature
 
 _LONGEST = 16_384
 _WRONG_PER_MINUTE = 30
@@ -62,7 +62,12 @@ def _enrol(collector: Collector, invitations: Invitations, given: JoinRequest) -
     with invitations.using(given.token, msgspec.json.encode(given)) as pending:
         require_own_signature(certificate)
         return collector.robots.join(
-            pending.name, given.key.encode(), certificate, pending.group, again=bool(pending.request)
+            pending.name,
+            given.key.encode(),
+            certificate,
+            pending.group,
+            pending.appliance,
+            again=bool(pending.request),
         )
 
 

@@ -17,10 +17,10 @@ from starlette.requests import ClientDisconnect
 from appliance.base import clock
 from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
-from rosrv_fleet.access import robot_of
+from rosrv_fleet.access import certificate_of, robot_of
 from rosrv_fleet.collector import LONG_CHECKS, SHORT_CHECKS, Collector
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.quotas import OverQuotaError
-from rosrv_fleet.robots import Robot
 from rosrv_fleet.segment_check import SegmentVerdict, check_segment
 from rosrv_fleet.segment_store import NotStorableError, SegmentPlace, StoreFullError
 
@@ -38,15 +38,28 @@ def push_router(collector: Collector) -> APIRouter:
     uploads = _Uploads(collector)
     RobotCaller = Annotated[Robot, Depends(robot_of(collector.robots))]  # noqa: N806  a type
 
+    def heard(request: Request, robot: Robot) -> None:
+        appliance = robot.appliance_with(certificate_of(request) or b"")
+        if appliance:
+            collector.presence.heard(robot.name, appliance)
+
     @router.get("")
     def head(
-        log: LogId, robot: RobotCaller, upto: Annotated[int, Query(ge=0, lt=10**18)] = 10**18 - 1
+        request: Request,
+        log: LogId,
+        robot: RobotCaller,
+        upto: Annotated[int, Query(ge=0, lt=10**18)] = 10**18 - 1,
+        *,
+        idle: bool = False,
     ) -> Response:
         """Return the newest stored checkpoint of the robot's log with a number up to `upto`; number 0: none.
 
         `hashes` has more than one hash if the robot signed several checkpoints with this number, and none if the disk
-        has damaged the segment; then the robot sends it again.
+        has damaged the segment; then the robot sends it again. With `idle` the robot states that it is there, and has
+        nothing to push.
         """
+        if idle:
+            heard(request, robot)
         found = collector.store.head(robot.name, log, upto)
         same = [] if found is None else collector.store.numbered(robot.name, log, found.number)
         hashes = [checkpoint_hash(header.end.text()) for header in collector.store.headers(same)]
@@ -66,6 +79,7 @@ def push_router(collector: Collector) -> APIRouter:
         except OSError as error:
             _log.error("a segment was not stored", robot=robot.name, number=number, reason=str(error))
             raise _later(503, "the collector cannot store segments; see its log", 60) from error
+        heard(request, robot)
         return Response(msgspec.json.encode(receipt), 201, media_type="application/json")
 
     return router
@@ -191,7 +205,7 @@ class _Uploads:
     ) -> SegmentVerdict:
         async with turn:
             work = self._collector.workers.submit(
-                check_segment, upload, robot.public_key, self._limits.segment_bytes, seconds
+                check_segment, upload, robot.public_keys, self._limits.segment_bytes, seconds
             )
             try:
                 verdict = await asyncio.wrap_future(work)

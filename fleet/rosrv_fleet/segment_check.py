@@ -3,6 +3,7 @@
 import gzip
 import time
 import zlib
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,14 +24,14 @@ class SegmentVerdict(NamedTuple):
     seconds: float
 
 
-def check_segment(upload: Path, key: bytes, most_bytes: int, seconds: float) -> SegmentVerdict:
-    """Verify a compressed segment with the raw public key `key` in at most `seconds`. Raises `OSError`."""
+def check_segment(upload: Path, keys: Collection[bytes], most_bytes: int, seconds: float) -> SegmentVerdict:
+    """Verify a compressed segment with one of the raw public keys `keys` in at most `seconds`. Raises `OSError`."""
     begun = time.process_time()
     summary, reason, late = None, "", False
     with gzip.open(upload) as file:
         try:
             with processor_time(seconds):
-                summary = SegmentReader(file, key, most_bytes).summary()
+                summary = SegmentReader(file, keys, most_bytes).summary()
         except OutOfTimeError as error:
             reason, late = str(error), True
         except (SegmentError, EOFError, zlib.error, gzip.BadGzipFile) as error:

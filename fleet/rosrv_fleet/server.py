@@ -18,8 +18,9 @@ from rosrv_fleet.app import make_app
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.connections import ClientConnections, listen
 from rosrv_fleet.door import Door
+from rosrv_fleet.enrolment import RobotAppliance
 from rosrv_fleet.failures import failure_of
-from rosrv_fleet.robots import Robot, Robots
+from rosrv_fleet.robots import Robots
 from rosrv_fleet.rollouts.service import BundleService
 
 _RELOAD_SECONDS = 1.0
@@ -46,21 +47,22 @@ class ServerTls:
     def reload(self) -> None:
         """Trust the robots that were enrolled since; a removed one is refused by each request."""
         for robot in self._robots.known().values():
-            if robot.removed is None and robot.certificate not in self._trusted:
-                self._trusted.add(robot.certificate)
-                self._fingerprints.add(robot.fingerprint)
-                self._trust(robot)
+            for appliance in robot.connecting.values():
+                if appliance.certificate not in self._trusted:
+                    self._trusted.add(appliance.certificate)
+                    self._fingerprints.add(appliance.fingerprint)
+                    self._trust(robot.name, appliance)
 
     def owner(self, certificate: bytes | None) -> str | None:
         """Return the fingerprint of a robot's certificate (DER); None for any other certificate."""
         found = None if certificate is None else hashlib.sha256(certificate).hexdigest()
         return found if found in self._fingerprints else None
 
-    def _trust(self, robot: Robot) -> None:
+    def _trust(self, robot: str, appliance: RobotAppliance) -> None:
         try:
-            self.context.load_verify_locations(cadata=robot.certificate)
+            self.context.load_verify_locations(cadata=appliance.certificate)
         except ssl.SSLError as error:
-            _log.error("a certificate cannot be trusted", robot=robot.name, reason=str(error))
+            _log.error("a certificate cannot be trusted", robot=robot, reason=str(error))
 
 
 def _protocol(header_seconds: float, table: ClientConnections, tls: ServerTls) -> type[HttpToolsProtocol]:

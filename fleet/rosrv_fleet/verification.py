@@ -1,6 +1,6 @@
 """Prove from the stored segments that no record of a robot is missing.
 
-Each segment is read and verified again with the robot's key. A log is complete if its segments form one chain: each
+Each segment is read and verified again with the robot's keys. A log is complete if its segments form one chain: each
 begins with the checkpoint that ends the one before. The first begins at the log's beginning, or after records whose
 removal by retention the signer signed, or after the segments that the collector's own retention noted as removed.
 """
@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 import msgspec
 
 from appliance.audit.segments import SegmentError, SegmentHeader, SegmentReader
-from rosrv_fleet.robots import Robot
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import RemovalNote, SegmentPlace, SegmentStore
 
 _MOST_ATTEMPTS = 10  # to prove a log of which retention removes segments at the same time
@@ -122,7 +122,7 @@ def _read(
 ) -> SegmentHeader | None:
     try:
         with gzip.open(store.path(place)) as file:
-            summary = SegmentReader(file, robot.public_key, segment_bytes).summary()
+            summary = SegmentReader(file, robot.public_keys, segment_bytes).summary()
     except _UNREADABLE as error:
         proof.findings.append(f"{store.path(place)}: damaged: {error}")
         return None

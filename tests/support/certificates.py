@@ -28,7 +28,6 @@ def make_certificates(
 ) -> Certificates:
     """Make an authority with this name, and a certificate for a server or client with this address."""
     folder.mkdir(parents=True)
-    now = datetime.datetime.now(datetime.UTC)
     keys = {name: ec.generate_private_key(ec.SECP256R1()) for name in ("ca", "peer")}
     issuer = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, authority)])
 
@@ -38,8 +37,8 @@ def make_certificates(
             subject,
             keys[name].public_key(),
             x509.random_serial_number(),
-            now - datetime.timedelta(hours=1),
-            now + datetime.timedelta(days=90),
+            datetime.datetime(2020, 1, 1, tzinfo=datetime.UTC),  # valid by any clock of a test
+            datetime.datetime(2100, 1, 1, tzinfo=datetime.UTC),
         )
         for extension, critical in extensions:
             builder = builder.add_extension(extension, critical)

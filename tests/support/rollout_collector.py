@@ -14,7 +14,7 @@ from fastapi import FastAPI, HTTPException, Request
 from rosrv_fleet.bundles.repository import TIMESTAMP_KEY
 from rosrv_fleet.bundles.robot_routes import robot_routes
 from rosrv_fleet.database import IndexDatabase, migrate
-from rosrv_fleet.robots import Robot, RobotGroup
+from rosrv_fleet.enrolment import Robot, RobotGroup
 from rosrv_fleet.rollouts.operator_routes import operator_routes
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore

@@ -268,7 +268,8 @@ WALL_CLOCK = {
     "a moment that people are shown, or that stands in a file": [
         "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
         "bundles/poller.py", "control/bundle_gate.py",
-        "cli/standby/second_join.py", "cli/status_watch.py", "control/host_blocks.py", "control/passive.py",
+        "cli/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
+        "control/host_blocks.py", "control/passive.py",
         "control/policies.py", "control/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
         "forwarding/segment_pusher.py",

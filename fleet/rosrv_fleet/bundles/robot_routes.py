@@ -21,8 +21,8 @@ from psycopg import Error as DatabaseError
 from appliance.bundles.poller import REPORT, RobotReport
 from appliance.bundles.process import EVENTS
 from appliance.bundles.verified_bundles import METADATA, SELECTION, TARGETS
+from rosrv_fleet.enrolment import Robot, RobotGroup
 from rosrv_fleet.request_body import read_body
-from rosrv_fleet.robots import Robot, RobotGroup
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 
 _log = structlog.get_logger()

@@ -18,6 +18,7 @@ _COLUMNS = (
     Column("Log"),
     Column("Segment", number=True),
     Column("Arrived", number=True),
+    Column("Heard", number=True),
     Column("Gaps", number=True),
     Column("Forks", number=True),
     Column("Bundle"),
@@ -175,6 +176,7 @@ def robot_row(one: RobotRow) -> str:
             " ".join(badge(_TONES[word], word) for word in one.log),
             "" if state.number is None else f"{state.number:,}",
             "never" if state.age_seconds is None else ago(state.age_seconds),
+            _heard(state),
             f"{state.gaps:,}",
             f"{state.forks:,}",
             "" if condition is None else badge(_TONES.get(condition.kind, "plain"), condition.kind),
@@ -182,3 +184,11 @@ def robot_row(one: RobotRow) -> str:
             "" if condition is None or condition.kind is ConditionKind.NO_BUNDLE else text(condition.why),
         ),
     )
+
+
+def _heard(state: RobotState) -> str:
+    """Return when a robot was last heard; with a standby for each appliance, by its name."""
+    found = {
+        name: "never" if seconds is None else ago(seconds) for name, seconds in state.heard_seconds.items()
+    }
+    return "<br>".join(f"{text(name)} {when}" if len(found) > 1 else when for name, when in found.items())

@@ -6,7 +6,7 @@ from typing import Any, Literal
 from psycopg import Error as DatabaseError
 
 from rosrv_fleet.console.frame import Column, Tone, alert, badge, link, moment, row, since, table, text
-from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import OperatorAct
 from rosrv_fleet.rollouts.operator_routes import group_state

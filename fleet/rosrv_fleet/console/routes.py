@@ -23,8 +23,8 @@ from rosrv_fleet.console.frame import HEADERS, alert, page
 from rosrv_fleet.console.robots_page import FILTERS, robots_page
 from rosrv_fleet.console.rollout_pages import Act, confirm_page, group_page, groups_page
 from rosrv_fleet.console.search_page import ASKED, search_page
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.request_body import read_body
-from rosrv_fleet.robots import RobotGroup
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.tokens import FleetRole, OperatorToken, OperatorTokens
 

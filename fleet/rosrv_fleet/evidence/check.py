@@ -16,8 +16,9 @@ from cryptography.hazmat.primitives.serialization import load_pem_public_key
 from appliance.audit.signatures import signature_is_valid
 from appliance.evidence.bundle_verifier import Verifier, printable
 from rosrv_fleet.config import FleetConfig
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.evidence.store import EvidenceContent
-from rosrv_fleet.robots import Robot, Robots
+from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.workers import OutOfTimeError, memory, processor_time
 
@@ -50,18 +51,19 @@ class _RobotVerifier(Verifier):
     """The verifier with a robot's key and collected segments. It runs no other program, which would have no limits."""
 
     def __init__(self, bundle: Path, robot: Robot, store: SegmentStore) -> None:
-        self._robot, self._store = robot, store
+        self._robot, self._store, self._key = robot, store, b""
         super().__init__(bundle, None, Path(), {})
 
     def read_key(self, _key: Path | None) -> str:
         key = load_pem_public_key(self.read("audit.pub"))
         raw = key.public_bytes_raw().hex() if isinstance(key, Ed25519PublicKey) else "of another kind"
-        if raw != self._robot.key:
+        if raw not in {one.key for one in self._robot.appliances.values()}:
             raise _OtherKeyError(raw)
+        self._key = bytes.fromhex(raw)
         return raw
 
     def has_signed(self, data: bytes, signed: bytes) -> bool:
-        return signature_is_valid(self._robot.public_key, signed, data)
+        return signature_is_valid(self._key, signed, data)
 
     def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
         log, number = self.manifest["log"], checkpoint["number"]
@@ -86,7 +88,9 @@ def check_evidence(config: FleetConfig, bundle: Path, robot: Robot) -> EvidenceC
                 about = msgspec.convert(verifier.manifest, _Manifest)
     except _OtherKeyError as error:
         owners = (
-            one.name for one in Robots(config.data / "robots").known().values() if one.key == str(error)
+            one.name
+            for one in Robots(config.data / "robots").known().values()
+            if str(error) in {own.key for own in one.appliances.values()}
         )
         owner = next(owners, None)
         whose = f"that of {owner}; use --robot {owner}" if owner else f"{error}, which no robot has"

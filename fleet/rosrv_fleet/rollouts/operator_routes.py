@@ -11,7 +11,7 @@ from psycopg import Error as DatabaseError
 from pydantic import BaseModel, ConfigDict, Field
 
 from appliance.bundles.terms import BundlePath, TermsError
-from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.conditions import ConditionKind
 from rosrv_fleet.rollouts.machine import HealthGates
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError

@@ -29,8 +29,8 @@ from rosrv_fleet.bundles.publication import (
     next_timestamp,
     read_publication,
 )
+from rosrv_fleet.enrolment import EnrolmentError, RobotGroup
 from rosrv_fleet.failures import failure_of
-from rosrv_fleet.robots import EnrolmentError, RobotGroup
 from rosrv_fleet.rollouts import machine
 from rosrv_fleet.rollouts.conditions import RobotCondition, conditions
 from rosrv_fleet.rollouts.machine import BundleRollout, HealthGates, OperatorAct, RobotSeen

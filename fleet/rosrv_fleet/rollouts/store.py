@@ -11,7 +11,7 @@ import msgspec
 import structlog
 from psycopg import Connection
 
-from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import BundleRollout, RobotSeen
 
 _log = structlog.get_logger()

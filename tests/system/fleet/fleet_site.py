@@ -8,7 +8,7 @@ import sqlite3
 import ssl
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,11 +38,13 @@ class FleetSite:
     database: str
     limits: dict[str, Any] = field(default_factory=dict)
     data: Path | None = None
+    address: str = "127.0.0.1"
+    popen: Callable[..., subprocess.Popen[bytes]] = subprocess.Popen  # on the host with this address
 
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.data = self.data or self.folder / "data"
-        self.server = make_certificates(self.folder / "server")
+        self.server = make_certificates(self.folder / "server", self.address)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -53,8 +55,9 @@ class FleetSite:
 
     def write_config(self, **changes: Any) -> None:
         config = {
-            "data": str(self.data), "listen": f"127.0.0.1:{self.port}", "certificate": str(self.server.certificate),
-            "key": str(self.server.key), "database": self.database, "limits": {"reserve_bytes": 1} | self.limits,
+            "data": str(self.data), "listen": f"{self.address}:{self.port}", "database": self.database,
+            "certificate": str(self.server.certificate), "key": str(self.server.key),
+            "limits": {"reserve_bytes": 1} | self.limits,
         }  # fmt: skip
         (self.folder / "fleet.yaml").write_text(yaml.safe_dump(config | changes))
 
@@ -75,7 +78,7 @@ class FleetSite:
         """Start the collector and wait until it answers."""
         environment = os.environ | {"PYTHONPATH": str(ROOT / "fleet")}
         with (self.folder / "log").open("ab") as log:
-            self._process = subprocess.Popen(self.command("serve"), stderr=log, env=environment)
+            self._process = self.popen(self.command("serve"), stderr=log, env=environment)
         eventually(
             self._answers, lambda: f"the collector answers: {(self.folder / 'log').read_text()[-2000:]}"
         )

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
-from rosrv_fleet.robots import Robot
+from rosrv_fleet.enrolment import Robot
 
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program

@@ -200,10 +200,10 @@ def test_a_day_that_is_dropped_while_its_segment_is_indexed(
     (place,) = collector.store.segments("arm1", log)
     with closing(_opened(site.database)) as database:
         if ended:
-            assert not index(database, collector.store, place, robot.public, collector.config)
+            assert not index(database, collector.store, place, (robot.public,), collector.config)
         else:
             with pytest.raises(psycopg.errors.CheckViolation):
-                index(database, collector.store, place, robot.public, collector.config)
+                index(database, collector.store, place, (robot.public,), collector.config)
     assert _days(site.database) == 0
     with psycopg.connect(site.database) as connection:
         assert connection.execute("SELECT count(*) FROM segment").fetchone() == (0,)

@@ -14,7 +14,7 @@ from typing import Any
 import httpx
 import pytest
 from rosrv_fleet.console.rollout_pages import group_page, groups_page
-from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import BundleRollout
 from rosrv_fleet.rollouts.service import RolloutRefusedError
 

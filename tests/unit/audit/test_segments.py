@@ -64,7 +64,7 @@ def written(path: Path, number: int) -> bytes:
 
 def test_a_segment_is_proven_with_the_key_alone(segments: list[bytes], public: bytes) -> None:
     """Consecutive segments are valid, and each begins with the checkpoint that ends the one before."""
-    read = [SegmentReader(io.BytesIO(one), public, _LARGEST) for one in segments]
+    read = [SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments]
     found = [[columns.sequence for columns in one] for one in read]
     summaries = [one.summary() for one in read]
     assert [one for part in found for one in part] == list(range(1, summaries[-1].last + 1))
@@ -130,14 +130,14 @@ def test_a_changed_segment_is_refused(name: str, segments: list[bytes], public: 
     """Each change of a segment is found, with its place."""
     change, why = CHANGES[name]
     with pytest.raises(SegmentError, match=why):
-        SegmentReader(io.BytesIO(change(segments[1])), public, _LARGEST).summary()
+        SegmentReader(io.BytesIO(change(segments[1])), (public,), _LARGEST).summary()
 
 
 def test_a_segment_of_another_key_is_refused(segments: list[bytes]) -> None:
     """A key that did not sign the checkpoints proves nothing."""
     other = Ed25519PrivateKey.generate().public_key().public_bytes_raw()
     with pytest.raises(SegmentError, match="is signed with"):
-        SegmentReader(io.BytesIO(segments[0]), other, _LARGEST)
+        SegmentReader(io.BytesIO(segments[0]), (other,), _LARGEST)
 
 
 def test_a_forged_checkpoint_is_refused(segments: list[bytes], public: bytes) -> None:
@@ -151,20 +151,20 @@ def test_a_forged_checkpoint_is_refused(segments: list[bytes], public: bytes) ->
         + b"\n"
     )
     with pytest.raises(SegmentError, match="signature of checkpoint 2 is wrong"):
-        SegmentReader(io.BytesIO(b"".join(lines)), public, _LARGEST)
+        SegmentReader(io.BytesIO(b"".join(lines)), (public,), _LARGEST)
 
 
 def test_a_large_segment_is_refused_early(segments: list[bytes], public: bytes) -> None:
     """No more than the limit is read."""
     file = io.BytesIO(segments[1] + b"x" * _LARGEST)
     with pytest.raises(SegmentError, match="larger than the limit"):
-        SegmentReader(file, public, len(segments[1]) - 1).summary()
+        SegmentReader(file, (public,), len(segments[1]) - 1).summary()
     assert file.tell() <= len(segments[1])
 
 
 def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: Path, public: bytes) -> None:
     """If retention removed the checkpoint before, the segment names the last removed record, and is proven."""
-    second, third = (SegmentReader(io.BytesIO(one), public, _LARGEST) for one in segments[1:])
+    second, third = (SegmentReader(io.BytesIO(one), (public,), _LARGEST) for one in segments[1:])
     second.summary()
     removed = second.header.end
     header = SegmentHeader(
@@ -173,13 +173,13 @@ def test_a_segment_after_removed_records_is_proven(segments: list[bytes], path: 
     assert header.follows(second.header)
     rest = b"".join(segments[2].splitlines(keepends=True)[1:])
     assert (
-        SegmentReader(io.BytesIO(header.line() + rest), public, _LARGEST).summary().first
+        SegmentReader(io.BytesIO(header.line() + rest), (public,), _LARGEST).summary().first
         == removed.sequence + 1
     )
     wrong = msgspec.structs.replace(header, after=RecordPlace(sequence=removed.sequence, hash="0" * 64))
     assert not wrong.follows(second.header)
     with pytest.raises(SegmentError, match="does not follow"):
-        SegmentReader(io.BytesIO(wrong.line() + rest), public, _LARGEST).summary()
+        SegmentReader(io.BytesIO(wrong.line() + rest), (public,), _LARGEST).summary()
 
 
 def test_retention_leaves_a_segment_after_the_removed_records(
@@ -195,7 +195,7 @@ def test_retention_leaves_a_segment_after_the_removed_records(
     number = next_segment(path, 0)
     assert number is not None
     assert number > 1
-    read = SegmentReader(io.BytesIO(written(path, number)), public, _LARGEST)
+    read = SegmentReader(io.BytesIO(written(path, number)), (public,), _LARGEST)
     first = next(export(path, Filter(), page=1)).sequence
     assert (read.summary().first, read.header.begin) == (first, None)
     assert write_segment(path, number - 1, lambda _line: None) is None

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet.config import EvidenceConfig, FleetConfig
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.evidence.check import EvidenceError, check_evidence
 from rosrv_fleet.evidence.store import EvidenceContent
-from rosrv_fleet.robots import Robot
 from rosrv_fleet.workers import Workers
 
 from tests.unit.audit.conftest import key, make_log, notary, path

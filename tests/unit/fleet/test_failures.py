@@ -12,11 +12,11 @@ import structlog
 from rosrv_fleet import indexer, retention
 from rosrv_fleet.config import FleetConfig, RetentionConfig
 from rosrv_fleet.database import IndexDatabase
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.failures import failure_of
 from rosrv_fleet.indexer import LANES, Indexer
 from rosrv_fleet.output import configure_log
 from rosrv_fleet.retention import Pruner
-from rosrv_fleet.robots import RobotGroup
 from rosrv_fleet.rollouts import service
 from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.rollouts.store import RolloutStore

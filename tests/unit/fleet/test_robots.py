@@ -19,11 +19,14 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet import robots as robots_module
-from rosrv_fleet.cli import app, robot_app, token_app
+from rosrv_fleet.cli import app, token_app
 from rosrv_fleet.collector import Collector
+from rosrv_fleet.enrolment import EnrolmentError, RobotGroup, require_own_signature
 from rosrv_fleet.health import FleetHealth, health_of
 from rosrv_fleet.invitations import InvalidInvitationError, Invitations
-from rosrv_fleet.robots import EnrolmentError, RobotGroup, Robots, require_own_signature
+from rosrv_fleet.presence import RobotPresence
+from rosrv_fleet.robot_commands import robot_app
+from rosrv_fleet.robots import Robots
 from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
@@ -402,7 +405,7 @@ def _health(data: Path) -> FleetHealth:
     """Return the health of a collector with the robots of a data folder, whose index is up."""
     up = SimpleNamespace(trouble=None)
     parts = SimpleNamespace(
-        store=SegmentStore(data, 0), robots=Robots(data / "robots"), indexer=up, pruner=up,
-        config=SimpleNamespace(silent_seconds=60.0),
+        store=SegmentStore(data, 0), robots=Robots(data / "robots"), presence=RobotPresence(data / "heard"),
+        indexer=up, pruner=up, config=SimpleNamespace(silent_seconds=60.0),
     )  # fmt: skip
     return health_of(cast(Collector, parts))

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import msgspec
 import pytest
 from rosrv_fleet.database import IndexDatabase
-from rosrv_fleet.robots import RobotGroup
+from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import Baseline, BundleRollout, HealthGates, OperatorAct, RobotSeen
 from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout

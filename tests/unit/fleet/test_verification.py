@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from rosrv_fleet.robots import Robot
+from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.segment_store import SegmentPlace, SegmentStore
 from rosrv_fleet.verification import LogProof, prove
 

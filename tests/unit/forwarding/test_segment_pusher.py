@@ -13,12 +13,14 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.copies import signed_checkpoints
+from appliance.base.clock import now, using
 from appliance.collector.connection import CollectorConnection, CollectorError
 from appliance.forwarding import segment_pusher
 from appliance.forwarding.segment_pusher import SegmentPusher
 from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from tests.support.audit import decision
+from tests.support.virtual_clock import VirtualClock
 from tests.unit.forwarding.conftest import MakeLog
 
 
@@ -32,6 +34,7 @@ class Collector(CollectorConnection):
         self.key = Ed25519PrivateKey.generate()
         self.pushed: list[int] = []
         self.asked = 0
+        self.idle: list[str] = []  # the logs whose robot stated that nothing waits
         self.head: Callable[[int], dict[str, Any]] = self.honest_head
         self.changes: dict[str, Any] = {}
         self.refusal: CollectorError | None = None
@@ -50,7 +53,10 @@ class Collector(CollectorConnection):
         self.asked += 1
         if self.refusal:
             raise self.refusal
-        return json.dumps({"robot": "arm1", "log": ""} | self.head(int(path.partition("=")[2]))).encode()
+        log, _, query = path.removeprefix("v1/logs/").partition("?")
+        asked = dict(word.split("=") for word in query.split("&"))
+        self.idle += [log] if "idle" in asked else []
+        return json.dumps({"robot": "arm1", "log": ""} | self.head(int(asked["upto"]))).encode()
 
     def put(self, path: str, content: Iterator[bytes], size: int, headers: Any = ()) -> bytes:
         """Take a segment and answer with a receipt."""
@@ -209,3 +215,45 @@ def test_a_replaced_log_counts_from_its_beginning(collector: Collector, make: Ma
     pusher.step()
     assert "another log" in pusher.progress.trouble
     assert pusher.progress.sequence == 0
+
+
+def test_a_robot_without_records_is_present(collector: Collector, make: Make) -> None:
+    """It states every minute that nothing waits, and not while the collector refuses a segment."""
+    pusher = make()
+    collector.changes = {"segment": "0" * 64}
+    pusher.step()
+    assert (pusher.progress.trouble != "", collector.idle) == (True, [])
+    collector.changes = {}
+    while pusher.step() == 0:
+        pass
+    assert len(collector.idle) == 1
+    pusher.step()
+    assert len(collector.idle) == 1
+    with using(VirtualClock(now=now() + 60)):
+        pusher.step()
+    assert len(collector.idle) == 2
+
+
+def test_a_collector_that_lost_segments_gets_them_again(collector: Collector, make: Make) -> None:
+    """A robot without new records sends what a restored collector lacks."""
+    pusher = make()
+    while pusher.step() == 0:
+        pass
+    del collector.pushed[1:]
+    with using(VirtualClock(now=now() + 60)):
+        pusher.step()
+        while pusher.step() == 0:
+            pass
+    assert collector.pushed[-2:] == [2, 3]
+
+
+def test_a_standby_without_a_log_is_present(collector: Collector, make: Make, path: Path) -> None:
+    """An appliance that was never active has nothing to push; the lost log of another one is a trouble."""
+    for file in path.parent.glob("audit.db*"):
+        file.unlink()
+    pusher = make()
+    pusher.step()
+    assert (pusher.progress.trouble, len(collector.idle)) == ("", 1)
+    (path.parent / "state" / "position.json").write_text("{}")
+    pusher.step()
+    assert "there is no audit log yet" in pusher.progress.trouble

@@ -1,0 +1,242 @@
+"""Define enrolled robots, and check their names, groups, keys and certificates."""
+
+import hashlib
+import re
+import ssl
+from typing import NamedTuple, Self
+
+import msgspec
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import Encoding, load_pem_public_key
+
+from appliance.base import clock
+from appliance.bundles.terms import TermsError, role_of
+from appliance.signing.own_certificate import untimely
+
+FIRST = "a"
+"""The name of a robot's first appliance; a robot without a standby has no other one."""
+_MOST_APPLIANCES = 2  # that may connect
+_MOST_KNOWN = 100  # with those that were removed
+_NAME = re.compile("[a-z0-9][a-z0-9._-]{0,62}")
+
+
+class EnrolmentError(Exception):
+    """A robot cannot be enrolled or changed; the message has the reason and the remedy."""
+
+
+class RobotGroup(NamedTuple):
+    """A robot group of a site."""
+
+    site: str
+    group: str
+
+    def __str__(self) -> str:
+        return f"{self.site}/{self.group}"
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Return the group in `SITE/GROUP`. Raises `EnrolmentError`."""
+        site, _, group = text.partition("/")
+        try:
+            role_of(site, group)
+        except TermsError as error:
+            raise EnrolmentError(f"{text[:160]!a} is not SITE/GROUP, such as site-a/arms: {error}") from error
+        return cls(site, group)
+
+
+class RobotAppliance(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An appliance of a robot: the raw public key of its log in hexadecimal, and its certificate (PEM).
+
+    `added` and `removed` are in nanoseconds since the epoch; one with `removed` may not connect.
+    """
+
+    key: str
+    certificate: str
+    added: int
+    removed: int | None = None
+
+    @property
+    def certificate_ends(self) -> float:
+        """Return when its certificate ends, in seconds since the epoch."""
+        return x509.load_pem_x509_certificate(self.certificate.encode()).not_valid_after_utc.timestamp()
+
+    @property
+    def public_key(self) -> bytes:
+        """Return the raw public key that seals its log."""
+        return bytes.fromhex(self.key)
+
+    @property
+    def fingerprint(self) -> str:
+        """Return the SHA-256 of its certificate, in hexadecimal."""
+        return hashlib.sha256(ssl.PEM_cert_to_DER_cert(self.certificate)).hexdigest()
+
+
+class Robot(RobotAppliance, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An enrolled robot: its name, its appliance, and with a standby the other one, by name, in `others`.
+
+    Each appliance has a log, a key and a certificate of its own; the name and the group are the robot's. A removed
+    appliance stays in `others`, because its segments are still verified. `group` is `SITE/GROUP`, or empty: the robot
+    gets no bundles. `removed` is that of the robot.
+    """
+
+    name: str
+    group: str = ""
+    appliance: str = FIRST
+    others: dict[str, RobotAppliance] = {}
+
+    @property
+    def appliances(self) -> dict[str, RobotAppliance]:
+        """Return all appliances by name, with those that were removed."""
+        return {self.appliance: self, **self.others}
+
+    @property
+    def connecting(self) -> dict[str, RobotAppliance]:
+        """Return the appliances that may connect, by name."""
+        if self.removed is not None:
+            return {}
+        return {name: one for name, one in self.appliances.items() if one.removed is None}
+
+    @property
+    def public_keys(self) -> frozenset[bytes]:
+        """Return the raw public keys that seal its logs."""
+        return frozenset(one.public_key for one in self.appliances.values())
+
+    def appliance_with(self, der: bytes) -> str:
+        """Return the name of the appliance with this certificate (DER); empty for none."""
+        fingerprint = hashlib.sha256(der).hexdigest()
+        return next((name for name, one in self.connecting.items() if one.fingerprint == fingerprint), "")
+
+
+def new_appliance(key: bytes, certificate: bytes) -> RobotAppliance:
+    """Return an appliance with PEM files. Raises `EnrolmentError`."""
+    return RobotAppliance(
+        key=_log_key(key), certificate=valid_certificate(certificate), added=clock.wall_ns()
+    )
+
+
+def valid_certificate(pem: bytes) -> str:
+    """Return a certificate (PEM). Raises `EnrolmentError`, also if it is not valid now: no connection could use it."""
+    text = _certificate(pem)
+    fault = untimely(text.encode(), "the collector")
+    if fault:
+        raise EnrolmentError(f"{fault}: correct the clock that is wrong, and try again")
+    return text
+
+
+def new_robot(name: str, made: RobotAppliance, group: str, appliance: str) -> Robot:
+    """Return a new robot with one appliance. Raises `EnrolmentError`."""
+    check_name(name)
+    return Robot(
+        name=name, key=made.key, certificate=made.certificate, added=made.added, appliance=appliance,
+        group=str(RobotGroup.parse(group)) if group else "",
+    )  # fmt: skip
+
+
+def with_appliance(robot: Robot, appliance: str, made: RobotAppliance) -> Robot:
+    """Return a robot with a second appliance. Raises `EnrolmentError`."""
+    if len(robot.connecting) >= _MOST_APPLIANCES or len(robot.appliances) >= _MOST_KNOWN:
+        raise EnrolmentError(
+            f"{robot.name} has the appliances {', '.join(robot.connecting)}; remove one before:"
+            f" rosrv-fleet robot remove {robot.name} --appliance NAME"
+        )
+    return msgspec.structs.replace(robot, others=robot.others | {appliance: made})
+
+
+def renewed(robot: Robot, appliance: str, certificate: str) -> Robot:
+    """Return a robot with another certificate of an appliance; a removed robot may connect again.
+
+    Raises `EnrolmentError`.
+    """
+    if appliance == robot.appliance:
+        return msgspec.structs.replace(robot, certificate=certificate, removed=None)
+    before = robot.others[appliance]
+    if before.removed is not None:
+        raise EnrolmentError(
+            f"appliance {appliance} of {robot.name} was removed; an appliance with this log key cannot join again"
+        )
+    changed = msgspec.structs.replace(before, certificate=certificate)
+    return msgspec.structs.replace(robot, others=robot.others | {appliance: changed}, removed=None)
+
+
+def without_appliance(robot: Robot, appliance: str) -> Robot:
+    """Return a robot of which one appliance may connect no more. Raises `EnrolmentError`."""
+    left = {name: one for name, one in robot.connecting.items() if name != appliance}
+    if len(left) != 1 or len(robot.connecting) != _MOST_APPLIANCES:
+        raise EnrolmentError(
+            f"{appliance!a} is not one of two appliances of {robot.name}; it has: {', '.join(robot.connecting)}"
+        )
+    gone = robot.appliances[appliance]
+    ended = RobotAppliance(
+        key=gone.key, certificate=gone.certificate, added=gone.added, removed=clock.wall_ns()
+    )
+    ((name, stays),) = left.items()
+    others = {other: one for other, one in robot.others.items() if other != name} | {appliance: ended}
+    return msgspec.structs.replace(
+        robot, appliance=name, key=stays.key, certificate=stays.certificate, added=stays.added, others=others
+    )
+
+
+def moved(robot: Robot, group: str) -> Robot:
+    """Return a robot in another group. Raises `EnrolmentError`."""
+    return msgspec.structs.replace(robot, group=str(RobotGroup.parse(group)))
+
+
+def check_name(name: str) -> None:
+    """Raise `EnrolmentError` for a name that robots and appliances cannot have."""
+    if _NAME.fullmatch(name) is None:
+        raise EnrolmentError(
+            f"{name!a}: use 1 to 63 small letters, digits, '.', '_', '-'; first a letter or digit"
+        )
+
+
+def check_stored(robot: Robot) -> None:
+    """Raise `EnrolmentError` or `ValueError` for a robot that no command has stored."""
+    for one in robot.appliances.values():
+        _certificate(one.certificate.encode())
+        Ed25519PublicKey.from_public_bytes(one.public_key)
+    for name in robot.appliances:
+        check_name(name)
+    if robot.group:
+        RobotGroup.parse(robot.group)
+
+
+def _log_key(pem: bytes) -> str:
+    try:
+        key = load_pem_public_key(pem)
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise EnrolmentError(f"--key: not a public key in PEM: {error}") from error
+    if not isinstance(key, Ed25519PublicKey):
+        raise EnrolmentError(
+            "--key: not an Ed25519 key; it is control/audit.pub in the appliance's state directory"
+        )
+    return key.public_bytes_raw().hex()
+
+
+def _certificate(pem: bytes) -> str:
+    """Return a certificate (PEM) if all that the collector reads of it later can be read.
+
+    A certificate is parsed only where it is read, and TLS has another parser: what passes here must fail nowhere else.
+    """
+    try:
+        found = x509.load_pem_x509_certificate(pem)
+        found.not_valid_before_utc.timestamp()
+        found.not_valid_after_utc.timestamp()
+        text = found.public_bytes(Encoding.PEM).decode("ascii")
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_verify_locations(cadata=text)
+    except (ValueError, x509.InvalidVersion, ssl.SSLError) as error:
+        raise EnrolmentError(f"--certificate: not a valid certificate in PEM: {error}") from error
+    return text
+
+
+def require_own_signature(pem: bytes) -> None:
+    """Require that a certificate (PEM) is signed with its own key, so that its sender has the key.
+
+    Raises `EnrolmentError`.
+    """
+    certificate = x509.load_pem_x509_certificate(_certificate(pem).encode())
+    try:
+        certificate.verify_directly_issued_by(certificate)
+    except (ValueError, TypeError, InvalidSignature, UnsupportedAlgorithm, x509.InvalidVersion):
+        raise EnrolmentError("the certificate is not signed with its own key") from None

@@ -1,0 +1,45 @@
+"""Note when each appliance of a robot was last heard: it pushed a segment, or stated that it has nothing to push.
+
+A file for each appliance, `heard/ROBOT/APPLIANCE`, has the time as its own, so that a restart of the collector does not
+make robots silent, and commands see it.
+"""
+
+import contextlib
+import os
+from pathlib import Path
+
+from appliance.base import clock
+from rosrv_fleet.robots import make_folder
+
+_SECOND = 1_000_000_000
+
+
+class RobotPresence:
+    """The times in a folder of the data folder, in seconds since the epoch."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._heard: dict[tuple[str, str], float] = {}
+        self.began = clock.wall()
+        """The time since which this process could hear robots."""
+
+    def heard(self, robot: str, appliance: str) -> None:
+        """Note that an appliance was heard now."""
+        now = clock.wall_ns()
+        self._heard[robot, appliance] = now / _SECOND
+        # On a full disk the time stays in memory; health reports the disk.
+        with contextlib.suppress(OSError):
+            file = self._folder / robot / appliance
+            make_folder(file.parent)
+            file.touch(mode=0o600)
+            os.utime(file, ns=(now, now))
+
+    def last(self, robot: str, appliance: str) -> float | None:
+        """Return when an appliance was last heard; None: never."""
+        found = self._heard.get((robot, appliance))
+        if found is not None:
+            return found
+        try:
+            return (self._folder / robot / appliance).stat().st_mtime
+        except OSError:
+            return None

@@ -1,0 +1,112 @@
+"""The two appliances of a robot with a standby are one robot of the collector, also after a takeover."""
+
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.copies import signed_checkpoints
+from examples.landshark.lab import Lab
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_program, need_root, needs
+from tests.support.standby_site import StandbySite
+from tests.support.waiting import eventually
+from tests.system.fleet.fleet_site import FleetSite
+
+COLLECTOR = "10.79.0.50"
+NAMES = ("a", "b")
+
+
+class Fleet(FleetSite):
+    """A collector on a host of its own, which is asked with commands only."""
+
+    def _answers(self) -> bool:
+        try:
+            with socket.create_connection((self.address, self.port), 1):
+                return True
+        except OSError:
+            return False
+
+    def heard(self) -> dict[str, str | None]:
+        """Return when each appliance was heard."""
+        rows = map(json.loads, self.run("robot", "list", "--json").stdout.splitlines())
+        return {row["appliance"]: row["heard"] for row in rows}
+
+    def proven(self) -> list[dict[str, Any]]:
+        """Return the results of `verify`, one for each log."""
+        return [json.loads(line) for line in self.run("verify", "--json").stdout.splitlines()]
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[tuple[Lab, StandbySite]]:
+    """Run both appliances, `a` active."""
+    need_root()
+    need_program("nft", "nftables")
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with Lab("rosrv-fleetpair") as lab, StandbySite(lab, tmp_path, monitors={}) as made:
+        made.start_witness()
+        made.start("a")
+        made.until_active("a")
+        made.start("b")
+        made.until_both_in_sync()
+        yield lab, made
+
+
+def test_both_join_and_a_takeover_goes_on(
+    pair: tuple[Lab, StandbySite], database: str, tmp_path: Path
+) -> None:
+    """Both join as the same robot while `a` is active; each pushes its log, also as the standby after a takeover."""
+    lab, site = pair
+    host = lab.host("collector", f"{COLLECTOR}/24")
+    fleet = Fleet(tmp_path / "fleet", database, address=COLLECTOR, popen=host.popen)
+    with host.entered():
+        fleet.start()
+    try:
+        _join(lab, site, fleet)
+        _restart(site, "b")
+        eventually(lambda: fleet.heard()["b"], "the standby is heard without a log")
+        _restart(site, "a")
+        site.until_active("b")
+        eventually(lambda: _all_pushed(site, fleet, "a"), "the new standby pushes its log")
+        eventually(lambda: len(fleet.proven()) == 2, "the active appliance pushes")
+        site.cut("b")
+        site.until_active("a")
+        eventually(lambda: _all_pushed(site, fleet, "a"), "the other appliance pushes after a takeover")
+        site.restore("b")
+        eventually(
+            lambda: _all_pushed(site, fleet, "b"), "the standby pushes what it recorded before the cut"
+        )
+        assert [(one["robot"], one["missing"]) for one in fleet.proven()] == [("arm7", 0)] * 2
+    finally:
+        fleet.kill()
+
+
+def _join(lab: Lab, site: StandbySite, fleet: Fleet) -> None:
+    """Join with both appliances."""
+    whole = fleet.server.certificate.read_bytes() + fleet.server.ca.read_bytes()
+    fleet.server.certificate.write_bytes(whole)
+    for name, words in (("a", ()), ("b", ("--appliance", "b"))):
+        file = fleet.folder / f"{name}.json"
+        file.write_text(fleet.run("robot", "invite", "arm7", *words).stdout)
+        appliance = site.appliances[name]
+        with lab.hosts[name].entered():
+            assert "arm7 is enrolled" in appliance.rosrv("fleet", "join", str(file)).stdout
+
+
+def _restart(site: StandbySite, name: str) -> None:
+    process = site.appliances[name].process
+    assert process is not None
+    process.stop()
+    site.start(name)
+    site.until_both_in_sync()
+
+
+def _all_pushed(site: StandbySite, fleet: Fleet, name: str) -> bool:
+    """Whether the collector has all records of an appliance that a checkpoint seals."""
+    log = site.appliances[name].state / "control" / "audit.db"
+    last = signed_checkpoints(log, 0, 1_000_000)[-1]
+    found = {proof["log"]: proof["last"] for proof in fleet.proven()}
+    return bool(found.get(last.log) == last.sequence)

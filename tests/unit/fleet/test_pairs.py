@@ -1,0 +1,58 @@
+"""A robot with a standby is one robot of the collector; both appliances have logs, keys and certificates."""
+
+from pathlib import Path
+
+import pytest
+from rosrv_fleet.enrolment import EnrolmentError
+from rosrv_fleet.robots import Robots
+
+from appliance.signing.own_certificate import make_own_certificate
+from tests.support.enrolled_robots import JoiningAppliance
+
+
+def test_a_standby_joins_as_the_same_robot(tmp_path: Path) -> None:
+    """Only an invitation for it adds the second appliance; both may renew their certificates, a third may not join."""
+    robots, first, second, third = (
+        Robots(tmp_path / "robots"),
+        JoiningAppliance(),
+        JoiningAppliance(),
+        JoiningAppliance(),
+    )
+    first.join(robots)
+    with pytest.raises(EnrolmentError, match="robot invite arm7 --appliance NAME"):
+        second.join(robots)
+    robot = second.join(robots, "b")
+    assert robot.public_keys == {first.raw, second.raw}
+    assert (first.of(robots), second.of(robots)) == ("arm7/a", "arm7/b")
+    second.certificate = make_own_certificate("arm7", 1)[1]
+    second.join(robots, "b")
+    assert (first.of(robots), second.of(Robots(tmp_path / "robots"))) == ("arm7/a", "arm7/b")
+    for appliance in ("b", "c"):
+        with pytest.raises(EnrolmentError, match="--appliance NAME"):
+            third.join(robots, appliance)
+    with pytest.raises(EnrolmentError, match="arm7 has this log key"):
+        robots.add("arm8", second.key, make_own_certificate("arm8", 1)[1])
+
+
+@pytest.mark.parametrize("gone", ["a", "b"])
+def test_an_appliance_is_replaced(gone: str, tmp_path: Path) -> None:
+    """The removed machine may not connect or join, its log is still verified, and a new one takes its place."""
+    robots, machines, new = (
+        Robots(tmp_path / "robots"),
+        {"a": JoiningAppliance(), "b": JoiningAppliance()},
+        JoiningAppliance(),
+    )
+    machines["b"].join(robots, "b")
+    machines["a"].join(robots)
+    robots.remove("arm7", gone)
+    stays = "b" if gone == "a" else "a"
+    assert (machines[gone].of(robots), machines[stays].of(robots)) == ("", f"arm7/{stays}")
+    with pytest.raises(EnrolmentError, match="is not one of two appliances"):
+        robots.remove("arm7", stays)
+    with pytest.raises(EnrolmentError, match="was removed"):
+        machines[gone].join(robots)
+    robot = new.join(robots, "c")
+    assert new.of(robots) == "arm7/c"
+    assert robot.public_keys == {new.raw, *(machine.raw for machine in machines.values())}
+    robots.remove("arm7")
+    assert (new.of(robots), machines[stays].of(robots)) == ("", "")
