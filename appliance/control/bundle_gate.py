@@ -74,9 +74,11 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 class BundleRecord(msgspec.Struct, frozen=True):
-    """The stored record: the bundle in force since `since` with its revisions, the refused one, and a trial.
+    """The stored record: the bundle in force since `since`, the refused one, and a trial.
 
-    `policy_back` is the revision of the policy before the bundle. `interrupted` is the SHA-256 of the bundle whose last
+    `policy_back` is the revision of the policy before the bundle. `content` is the fingerprint of all parts when the
+    bundle came into force. Revision numbers do not tell whether a part was changed: going back makes a new revision of
+    the same text. Records of earlier versions have only numbers. `interrupted` is the SHA-256 of the bundle whose last
     `interruptions` trials ended with the process.
     """
 
@@ -90,6 +92,7 @@ class BundleRecord(msgspec.Struct, frozen=True):
     trial: Trial | None = None
     interrupted: str = ""
     interruptions: int = 0
+    content: str = ""
 
 
 class BundleGate:
@@ -122,6 +125,7 @@ class BundleGate:
         self._offered: BundleOffered | None = None
         self._there = asyncio.Event()
         self._waits = ""
+        self._fingerprinted: tuple[object, str] = (None, "")
 
     def status(self) -> BundlesState | None:
         """Return the state for `rosrv status` and the metrics, or None if no bundles are configured or in force."""
@@ -194,8 +198,27 @@ class BundleGate:
         record = self._record
         if not record.in_force or record.trial is not None:
             return False
+        if record.content:
+            return self._content() != record.content
         there = (self._policies.revision, self._monitors.revision)
         return there != (record.policy, record.monitors) or not self._hosts.bundled
+
+    def _content(self) -> str:
+        """Return the fingerprint of the policy, the specifications, the switches of monitors and the hosts in force."""
+        policies, monitors, hosts = self._policies, self._monitors, self._hosts
+        switches = monitors.switches.states_of(monitors.checked)
+        given = (policies.revision, monitors.revision, switches, hosts.bundled)
+        if self._fingerprinted[0] != given:
+            parts = [
+                policies.current.text,
+                policies.in_force.signature,
+                monitors.sources,
+                switches,
+                hosts.bundled,
+            ]
+            text = msgspec.json.encode(parts, order="deterministic").decode()
+            self._fingerprinted = (given, fingerprint(text))
+        return self._fingerprinted[1]
 
     # --- the gate ---
 
@@ -249,7 +272,15 @@ class BundleGate:
             return
         policy, monitors = self._policies.revision, self._monitors.revision
         await self._keep(
-            BundleRecord(trial.path, trial.sha256, clock.wall(), policy, monitors, trial.policy_back)
+            BundleRecord(
+                trial.path,
+                trial.sha256,
+                clock.wall(),
+                policy,
+                monitors,
+                policy_back=trial.policy_back,
+                content=self._content(),
+            )
         )
         self._trail.happened(
             "bundle in force",

@@ -174,14 +174,22 @@ def test_a_kill_during_the_trial_goes_back_and_tries_again(site: tuple[BundleSit
 
 
 def test_a_change_on_the_robot_is_reported(site: tuple[BundleSite, str]) -> None:
-    """If an operator changes the policy on the robot, that stays, and the robot reports the difference."""
+    """If an operator changes a part on the robot, that stays and is reported, until the part is as it was before."""
     served, url = site
     with robot(served, url) as appliance:
-        in_force(appliance, served.add(bundle_files(OPEN_POLICY)))
+        in_force(appliance, served.add(bundle_files(OPEN_POLICY, monitors__quiet_dot_rv=MONITOR)))
+        assert not bundles_of(appliance)["changed"]
         appliance.reload(OPEN_POLICY + "# by hand\n")
         assert bundles_of(appliance)["changed"]
         assert "# by hand" in appliance.rosrv("policy", "show").stdout
         eventually(lambda: changed(served), "a report of the change")
+        appliance.reload(OPEN_POLICY)
+        assert not bundles_of(appliance)["changed"]
+        (name,) = (row["name"] for row in appliance.status()["monitors"]["monitors"])
+        appliance.rosrv("monitor", "disable", name)
+        assert bundles_of(appliance)["changed"]
+        appliance.rosrv("monitor", "enable", name)
+        assert not bundles_of(appliance)["changed"]
 
 
 def changed(site: BundleSite) -> bool:
