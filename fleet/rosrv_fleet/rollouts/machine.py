@@ -14,7 +14,7 @@ Invariants:
    but a ring that has lost all its robots stops the rollout.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import msgspec
@@ -74,10 +74,10 @@ class OperatorAct(msgspec.Struct, frozen=True):
 class BundleRollout(msgspec.Struct, frozen=True):
     """A rollout of the bundle `path` over the bundle `before` (empty: none).
 
-    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened. `healthy` is the
-    time since which all open rings have been taken and healthy; None: they are not. `baselines` has the robots that
-    count for the gates: those that were not silent when their ring opened. `why` explains the state. `acts` are the
-    acts of operators.
+    The rings up to `ring` are open; -1: none yet. `opened` is the time at which the last ring opened, or the earliest
+    one for the first. `healthy` is the time since which all open rings have been taken and healthy; None: they are not.
+    `baselines` has the robots that count for the gates: those that were not silent when their ring opened. `why`
+    explains the state. `acts` are the acts of operators.
     """
 
     path: str
@@ -102,6 +102,22 @@ class BundleRollout(msgspec.Struct, frozen=True):
 def ring_of(rollout: BundleRollout, robot: str) -> int:
     """Return the index of a robot's ring."""
     return rollout.terms.ring_of(robot, rollout.bundle)
+
+
+def fault_of_rings(rollout: BundleRollout, robots: Collection[str]) -> str:
+    """Return why the rings do not fit the robots that are enrolled in the group; empty if they do."""
+    place = f"{rollout.bundle.site}/{rollout.bundle.group}"
+    for ring in rollout.terms.rings:
+        unknown = [robot for robot in ring.robots if robot not in robots]
+        if unknown:
+            return (
+                f"ring {ring.name} names {', '.join(unknown[:10])}, not enrolled in {place}: see rosrv-fleet robot"
+                " list, and add the bundle again with the right names"
+            )
+    first = rollout.terms.rings[0]
+    if not any(ring_of(rollout, robot) == 0 for robot in robots):
+        return f"the first ring, {first.name}, has none of the {len(robots)} robots of {place}: name robots in it"
+    return ""
 
 
 def selected(rollout: BundleRollout, robot: str, seen: RobotSeen | None) -> str:
@@ -161,10 +177,11 @@ def reverted(rollout: BundleRollout, why: str) -> BundleRollout:
 
 def resumed(rollout: BundleRollout, seconds: float) -> BundleRollout:
     """Return a running rollout after `seconds` in which the collector heard no robot: they count for no gate."""
-    if rollout.state != "running" or rollout.ring < 0:
+    if rollout.state != "running":
         return rollout
     why = f"the collector heard no robot for {seconds:.0f} s; the time of health begins again"
-    return msgspec.structs.replace(rollout, opened=rollout.opened + seconds, healthy=None, why=why)
+    opened = max(rollout.opened, rollout.started) + seconds
+    return msgspec.structs.replace(rollout, opened=opened, healthy=None, why=why)
 
 
 def counts(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float) -> list[dict[str, object]]:
@@ -200,6 +217,8 @@ def _opened(rollout: BundleRollout, robots: Mapping[str, RobotSeen], now: float)
     }
     if not fresh and index == 0:
         why = f"no robot of the first ring, {rollout.terms.rings[0].name}, reports"
+        if now - max(rollout.started, rollout.opened, earliest) > rollout.gates.ring_seconds:
+            return _stopped(rollout, f"{why}, after {rollout.gates.ring_seconds:g} s")
         return msgspec.structs.replace(rollout, why=why)
     return msgspec.structs.replace(
         rollout,

@@ -193,6 +193,10 @@ class BundleService:
                 " that of the machine that signs, and add the bundle again"
             )
         rollout = BundleRollout(str(path), before, terms, gates, now, acts=[OperatorAct(now, who, "start")])
+        members = await asyncio.to_thread(self._members)
+        fault = machine.fault_of_rings(rollout, {one for one, own in members.items() if own == group})
+        if fault:
+            raise RolloutRefusedError(fault)
         number = await asyncio.to_thread(self.store.begin, group, last, rollout, now)
         if number is None:
             raise RolloutRefusedError(f"a rollout of {path.site}/{path.group} runs: stop it first")

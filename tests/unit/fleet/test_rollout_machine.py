@@ -12,6 +12,7 @@ from rosrv_fleet.rollouts.machine import (
     RobotSeen,
     advanced,
     counts,
+    fault_of_rings,
     resumed,
     reverted,
     ring_of,
@@ -149,12 +150,36 @@ def test_a_ring_that_is_not_taken_stops_after_its_time() -> None:
     assert "0 of 2 robots of ring canary" in late.why
 
 
-def test_a_canary_ring_without_robots_waits() -> None:
-    """Without a reporting canary no ring opens."""
-    rollout = advanced(begun(), {"r9": RobotSeen(0, OLD)}, 0)
+def test_a_canary_ring_without_robots_stops_after_its_time() -> None:
+    """Without a reporting canary no ring opens; the rollout waits `ring_seconds` in which the collector was there."""
+    robots = {"r9": RobotSeen(0, OLD)}
+    rollout = advanced(begun(), robots, 0)
     assert rollout.ring == -1
     assert "no robot of the first ring" in rollout.why
     assert stopped(rollout, "by hand").state == "stopped"
+    assert advanced(rollout, robots, 1000).state == "running"
+    assert advanced(rollout, robots, 1001).state == "stopped"
+    assert advanced(resumed(rollout, 5000), robots, 6000).state == "running"
+
+
+@pytest.mark.parametrize(
+    ("rings", "fault"),
+    [
+        (RINGS, ""),
+        (
+            [Ring("canary", ["r-zero", "r1"]), Ring("rest", [], 100)],
+            "ring canary names r-zero, not enrolled in s/g",
+        ),
+        ([Ring("canary", ["r1"]), Ring("some", ["R2"]), Ring("rest", [], 100)], "ring some names R2"),
+        ([Ring("canary", [], 1), Ring("rest", [], 100)], "the first ring, canary, has none of the 20 robots"),
+    ],
+    ids=["right", "beside a right name", "later", "percent"],
+)
+def test_rings_fit_the_enrolled_robots(rings: list[Ring], fault: str) -> None:
+    """A name that is not enrolled in the group is a typing error; a first ring without robots would never be taken."""
+    found = fault_of_rings(begun(Terms(0, rings)), ROBOTS)
+    assert fault in found
+    assert bool(found) == bool(fault)
 
 
 def test_a_removed_robot_counts_no_more() -> None:

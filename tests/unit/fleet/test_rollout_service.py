@@ -3,10 +3,12 @@
 import asyncio
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, TypeVar
+from types import SimpleNamespace
+from typing import Any, TypeVar, cast
 
 import msgspec
 import pytest
+from rosrv_fleet.bundles.publication import PublishedBundles
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.enrolment import RobotGroup
 from rosrv_fleet.rollouts.machine import Baseline, BundleRollout, HealthGates, OperatorAct, RobotSeen
@@ -14,7 +16,7 @@ from rosrv_fleet.rollouts.service import BundleService, RolloutRefusedError
 from rosrv_fleet.rollouts.store import RolloutStore, StoredReport, StoredRollout
 
 from appliance.bundles.poller import RobotReport
-from appliance.bundles.terms import Ring, Terms
+from appliance.bundles.terms import BundlePath, Ring, Terms
 
 T = TypeVar("T")
 _GROUP = RobotGroup("site-a", "arms")
@@ -176,3 +178,15 @@ def test_an_absence_is_health_for_no_tick(
 
     _run(monkeypatch, calls, run())
     assert (store.stored.rollout.ring, store.stored.rollout.healthy) == (0, 4600.0)
+
+
+def test_a_rollout_with_an_unknown_robot_does_not_start(
+    store: _Memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ring with a wrong name is refused before anything changes."""
+    service, path = _service(store, tmp_path, [1010.0]), "site-a/arms/3.tar"
+    terms = Terms(0, [Ring("canary", ["r-0", "r-zero"]), Ring("rest", [], 100)])
+    service.publication = cast(PublishedBundles, SimpleNamespace(bundles={path: terms}))
+    with pytest.raises(RolloutRefusedError, match="r-zero, not enrolled in site-a/arms"):
+        _run(monkeypatch, _Calls(), service.start(BundlePath.parse(path), HealthGates(), "olga"))
+    assert store.stored.rollout == _ROLLOUT
