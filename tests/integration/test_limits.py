@@ -128,26 +128,3 @@ def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
         assert seconds_for(tablet, there + 20, began) > (20 - 10) / 5
     finally:
         appliance.reload(LIMITED)
-
-
-@pytest.mark.parametrize("client", CLIENTS)
-def test_a_latched_message_beyond_the_limit_is_delayed(ros: RosSession, client: Client) -> None:
-    """The last of several quick messages reaches every subscriber, including later ones."""
-    listener = ros.listener(client, "/map", name=f"reader_{client}")
-    ros.start(
-        [
-            "/usr/bin/python3",
-            "-c",
-            "import rospy; from std_msgs.msg import String; rospy.init_node('mapper', anonymous=True);"
-            "p = rospy.Publisher('/map', String, latch=True, queue_size=10)\n"
-            "while not p.get_num_connections(): rospy.sleep(0.01)\n"
-            "for n in range(1, 6): p.publish(f'map {n}')\n"
-            "rospy.spin()",
-        ],
-        label="mapper",
-    )
-    listener.wait_for(event="received", data="map 5")
-    heard = numbers(listener.seen(event="received"))
-    assert (heard[0], heard[-1], heard == sorted(set(heard)), len(heard) < 5) == (1, 5, True, True)
-    late = ros.listener(client, "/map", name=f"late_{client}")
-    assert late.wait_for(event="received")["data"] == "map 5"

@@ -48,28 +48,6 @@ def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
         assert len(listener.seen(event="received")) == 1
 
 
-@pytest.mark.parametrize("to", CLIENTS)
-def test_two_talkers_on_one_topic(ros: RosSession, to: Client) -> None:
-    """A subscriber hears every publisher of its topic, and can tell them apart."""
-    listener = ros.listener(to, "/chatter")
-    ros.talker("rospy", "/chatter", "--text", "one", name="one")
-    ros.talker("roscpp", "/chatter", "--text", "two", name="two")
-    for name in ("one", "two"):
-        assert listener.wait_for(event="received", publisher=f"/{name}")["data"].startswith(name)
-
-
-@pytest.mark.parametrize("to", CLIENTS)
-@pytest.mark.parametrize("by", CLIENTS)
-def test_restarted_talker(ros: RosSession, by: Client, to: Client) -> None:
-    """A publisher that ended and returned under the same name is heard again."""
-    listener = ros.listener(to, "/chatter")
-    first = ros.talker(by, "/chatter", "--text", "before", name="voice")
-    listener.wait_for(lambda event: event.get("data", "").startswith("before"))
-    first.stop()
-    ros.talker(by, "/chatter", "--text", "after", name="voice")
-    listener.wait_for(lambda event: event.get("data", "").startswith("after"))
-
-
 @pytest.mark.parametrize("by", CLIENTS)
 def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -> None:
     """ROS's own rule holds: a new node of the same name on the same host ends the old one."""

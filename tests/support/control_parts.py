@@ -33,13 +33,14 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import MASTER_CHANGES
 from appliance.rpc.server import HttpRequest, Peer
-from appliance.rpc.xmlrpc_client import CallFailedError, RefusedError
+from appliance.rpc.xmlrpc_client import RefusedError, UnansweredError
 from appliance.store.state_file import StateStore
 from appliance.telemetry.metrics import Meter
+from roswire.parameter_tree import standing_at
 from roswire.uris import node_uri, parse_node_uri
 from roswire.xmlrpc import Value, XmlRpcLimits, build_call, parse_response
 from tests.support.idle import idle, idle_class
-from tests.support.parameters import mirror
+from tests.support.parameters import mirror, put
 from tests.support.serving import serving
 
 HOST = ipaddress.ip_address("10.0.0.5")
@@ -90,6 +91,8 @@ class Records:
         self, _caller: Any, _method: str, category: str, resource: str, decision: Decision, **more: Any
     ) -> str:
         self.events.append(("allow" if decision.allowed else "deny", resource))
+        if decision.would_deny:
+            self.refused.append(f"would deny: {category} {resource}")
         if not decision.allowed:
             about = {name: value for name, value in more.items() if name != "reads"}
             self.denied.append(Denied(category, resource, decision, about))
@@ -97,7 +100,7 @@ class Records:
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **detail: Any) -> str:
         self.events.append((event, resource))
-        if detail.get("decision") == "deny":
+        if event in {"malformed", "limit exceeded"}:
             self.refused.append(f"{event}: {detail.get('caller_id', '')} {detail['category']} {resource}")
         return "id"
 
@@ -162,6 +165,8 @@ class HiddenMaster:
     def _answer(self, method: str, params: tuple[Value, ...]) -> Answer:
         if method == "lookupNode" and params[1] not in self.nodes:
             return [-1, "unknown", ""]
+        if method in {"setParam", "deleteParam"}:
+            return self._write(method, str(params[1]), *params[2:])
         asked = str(params[-1])
         values: dict[str, Value] = {
             "getPid": self.pid,
@@ -176,10 +181,30 @@ class HiddenMaster:
             "getParam": dict(self.parameters),
             "subscribeParam": self.parameters.get(asked[1:], {}) if asked != "/" else dict(self.parameters),
             "unsubscribeParam": 1,
-            "setParam": 0,
-            "deleteParam": 0,
         }
+        if method == "searchParam":
+            return self._search(str(params[0]), asked)
         return [1, "", values[method]]
+
+    def _write(self, method: str, key: str, *value: Value) -> Answer:
+        there = mirror(self.parameters)
+        was = standing_at(there.tree, key)[0]
+        if value:
+            put(there, key, value[0], HOST)
+            self.parameters = there.tree
+            return [1, f"parameter {key} set", 0]
+        there.delete(key)
+        return [-1, f"parameter [{key}] is not set", 0] if was is None else [1, f"parameter {key} deleted", 0]
+
+    def _search(self, caller_id: str, key: str) -> Answer:
+        first = key.strip("/").split("/")[0]
+        above = [] if key.startswith("/") else caller_id.strip("/").split("/")
+        for depth in range(len(above), -1, -1):
+            base = "".join(f"/{part}" for part in above[:depth])
+            if standing_at(self.parameters, f"{base}/{first}")[0] is not None:
+                name = f"{base}/{key.strip('/')}"
+                return [1, f"Found [{name}]", name]
+        return [-1, f"Cannot find parameter [{key}] in an upwards search", ""]
 
     def _change(self, how: str, kind: Kind, name: str, resource: str, *rest: str) -> Answer:
         table = self.tables[kind].setdefault(resource, {})
@@ -252,7 +277,7 @@ class Clients:
         if self._asked in self.gone:
             raise RefusedError("nobody is there")
         if self._asked in self.silent:
-            raise CallFailedError("no answer")
+            raise UnansweredError("no answer")
         return [1, "", 1]
 
 

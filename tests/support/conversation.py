@@ -14,24 +14,27 @@ Events:
     /talker dies | /talker is silent | /talker answers              and is checked
     /talker misses the list of /chatter                             its delivery failed
     /ear loses its connection for /chatter                          and is checked
+    /ear is forgotten                                               as a lost node that makes room
     nodes may be silent for 60 s                                    before they are lost; otherwise 0 s
     policy NAME | policy NAME, NAME                                 put that policy in force, or several at once
     host 10.0.0.1 is expelled                                       revoke everything that its nodes have
     `ROSMaster starts anew` | `a relay starts anew`                 the ROS master or a relay restarts
     `ROSMaster is slow` | `ROSMaster answers`                       its answers wait until then
+    `ROSMaster stops`                                               until a round
     `the queue of changes is full`                                  calls that change the graph wait for a round
     a round                                                         of the reconcile loop
     `ROSMaster has /talker publication /chatter of /other`          a registration that control has not made
     state                                                           what control and the ROS master have
     given LINE                                                      another action, whose effects are not listed
 
-Effects follow, one per line, in the order in which they are carried out. First come the answers of calls: a denial as
-`deny CATEGORY RESOURCE: reason`, with the reason in the record below it if the caller gets less, another failure as
-`refused: reason`, an error of the caller as `error: reason`, the answer to a question as `answer: value`. Then comes
-`record malformed` or `record limit exceeded`, last a withheld update as `withhold`. Nodes are written by name (a second
-incarnation as `/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI.
-Effects that only store state for a restart of control are left out. No socket is opened and no name is random, so a
-formal model of RVMaster can be compared with the text.
+Effects follow, one per line. First come the answers of calls: a denial as `deny CATEGORY RESOURCE: reason`, with the
+reason in the record below it if no rule decides and the caller gets less, another failure as `refused: reason`, an
+error of the caller as `error: reason`, the answer to a question as `answer: value`. Then come `record malformed`,
+`record limit exceeded` and `record would deny`, the effects in the order in which they are carried out, and last the
+denied resources that a caller or node does not get, as `withhold`. Nodes are written by name (a second incarnation as
+`/talker:2`), also for the URIs of their proxy endpoints; `/talker itself` is the node's own URI. Effects that only
+store state for a restart of control are left out. No socket is opened and no name is random, so a formal model of
+RVMaster can be compared with the text.
 
 A file has policies (`policy NAME`, or `policy NAME like OTHER` for more sections, with indented lines), and then
 conversations (`# title`).
@@ -42,14 +45,11 @@ import ipaddress
 import json
 import re
 import shlex
-from collections.abc import Iterable, Sequence
-from typing import Any, cast
+from collections.abc import Iterable
+from typing import Any
 
 from appliance.channel import messages
 from appliance.configuration.settings import LivenessSection
-from appliance.master.endpoints.node_api import NodeApiClient
-from appliance.master.endpoints.relay_control import RelayControl
-from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
@@ -68,32 +68,11 @@ from appliance.master.graph.effects import (
 )
 from appliance.master.graph.registry import Incarnation, Kind
 from appliance.policy.model import text_for_caller
-from appliance.specifications.allocation import Allocation
 from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts
-from tests.support.idle import idle
+from tests.support.conversation_calls import OWN, PORTS, QUESTIONS, WrittenCall, call_of, is_call
+from tests.support.new_relay import told_to_a_new_relay
 
-# The parameters of calls after the caller's name: R a resource, V a value, A the node's API, S that of its service.
-_SHAPES = {
-    "registerPublisher": "RVA",
-    "registerSubscriber": "RVA",
-    "registerService": "RSA",
-    "unregisterPublisher": "RA",
-    "unregisterSubscriber": "RA",
-    "unregisterService": "RS",
-    "subscribeParam": "AR",
-    "unsubscribeParam": "AR",
-    "setParam": "RJ",
-    "publisherUpdate": "RJ",
-    "paramUpdate": "RJ",
-    "requestTopic": "RP",
-}
-# Calls whose answer is not only that they were carried out.
-_QUESTIONS = {
-    "getParam", "getParamNames", "getPid", "getPublishedTopics", "getSystemState", "getTopicTypes", "getUri",
-    "hasParam", "lookupNode", "lookupService", "searchParam",
-}  # fmt: skip
-_RAW = re.compile(r"(\S+) calls (\S+) (\[.*\])(?: of (\S+))?")
 _REGISTER = {Kind.PUBLICATION: "registerPublisher", Kind.SUBSCRIPTION: "registerSubscriber"}
 _WORDS = {
     PlaceResource: "place",
@@ -115,6 +94,7 @@ class Conversation:
         self._policies = policies
         self._names: dict[str, str] = {}  # of incarnations, by their keys
         self._begun: dict[str, asyncio.Task[list[str]]] = {}  # calls without an answer, by their lines
+        self._held = False  # changes wait for the ROS master
 
     async def say(self, line: str) -> list[str]:
         """Return the effects of one line."""
@@ -130,9 +110,7 @@ class Conversation:
             self._begun[call] = asyncio.create_task(self._call_by(call))
             answers = []
         else:
-            answers = await (
-                self._call_by(line) if line[0].isdigit() or line[:4] == "own " else self._event(line)
-            )
+            answers = await (self._call_by(line) if is_call(line) else self._event(line))
         await self._settle()
         answers += self._finished()
         shown = [self._shown(effect) for effect in self.parts.enactor.noted]
@@ -141,16 +119,17 @@ class Conversation:
         return [*answers, *refused, *filter(None, shown), *withheld]
 
     async def _settle(self) -> None:
-        """Wait until all work is done, or, while a call waits, for the work that does not wait."""
-        for _ in range(50 if self._begun else 0):
+        """Wait until all work is done, or, while work waits for the ROS master, for the work that does not wait."""
+        for _ in range(50):
             await asyncio.sleep(0)
-        if all(task.done() for task in self._begun.values()):
+        if not self._held and all(task.done() for task in self._begun.values()):
             await self.parts.settle()
-        self._names |= {
-            node.key: f"{node.name}{'' if (life := node.api.port - 40_000) == 1 else f':{life}'}"
-            for node in self.parts.registry.all()
-            if node.key not in self._names
-        }
+        self._name_nodes()
+
+    def _name_nodes(self) -> None:
+        for node in self.parts.registry.all():
+            life = node.api.port - PORTS
+            self._names.setdefault(node.key, f"{node.name}:{life}" if life in range(2, 10) else node.name)
 
     def _finished(self) -> list[str]:
         """Return the answers of calls that were begun earlier and have one now."""
@@ -163,34 +142,31 @@ class Conversation:
 
     async def _call_by(self, line: str) -> list[str]:
         """Make a call; return the lines of its answer."""
-        raw = _RAW.fullmatch(line)
-        if raw is not None:
-            host, method, text, called = raw.groups()
-            answer = await self._ask(host, method, json.loads(text), called)
-            return self._answered(method, answer, raw=True)
-        host, name, method, *rest = shlex.split(line)
-        called = rest[-1] if rest[-2:-1] == ["of"] else None
-        if method != "multicall":
-            params = self._parameters(host, name, method, rest[: -2 if called else None])
-            return self._answered(method, await self._ask(host, method, params, called))
-        calls = [shlex.split(part) for part in line.partition(" multicall ")[2].split(" | ")]
-        parts = [{"methodName": one, "params": self._parameters(host, name, one, of)} for one, *of in calls]
-        answers = await self._ask(host, "system.multicall", [parts], called)
-        assert isinstance(answers, list)
+        call = call_of(line)
+        answer = await self._ask(call)
+        if not call.parts:
+            return self._answered(call.method, answer, raw=call.raw)
+        assert isinstance(answer, list)
         return [
             f"{number}. {shown}"
-            for number, ((one, *_), answer) in enumerate(zip(calls, answers, strict=True), 1)
-            for shown in self._answered(one, answer[0] if isinstance(answer, list) else answer) or ["done"]
+            for number, (part, one) in enumerate(zip(call.parts, answer, strict=True), 1)
+            for shown in self._answered(part, one[0] if isinstance(one, list) else one) or ["done"]
         ]
 
-    async def _ask(self, host: str, method: str, params: Sequence[Any], called: str | None) -> Value:
-        own = host == "own"
-        target = None if called is None else self._node(called)
-        where = "127.0.0.1" if own else host
+    async def _ask(self, call: WrittenCall) -> Value:
+        target = None if call.node is None else self._node(call.node)
         try:
-            return await self.parts.ask(method, *params, host=where, own=own, target=target)
+            return await self.parts.ask(
+                call.method,
+                *call.params,
+                host="127.0.0.1" if call.host == OWN else call.host,
+                own=call.host == OWN,
+                target=target,
+            )
         except FaultReceived as fault:
             return {"faultString": fault.text}
+        finally:
+            self._name_nodes()
 
     def _answered(self, method: str, answer: Any, *, raw: bool = False) -> list[str]:
         """Return the lines of an answer; none if a call was only carried out."""
@@ -201,9 +177,9 @@ class Conversation:
         code, text, value = answer
         if code == 0:
             return self._denied(text)
-        if code == -1 and (raw or method not in _QUESTIONS):
+        if code == -1 and (raw or method not in QUESTIONS):
             return [f"error: {text}: {json.dumps(value)}"]
-        if raw or method in _QUESTIONS:
+        if raw or method in QUESTIONS:
             return [f"answer: {self._value(text)}: {self._value(value)}" if code == 1 else f"answer: {text}"]
         return []
 
@@ -219,7 +195,11 @@ class Conversation:
             if text == f"{told} [id]":
                 del denied[place]
                 about = "".join(f" {name} {value}" for name, value in one.about.items())
-                longer = [f"recorded: {one.decision.reason}"] if one.decision.told else []
+                longer = (
+                    [f"recorded: {one.decision.reason}"]
+                    if one.decision.told and not one.decision.rule
+                    else []
+                )
                 return [f"deny {one.category} {one.resource}{about}: {text}", *longer]
         return [f"refused: {text}"]
 
@@ -238,8 +218,10 @@ class Conversation:
                 expelled = parts.revocation.expel(ipaddress.ip_address(host), "the host was expelled")
                 parts.enactor.carry_out(expelled)
             case ["a", "round"]:
+                self._held = False
                 await parts.round()
             case ["the", "queue", "of", "changes", "is", "full"]:
+                self._held = True
                 parts.fill_queue()
             case ["nodes", "may", "be", "silent", "for", seconds, "s"]:
                 parts.liveness.settings = LivenessSection(silent=float(seconds))
@@ -254,11 +236,17 @@ class Conversation:
         hidden = self.parts.hidden
         match happening:
             case ["starts", "anew"]:
+                self._held = False
                 hidden.restart()
                 await self.parts.round()
+            case ["stops"]:
+                self._held = True
+                self.parts.rosmaster.shut()
             case ["is", "slow"]:
+                self._held = True
                 hidden.go.clear()
             case ["answers"]:
+                self._held = False
                 hidden.go.set()
             case ["has", name, kind, resource, "of", owner]:
                 uri = self.parts.faces.inner_uri(self._node(owner))
@@ -274,6 +262,8 @@ class Conversation:
                 self.parts.watchlist.could_not_tell(node, missed, "it does not answer")
             case ["loses", "its", "connection", "for", topic]:
                 self.parts.watchlist.cut_off(node, topic)
+            case ["is", "forgotten"]:
+                self.parts.enactor.carry_out(self.parts.graph.forgotten(node))
             case ["dies"] | ["is", "silent"] | ["answers"]:
                 clients = self.parts.clients
                 for names, word in ((clients.gone, "dies"), (clients.silent, "silent")):
@@ -306,23 +296,6 @@ class Conversation:
         node = self.parts.faces.by_inner_uri(self.parts.hidden.nodes[name])
         return name if node is None else self._names[node.key]
 
-    def _parameters(self, host: str, name: str, method: str, rest: list[str]) -> list[Any]:
-        name, _, life = name.partition(":")
-        given, parameters = iter(rest), [name]
-        for shape in _SHAPES.get(method, "R" * len(rest)):
-            match shape:
-                case "A":
-                    parameters.append(f"http://{host}:{40_000 + int(life or 1)}/")
-                case "S":
-                    parameters.append(f"rosrpc://{host}:{next(given)}")
-                case "J":
-                    parameters.append(json.loads(next(given)))
-                case "P":
-                    parameters.append(json.loads(next(given, '[["TCPROS"]]')))
-                case _:
-                    parameters.append(next(given))
-        return parameters
-
     def _node(self, name: str) -> Incarnation:
         keys = [key for key, known in self._names.items() if known == name]
         node = self.parts.registry.by_key(keys[0])
@@ -331,23 +304,10 @@ class Conversation:
 
     def _relay_starts(self) -> list[str]:
         """Restate the nodes, as control does when it gets the link of a new relay."""
-        parts, link = self.parts, _Link()
-        relay = RelayControl(
-            parts.registry,
-            parts.grants,
-            cast(Any, _Ports()),
-            idle(NodeApiClient),
-            idle(RelayTraffic),
-            allocation=Allocation(1),
-            policy=lambda: parts.current,
-            monitors=cast(Any, _Monitors),
-            broken=lambda _node: None,
-            own_header=None,
-            own_call=cast(Any, None),
-        )
-        relay.attach(0, cast(Any, link))
+        parts = self.parts
+        told = told_to_a_new_relay(parts.registry, parts.grants, lambda: parts.current)
         parts.enactor.carry_out(parts.graph.tell_everybody(lambda _topic: True))
-        return [self._stated(message) for message in link.told]
+        return [self._stated(message) for message in told]
 
     # --- as text ---
 
@@ -396,38 +356,6 @@ class Conversation:
                 text = text.replace(uri, name)
             text = text.replace(one.api_text, f"{name} itself")
         return text
-
-
-class _Ports:
-    """`Places` without real ports."""
-
-    def socket(self, port: int) -> "_Ports":
-        self._port = port
-        return self
-
-    def fileno(self) -> int:
-        return self._port
-
-
-class _Monitors:
-    """Monitors without a specification in force."""
-
-    def statement(self, _relay: int) -> messages.SpecificationsStated:
-        return messages.SpecificationsStated(0, b"", {}, restarted=False)
-
-
-class _Link:
-    """A channel to a relay that keeps its messages."""
-
-    def __init__(self) -> None:
-        self.told: list[messages.Message] = []
-
-    def attach(self, *_given: object) -> None:
-        """Do nothing."""
-
-    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        if not isinstance(message, messages.StateBegan | messages.StateEnded | messages.SpecificationsStated):
-            self.told.append(message)
 
 
 def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:

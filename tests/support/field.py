@@ -1,8 +1,8 @@
 """Run an appliance under attack: a robot and its operator talk, a rogue host attacks, a test reads the audit log.
 
 with Field(lab, home, POLICY) as field:
-    answer = field.rogue("unregisterPublisher", "/voice", "/chatter", field.api)
-    field.denied(answer, "held by 10.77.0.10")
+    answer = field.rogue("lookupNode", "/looker", "/voice")
+    field.recorded(event="decision", host="10.77.0.66")
     field.unharmed()
 """
 
@@ -21,9 +21,6 @@ from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, numbers, without_gap
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
-
-_ADDRESS = re.compile(r"\b(?!127\.)[0-9]{1,3}(?:\.[0-9]{1,3}){3}\b")  # every host has its own loopback
-_RECORD_ID = re.compile(r"\[([0-9a-f]{20})\]\Z")
 
 
 class Field:
@@ -111,44 +108,6 @@ class Field:
         return (host or self.attacker).run(lambda: socket.create_connection(("10.77.0.2", port), LIMIT))
 
     # --- promises that must hold afterwards ---
-
-    def denied(
-        self,
-        answer: Any,
-        reason: str,
-        *,
-        in_record: str | None = None,
-        rule: str | None = None,
-        code: int = 0,
-        **fields: Any,
-    ) -> Event:
-        """Assert that the answer is a denial for this reason, and that the log has it with the rule and its line.
-
-        The denial contains no address except the caller's. `in_record` is the reason in the record, where it is longer.
-        `rule` is its section and key, such as `[Nodes] default`. Returns the record.
-        """
-        assert isinstance(answer, list), answer
-        assert (len(answer), answer[0]) == (3, code), answer
-        assert reason in answer[1], answer
-        host = fields.get("host", "10.77.0.66")
-        assert set(_ADDRESS.findall(answer[1])) <= {host}, f"the denial reveals other addresses: {answer[1]}"
-        found = _RECORD_ID.search(answer[1])
-        assert found is not None, answer
-        record = self.trail.wait_for(id=found[1])
-        assert (in_record or reason) in record["reason"], record
-        expected = {"decision": "deny", "host": "10.77.0.66"} | fields
-        assert {key: record[key] for key in expected} == expected
-        if rule is None:
-            assert record["rule"] is None, record
-        else:
-            place = record["rule"]
-            assert f"[{place['section']}] {place['key']}" == rule, record
-            assert place["file"] == str(self.appliance.policy_file), record
-            lines = self.policy.splitlines()[: place["line"]]
-            assert re.match(re.escape(place["key"]) + r" *=", lines[-1]), record
-            assert [line for line in lines if line.startswith("[")][-1] == f"[{place['section']}]", record
-            assert rule in answer[1], answer
-        return record
 
     def recorded(self, reason: str = "", **fields: Any) -> Event:
         """Wait for the first record with these fields and with this text in its reason."""

@@ -13,7 +13,6 @@ from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
-from tests.support.waiting import eventually
 
 SLOW = 1.0  # seconds for a call of the robot during a flood, on an idle machine
 PARTS = 9000
@@ -60,21 +59,6 @@ def test_reads_with_long_keys_do_not_fill_the_disk(siege: Siege) -> None:
     assert siege.trail.wait_for(event="limit exceeded", host=guest)["decision"] == "deny"
     assert log_bytes(siege) - before < 6 * AUDIT_BYTES.bounds.host
     assert siege.appliance.recorded("--deny", host=guest)[-1]["detail"]["key"] == "/limits/speed"
-
-
-def test_repeated_reads_are_counted(siege: Siege) -> None:
-    """A node that polls a parameter leaves one record of its first read, and a count for every ten seconds."""
-    guest = siege.crowd.guests[1]
-    part = {"methodName": "hasParam", "params": ["/poller", "/rosdistro"]}
-    answer = siege.crowd.call(guest, "system.multicall", [part] * 2000)
-    assert all(isinstance(one, list) and one[0][0] == 1 for one in answer)
-
-    def sums() -> list[dict[str, Any]]:
-        return siege.trail.seen(event="repetitions folded", host=guest)
-
-    # one, unless the calls take ten seconds
-    eventually(lambda: sum(one["detail"]["count"] for one in sums()) == 1999, siege.trail.story)
-    assert {(one["detail"]["key"], one["decision"]) for one in sums()} == {("/rosdistro", "allow")}
 
 
 def test_unknown_hosts_do_not_displace_denials_of_named_hosts(siege: Siege) -> None:

@@ -4,7 +4,6 @@ The policy grants the rogue everything, so limits, and not rules, protect the ot
 """
 
 import contextlib
-import socket
 import threading
 import time
 import xmlrpc.client
@@ -13,11 +12,9 @@ from typing import Any
 
 import pytest
 
-from appliance.quotas.table import RVMASTER_CONNECTIONS
 from tests.support.appliance import OPEN_POLICY
-from tests.support.field import Field, Impostor, answering, whole
+from tests.support.field import Field, Impostor, whole
 from tests.support.processes import LIMIT
-from tests.support.rosmaster import master_at
 from tests.support.waiting import allowed, eventually
 
 POLICY = OPEN_POLICY
@@ -98,32 +95,6 @@ def calm(field: Field) -> Iterator[Field]:
     field.ros.on(field.ocu).listener("rospy", "/chatter").wait_for(event="received")
 
 
-def test_connections(calm: Field) -> None:
-    """A host has a quota of connections; further ones are closed, and another host connects at once."""
-    with contextlib.ExitStack() as held:
-        opened = [held.enter_context(calm.connect()) for _ in range(700)]
-        for one in opened:
-            one.setblocking(False)
-
-        def closed() -> int:
-            return sum(map(is_closed, opened))
-
-        eventually(
-            lambda: closed() >= 700 - RVMASTER_CONNECTIONS.bounds.unknown, lambda: f"{closed()} closed"
-        )
-        assert bystander(calm) < allowed(SLOW)
-
-
-def is_closed(sock: socket.socket) -> bool:
-    """Whether the peer has closed the connection."""
-    try:
-        return sock.recv(1, socket.MSG_PEEK) == b""
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
-
-
 def test_calls(calm: Field) -> None:
     """Flood with calls as fast as a host can make them, on persistent connections."""
     data = request("getSystemState", "/flooder")
@@ -154,36 +125,6 @@ def test_calls_whose_answers_are_not_read(calm: Field) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
                 one.send(data)
-    assert bystander(calm) < allowed(SLOW)
-    for one in held:
-        one.close()
-
-
-def test_connections_closed_before_the_answer(calm: Field) -> None:
-    """Clients repeatedly disconnect before the answer."""
-    data = request("getSystemState", "/flooder")
-
-    def act(_number: int, _turn: int) -> None:
-        with calm.connect() as sock:
-            sock.sendall(data)
-
-    with Flood(calm, 8, act):
-        assert bystander(calm) < allowed(SLOW)
-        calm.unharmed(50)
-
-
-def test_bodies_that_never_end(calm: Field) -> None:
-    """Large incomplete bodies are limited per host, whatever their number."""
-    beginning = b"POST / HTTP/1.1\r\nContent-Length: 16000000\r\n\r\n" + b"x" * 15_000_000
-    held = []
-    for _ in range(20):
-        sock = calm.connect()
-        held.append(sock)
-        sock.settimeout(2)
-        with contextlib.suppress(OSError):
-            sock.sendall(beginning)
-    record = calm.recorded("bytes in requests and answers", host=HOST)
-    assert record["decision"] == "deny"
     assert bystander(calm) < allowed(SLOW)
     for one in held:
         one.close()
@@ -221,50 +162,6 @@ def test_values_for_a_node_that_never_answers(calm: Field) -> None:
     assert calm.rogue("deleteParam", "/setter", "/hoard")[0] == 1
 
 
-def test_registrations(calm: Field) -> None:
-    """The rogue reaches its limit of nodes and topics, and keeps it in later tests; other hosts still get both.
-
-    The rogue's nodes answer: silent nodes would be lost, and make room for the next.
-    """
-    refused: list[Any] = []
-    with Impostor(calm.attacker, answering([1, "", 4711])) as node:
-
-        def act(number: int, turn: int) -> None:
-            name = f"/many_{number}_{turn}"
-            with master_at(calm.master) as server:
-                answer = server.registerPublisher(name, f"/t{name[1:]}", "std_msgs/String", node.uri)
-            if answer[0] != 1:
-                refused.append(answer)
-
-        def at_its_limit() -> list[Any]:
-            bystander(calm, 4)
-            return refused
-
-        with Flood(calm, 4, act):
-            eventually(at_its_limit, "the limit of one host is reached", 4 * LIMIT)
-    calm.denied(refused[0], "500 nodes, the limit for one host")
-    calm.ros.talker("rospy", "/new_topic", name="newcomer")
-    calm.ros.on(calm.ocu).listener("rospy", "/new_topic", name="new_ear").wait_for(event="received")
-
-
-def test_registrations_of_one_node(calm: Field) -> None:
-    """Topics of one node count as well."""
-    answer: list[Any] = [1]
-    with Impostor(calm.unknown_host, answering([1, "", 0])) as node:
-        for number in range(20):
-            parts = [
-                {
-                    "methodName": "registerPublisher",
-                    "params": ["/one", f"/topics/t{number}_{inner}", "std_msgs/String", node.uri],
-                }
-                for inner in range(100)
-            ]
-            answer = calm.call(calm.unknown_host, "system.multicall", parts)[-1][0]
-            if answer[0] != 1:
-                break
-    assert "1000 registrations, the limit for one host" in answer[1]
-
-
 def test_queried_names_do_not_accumulate(calm: Field) -> None:
     """New names in reading calls and topic requests, without end, do not make memory grow."""
     face = calm.rogue("lookupNode", "/looker", "/voice")[2]
@@ -280,26 +177,3 @@ def test_queried_names_do_not_accumulate(calm: Field) -> None:
     with Flood(calm, 4, act):
         calm.unharmed(50)
         assert bystander(calm) < allowed(SLOW)
-
-
-def test_denials(calm: Field) -> None:
-    """Thousands of denials are folded into a few records with counts."""
-    parts = [{"methodName": f"noSuch{number}", "params": ["/denied"]} for number in range(5000)]
-    calm.rogue("system.multicall", parts)
-    calm.recorded(event="denials folded", host=HOST)
-    written = [event for event in calm.trail.seen(host=HOST, decision="deny") if "noSuch" in event["reason"]]
-    assert len(written) < 1000
-    assert bystander(calm) < allowed(SLOW)
-
-
-def test_relay_ports(calm: Field) -> None:
-    """Connections to a relay port without a header do not keep subscribers away."""
-    face = calm.rogue("lookupNode", "/looker", "/voice")[2]
-    port = calm.rogue("requestTopic", "/knocker", "/chatter", [["TCPROS"]], uri=face)[2][2]
-    held = []
-    with contextlib.suppress(OSError):
-        for _ in range(600):
-            held.append(calm.attacker.run(lambda: socket.create_connection(("10.77.0.2", port), 1)))
-    calm.ros.on(calm.ocu).listener("roscpp", "/chatter").wait_for(event="received")
-    for one in held:
-        one.close()

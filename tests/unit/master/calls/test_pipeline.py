@@ -177,61 +177,6 @@ async def others() -> None:
         await asyncio.sleep(0)
 
 
-@pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
-async def test_a_pending_value_is_not_replaced_from_below(together: bool, site: Site) -> None:
-    """A write below a key that is being set is decided only after the key is set."""
-    site.go.clear()
-    setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
-    await others()
-    wanted: list[Value] = [part("hasParam", "/arm/max"), part("setParam", "/arm/max/x", 0)]
-    below = asyncio.create_task(
-        site.ask(OPERATOR, "system.multicall", wanted)
-        if together
-        else site.ask(OPERATOR, "setParam", "/me", "/arm/max/x", 0)
-    )
-    elsewhere = asyncio.create_task(site.ask(OPERATOR, "setParam", "/me", "/arm/min", 1))
-    await others()
-    assert site.arrived == ["setParam /arm/max", "setParam /arm/min"]
-    site.go.set()
-    answer = await below
-    assert (answer[1][0] if together else answer)[0] == 0
-    assert (await setting)[0] == (await elsewhere)[0] == 1
-    assert site.there.tree == site.parameters.tree == {"arm": {"max": 5, "min": 1}}
-    assert [one.allowed for _, _, one in site.trail.decisions].count(False) == 1
-
-
-async def test_a_denied_write_does_not_wait(site: Site) -> None:
-    """A denied write is answered at once, and delays no other write."""
-    site.go.clear()
-    setting = asyncio.create_task(site.ask(ADMIN, "setParam", "/admin", "/arm/max", 5))
-    await others()
-    assert (await site.ask(OPERATOR, "deleteParam", "/me", "/"))[0] == 0
-    [answer] = await site.ask(OPERATOR, "system.multicall", [part("setParam", "/", {"a": 1})])
-    assert answer[0][0] == 0
-    assert len(site.trail.decisions) == 3
-    site.go.set()
-    assert (await setting)[0] == 1
-
-
-async def test_parts_are_decided_and_answered_in_their_places(site: Site) -> None:
-    """Each part of a run has its answer, whether it was carried out, denied or rejected."""
-    answers = await site.ask(
-        OPERATOR,
-        "system.multicall",
-        [
-            part("setParam", "/arm/a", 1),
-            part("setParam", "/leg", 1),
-            part("setParam", "bad key!?", 1),
-            part("hasParam", "/arm/a"),
-            part("deleteParam", "/arm/a"),
-        ],
-    )
-    assert [one[0][0] for one in answers] == [1, 0, -1, 1, 1]
-    assert "[Parameters] write default" in answers[1][0][1]
-    assert site.there.tree == site.parameters.tree == {"arm": {}}
-    assert [resource.allowed for _, _, resource in site.trail.decisions] == [True, False, True, True]
-
-
 def sets(*keys: str) -> list[Value]:
     """Return the parts of a multicall that sets these keys."""
     return [part("setParam", key, 1) for key in keys]
@@ -427,27 +372,3 @@ async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     threads.clear()
     await site.ask(OPERATOR, "setParam", "/me", "/arm/model", "x" * OFFLOAD)
     assert threads == [("parse_call", False), ("build_response", True)]
-
-
-@pytest.mark.parametrize(
-    ("tell", "told"),
-    [
-        (
-            "",
-            "10.0.0.5 is not among the hosts that may write the parameter /arm/max, by [Parameters] write /arm/max",
-        ),
-        (
-            "full",
-            "10.0.0.5 is not among the hosts that may write the parameter /arm/max: only adm (10.0.0.9) may, by",
-        ),
-        ("id", "denied [id]"),
-    ],
-)
-async def test_the_answer_to_a_denied_host_follows_the_policy(tell: str, told: str) -> None:
-    """The answer has the id of the record and the details that `[Options] tell` allows; the record has all details."""
-    site = Site(LIMITED + (f"[Options]\ntell = {tell}\n" if tell else ""))
-    answer = await site.ask(OPERATOR, "setParam", "/n", "/arm/max", 1)
-    assert answer[0] == 0
-    assert answer[1].startswith(told), answer
-    assert answer[1].endswith("[id]")
-    assert "only adm (10.0.0.9) may" in site.trail.decisions[-1][2].reason

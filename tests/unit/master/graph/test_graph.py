@@ -4,32 +4,12 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.graph.registry import Kind, Life
+from appliance.master.graph.registry import Kind
 from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 from tests.support.control_parts import HOST, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
-
-
-@pytest.mark.parametrize("forgotten", [False, True], ids=["it unregisters", "it is forgotten"])
-async def test_a_lost_incarnation_takes_nothing_from_its_successor(forgotten: bool) -> None:
-    """A hung node wakes up and shuts down after its successor started: their grant, by name and host, stays."""
-    world = await ControlParts.begun()
-    talker, old, new = world.node("/talker"), world.node("/ear", 2), world.node("/ear", 3)
-    await world.register(talker, Kind.PUBLICATION, "/a")
-    await world.register(old, Kind.SUBSCRIPTION, "/a")
-    world.clients.silent = {"/ear"}
-    await world.look(old)
-    assert old.life is Life.SHADOW
-    await world.register(new, Kind.SUBSCRIPTION, "/a")
-    grant = PermissionRow(talker.key, "topic", "/a", str(HOST), "/ear")
-    world.enactor.carry_out(world.graph.topic_granted(talker, "/a", HOST, "/ear"))
-    gone = world.graph.forgotten(old) if forgotten else world.graph.unregistered(old, Kind.SUBSCRIPTION, "/a")
-    world.enactor.carry_out(gone)
-    assert list(world.grants.of(talker.key)) == [grant]
-    world.enactor.carry_out(world.graph.unregistered(new, Kind.SUBSCRIPTION, "/a"))
-    assert list(world.grants.of(talker.key)) == []
 
 
 async def test_the_next_control_repeats_the_news_of_a_lost_topic() -> None:

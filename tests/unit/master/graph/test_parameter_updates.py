@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Kind
-from roswire.names import is_relative_member
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, ControlParts
 from tests.support.examples import examples
@@ -107,31 +106,6 @@ def test_an_update_has_the_value_that_was_set() -> None:
     assert isinstance(namespace, dict)
     namespace["b"] = 2
     assert kept == before
-
-
-@pytest.mark.parametrize("name", ["/limits/speed", "~own", "a//b", "", "a/", "/"])
-@pytest.mark.parametrize("depth", range(3))
-@pytest.mark.anyio
-async def test_a_member_with_an_invalid_name_is_refused(name: str, depth: int) -> None:
-    """At any depth, alone or in a multicall, the error names the member, and nothing is set or sent."""
-    world = await ControlParts.begun()
-    node = world.node("/robot")
-    await world.register(node, Kind.PARAMETER, "/limits/speed", "")
-    value: Value = {name: 1, "fine": 666}
-    for level in range(depth):
-        value = {f"level{level}": value}
-    params: list[Value] = ["/guest", "/guest", value]
-    alone: Any = await world.ask("setParam", *params)
-    part: Value = {"methodName": "setParam", "params": params}
-    together: Any = await world.ask("system.multicall", [part, part])
-    for answer in (alone, together[0][0], together[1][0]):
-        assert answer[0] == -1
-        assert "no relative name" in answer[1]
-        assert ascii(name) in answer[1]
-    assert not [call for call in world.hidden.calls if call[0] == "setParam" and call[2] == "/guest"]
-    assert not world.parameters.tree.get("guest")
-    assert not [one for one in world.deliveries.told if one[1] == "paramUpdate"]
-    assert not is_relative_member(name)
 
 
 @pytest.mark.anyio

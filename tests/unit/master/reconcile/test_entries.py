@@ -59,44 +59,6 @@ def changes(world: ControlParts) -> list[tuple[Any, Any]]:
     return [(call[0], call[2]) for call in world.hidden.calls if "egister" in str(call[0])]
 
 
-async def test_a_node_does_not_wait_for_the_ros_master() -> None:
-    """The answers come from the registry, with the ROS master's texts; the ROS master gets the changes in order."""
-    world, requests = await started()
-    requests.held.clear()
-    answers = [
-        await world.ask("registerPublisher", "/n", "/t", TYPE, uri()),
-        await world.ask("registerSubscriber", "/ear", "/t", TYPE, uri(2)),
-        await world.ask("registerService", "/n", "/s", "rosrpc://10.0.0.5:99", uri()),
-        await world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99"),
-        await world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99"),
-        await world.ask("unregisterPublisher", "/n", "/t", uri()),
-        await world.ask("unregisterPublisher", "/n", "/t", uri()),
-        await world.ask("unregisterSubscriber", "/ear", "/other", uri(2)),
-    ]
-    outer = world.registry.all()[0].outer_uri("10.0.0.1")
-    assert answers == [
-        [1, "Registered [/n] as publisher of [/t]", []],
-        [1, "Subscribed to [/t]", [outer]],
-        [1, "Registered [/n] as provider of [/s]", 1],
-        [1, "Unregistered [/n] as provider of [/s]", 1],
-        [1, "[rosrpc://10.0.0.5:99] is no longer the current service api handle for [/s]", 0],
-        [1, "Unregistered [/n] as provider of [/t]", 1],
-        [1, "[/n] is not a registered node", 0],
-        [1, "[/ear] is not a known provider of [/other]", 0],
-    ]
-    assert changes(world) == []
-    requests.held.set()
-    await world.settle()
-    assert changes(world) == [
-        ("registerPublisher", "/t"),
-        ("registerSubscriber", "/t"),
-        ("registerService", "/s"),
-        ("unregisterService", "/s"),
-        ("unregisterPublisher", "/t"),
-    ]
-    assert requests.methods == ["system.multicall"]
-
-
 async def test_many_changes_go_in_order_in_few_requests() -> None:
     """One request is under way at a time, with at most 64 changes."""
     world, requests = await started()
@@ -141,27 +103,6 @@ async def test_a_rejected_change_causes_a_round() -> None:
     assert (world.rosmaster.doubtful.is_set(), world.rosmaster.reachable) == (True, True)
 
 
-async def test_calls_wait_while_too_many_changes_wait() -> None:
-    """They are answered once a round has given the ROS master the registry, which then has the change."""
-    world, _requests = await started()
-    world.fill_queue()
-    calls = [
-        asyncio.ensure_future(world.ask("registerPublisher", "/n", "/t", TYPE, uri())),
-        asyncio.ensure_future(world.ask("unregisterPublisher", "/n", "/other", uri())),
-        asyncio.ensure_future(world.ask("unregisterService", "/n", "/s", "rosrpc://10.0.0.5:99")),
-        asyncio.ensure_future(world.ask("unsubscribeParam", "/n", uri(), "/p")),
-    ]
-    for _ in range(20):
-        await asyncio.sleep(0)
-    assert not [call for call in calls if call.done()]
-    assert not [one for one in world.registry.all() if one.name == "/n"]
-    await world.round()
-    answers: list[Any] = await asyncio.gather(*calls)
-    assert [answer[0] for answer in answers] == [1] * 4
-    await world.settle()
-    assert world.hidden.has(Kind.PUBLICATION, "/t") == ["/n"]
-
-
 async def test_a_host_leaves_room_in_the_queue() -> None:
     """A host with its share of waiting changes waits; a call of another host is answered at once."""
     world, _requests = await started()
@@ -176,17 +117,6 @@ async def test_a_host_leaves_room_in_the_queue() -> None:
     await world.round()
     answer: Any = await flood
     assert answer[0] == 1
-    await world.settle()
-
-
-async def test_a_call_does_not_wait_forever() -> None:
-    """If the ROS master does not come back, the call fails, and nothing was registered."""
-    world, _requests = await started()
-    world.fill_queue()
-    answer: Any = await world.ask("registerPublisher", "/n", "/t", TYPE, uri())
-    assert answer == [0, "the ROS master does not answer; the appliance is restarting it", []]
-    assert not [one for one in world.registry.all() if one.name == "/n"]
-    await world.round()
     await world.settle()
 
 

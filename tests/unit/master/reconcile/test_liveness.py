@@ -7,7 +7,6 @@ from typing import Any, cast
 import pytest
 
 from appliance.base.clock import using
-from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.reconcile import liveness
 from appliance.master.reconcile.liveness import Presence
@@ -31,43 +30,6 @@ async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
         world.clients.silent = set()
         await world.look(node)
     assert (node.life, world.hidden.has(Kind.PUBLICATION, "/a")) == (Life.LIVE, ["/n"])
-
-
-async def test_a_missed_list_is_sent_again_when_the_node_answers() -> None:
-    """A list that was lost in a short outage is sent again once, even if the node never counted as lost.
-
-    The node may know the list but have lost the connection, so a list without the publisher is sent first.
-    """
-    world = ControlParts(silent=3600.0)
-    await world.round()
-    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
-    await world.register(ear, Kind.SUBSCRIPTION, "/t")
-    await world.register(ear, Kind.SUBSCRIPTION, "/other")
-    await world.register(mouth, Kind.PUBLICATION, "/t")
-    world.deliveries.told.clear()
-    world.clients.silent = {"/ear"}
-    world.watchlist.could_not_tell(ear, NodeCall("publisherUpdate", ("/t", [])), "away")
-    await world.settle()
-    assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
-    world.clients.silent = set()
-    await world.look(ear)
-    await world.look(ear)
-    lists: list[tuple[str, list[str]]] = [("/t", []), ("/t", [mouth.outer_uri("10.0.0.1")])]
-    assert world.deliveries.told == [("/ear", "publisherUpdate", each) for each in lists]
-
-
-async def test_a_subscriber_that_was_cut_off_gets_its_list_again() -> None:
-    """A subscriber whose connection broke drops the publisher and connects again, once it answers."""
-    world = await ControlParts.begun()
-    ear, mouth = world.node("/ear", 1), world.node("/mouth", 2)
-    await world.register(ear, Kind.SUBSCRIPTION, "/t")
-    await world.register(mouth, Kind.PUBLICATION, "/t")
-    world.deliveries.told.clear()
-    world.watchlist.cut_off(ear, "/t")
-    for watched in world.watchlist.take():
-        await world.look(watched)
-    lists: list[tuple[str, list[str]]] = [("/t", []), ("/t", [mouth.outer_uri("10.0.0.1")])]
-    assert world.deliveries.told == [("/ear", "publisherUpdate", each) for each in lists]
 
 
 async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
