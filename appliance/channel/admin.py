@@ -33,6 +33,7 @@ from appliance.channel.answers import (
     graph_answers,
     host_answers,
     inventory_answers,
+    limit_answers,
     measures,
     monitor_answers,
     policy_answers,
@@ -118,6 +119,11 @@ class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
 @rest("viewer", "GET", "/v1/inventory", name="inventory", tag="status")
 class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
     """The running software: version, build, parts with their licences, and the kernel's features in use."""
+
+
+@rest("viewer", "GET", "/v1/limits", name="limits", tag="status")
+class LimitsWanted(AdminRequest[limit_answers.LimitList], frozen=True, tag="limits"):
+    """The finite resources that hosts can exhaust: used of allowed, and the host that uses most of each."""
 
 
 @rest(

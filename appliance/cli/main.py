@@ -18,6 +18,7 @@ _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there i
 VERBS: dict[str, Verb | Group] = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
+    "limits": Verb("limits_verb:limits"),
     "selftest": Verb("selftest.verb:selftest"),
     "demo": Verb("demo:demo"),
     "protect": Verb("protect_verb:protect", "Close the ROS ports of this machine to all but the appliance."),

@@ -13,6 +13,7 @@ from appliance.control.clock_check import ClockCheck
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder_link import ForwarderLink
 from appliance.control.foundation import Current, Foundation
+from appliance.control.limit_use import LimitQueries
 from appliance.control.overview import hosts_connected
 from appliance.control.queries import Queries
 from appliance.control.request_methods import request_methods
@@ -132,6 +133,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             blocks=blocks,
             evidence=EvidenceOrders(base.audit, trail),
             standby=orders,
+            limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),
         ),
         durable=partial(_durable, base),
         require_room=base.store.database.require_room,

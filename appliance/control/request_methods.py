@@ -8,6 +8,7 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.limit_use import LimitQueries
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecordingOrders
@@ -43,11 +44,13 @@ def request_methods(
     blocks: BlockOrders,
     evidence: EvidenceOrders,
     standby: StandbyOrders,
+    limits: LimitQueries,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request."""
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
+        RequestMethod(admin.LimitsWanted, limits.use, order=False),
         RequestMethod(admin.GraphWanted, queries.graph, order=False),
         RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),
         RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),

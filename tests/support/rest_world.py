@@ -31,6 +31,7 @@ from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.administration import Administration
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.limit_use import LimitQueries
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecordingOrders
@@ -148,6 +149,7 @@ class RestWorld:
             blocks=idle(BlockOrders),
             evidence=idle(EvidenceOrders),
             standby=idle(StandbyOrders),
+            limits=idle(LimitQueries),
         )
         administration = Administration(
             queries,

@@ -101,7 +101,7 @@ NAMED = [operation for operation in OPERATIONS if operation.name]
 LEAST = {
     **dict.fromkeys(
         (
-            "status", "inventory", "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
+            "status", "inventory", "limits", "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
             "monitor_revision",
             "recordings", "recording", "hosts", "host_blocks", "challenge", "standby",
         ),

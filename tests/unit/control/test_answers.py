@@ -11,6 +11,7 @@ from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.limit_use import LimitQueries
 from appliance.control.policies import Policies
 from appliance.control.queries import Queries
 from appliance.control.recording_orders import RecordingOrders
@@ -42,6 +43,7 @@ CLASSES: dict[str, Any] = {
     "blocks": BlockOrders,
     "evidence": EvidenceOrders,
     "standby": StandbyOrders,
+    "limits": LimitQueries,
 }
 METHODS = request_methods(**CLASSES)
 REQUESTS: tuple[type[Any], ...] = tuple(

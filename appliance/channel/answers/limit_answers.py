@@ -1,0 +1,27 @@
+"""The answer about the limits of finite resources: how much of each is used."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.channel.answers.field_docs import doc
+
+
+class LimitUse(msgspec.Struct, frozen=True):
+    """A finite resource: how much all hosts use together, and the host that uses most of its own quota."""
+
+    resource: Annotated[str, doc("the resource with its unit")]
+    used: Annotated[int, doc("by all hosts together")]
+    allowed: Annotated[int | None, doc("for all hosts together; null: only each host has a limit")]
+    setting: Annotated[str, doc("the setting that changes the limit; empty: there is none")]
+    host: Annotated[str, doc("the host that uses most; empty: none, or hosts have no quota of their own")] = (
+        ""
+    )
+    host_used: Annotated[int, doc("by that host")] = 0
+    host_allowed: Annotated[int, doc("the limit of one host")] = 0
+
+
+class LimitList(msgspec.Struct, frozen=True):
+    """The finite resources that hosts can exhaust, with their present use."""
+
+    limits: Annotated[list[LimitUse], doc("one row for each resource")]
