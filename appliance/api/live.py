@@ -13,7 +13,6 @@ from fastapi import Query, Request, Response
 from sse_starlette import EventSourceResponse, ServerSentEvent
 
 from appliance.api.access import Bearer
-from appliance.api.alarms import Alarm, activity, open_alarms
 from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, LastSample, Sample
 from appliance.api.moments import in_full
@@ -24,6 +23,7 @@ from appliance.api.services import Services
 from appliance.api.streams import StreamResponse, Streams, peer_of
 from appliance.base import clock
 from appliance.channel.admin import GraphWanted
+from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.status import Status
 from appliance.channel.answers.token_answers import TokenRole

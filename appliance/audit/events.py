@@ -29,6 +29,9 @@ EVENTS: dict[str, str] = {
     " what ended.",
     "host unblocked": "An operator lifted the block of a host; `detail` has who.",
     "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
+    "alarm acknowledged": "An operator takes care of an alarm; `resource` is its kind, `detail` has who and the note.",
+    "alarm silenced": "An operator made an alarm a notice for a time; `detail` has who, `until` and the note.",
+    "alarm sounds again": "An operator ended the silence or the acknowledgement of an alarm.",
     "host awaited": "A one-time token was made; the host that presents it is enrolled under this name.",
     "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
     "hosts reloaded": "The file of declared hosts was read again; `detail` has the tunnels that were opened and"

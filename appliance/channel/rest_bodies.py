@@ -16,6 +16,7 @@ LONGEST_REQUEST = 16 << 10
 LONGEST_DAYS = 398
 LONGEST_TOKEN_SECONDS = 7 * 86_400
 LONGEST_REVISION = 10**15
+LONGEST_SILENCE_SECONDS = 7 * 86_400.0
 LONGEST_BLOCK_SECONDS = 365 * 86_400
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[
@@ -201,6 +202,24 @@ class NewBlock(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
     note: Annotated[str, doc("reason for the block, shown to operators", max_length=200)] = ""
     force: Annotated[bool, doc("block the robot's own host also")] = False
+
+
+class OneAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An alarm to acknowledge."""
+
+    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
+    note: Annotated[str, doc("shown to operators", max_length=200)] = ""
+
+
+class SilencedAlarm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An alarm to silence."""
+
+    kind: Annotated[str, doc("the alarm's name", min_length=1, max_length=300)]
+    seconds: Annotated[
+        Annotated[float, msgspec.Meta(ge=1, le=LONGEST_SILENCE_SECONDS)] | None,
+        doc("the silence ends after this time; null: it ends now"),
+    ] = None
+    note: Annotated[str, doc("reason, shown to operators", max_length=200)] = ""
 
 
 class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -21,6 +21,14 @@ VERBS: dict[str, Verb | Group] = {
     "limits": Verb("limits_verb:limits"),
     "selftest": Verb("selftest.verb:selftest"),
     "demo": Verb("demo:demo"),
+    "alarm": Group(
+        "List the present alarms, and record who takes care of them.",
+        {
+            "list": Verb("alarm_verbs:list_alarms"),
+            "acknowledge": Verb("alarm_verbs:acknowledge"),
+            "silence": Verb("alarm_verbs:silence"),
+        },
+    ),
     "protect": Verb("protect_verb:protect", "Close the ROS ports of this machine to all but the appliance."),
     "audit": Group(
         "Review the audit log and verify that it is complete.",

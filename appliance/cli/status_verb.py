@@ -11,11 +11,11 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from appliance.api.alarms import activity, open_alarms
 from appliance.api.moments import in_full
 from appliance.base import clock
 from appliance.base.actors import DISK
 from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
+from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
@@ -112,9 +112,14 @@ def _shown(answer: AdminAnswer[A], view: Callable[[A], StatusView]) -> AdminAnsw
 
 def _view(body: Status) -> StatusView:
     troubles = list(troubles_of(body))
-    attention = [alarm.text for alarm in activity(body)]
+    attention = [alarm.text for alarm in (*activity(body), *open_alarms(body)) if _is_attention(alarm, body)]
     fields = {**in_full(body), "troubles": troubles, "attention": attention}
     return StatusView(1 if troubles else 0, StatusScreen(body, troubles, attention), fields)
+
+
+def _is_attention(alarm: Alarm, body: Status) -> bool:
+    """Whether an alarm is shown without being a trouble: recent denials and drops, and silenced alarms."""
+    return alarm in activity(body) or (alarm.severity == "notice" and alarm.handled != "")
 
 
 def troubles_of(body: Status) -> list[str]:

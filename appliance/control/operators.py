@@ -5,6 +5,7 @@ from functools import partial
 
 from appliance.channel.answers.status import AuditState
 from appliance.control.administration import Administration
+from appliance.control.alarm_orders import AlarmOrders, HandledAlarms
 from appliance.control.assembly import Parts
 from appliance.control.block_orders import BlockOrders
 from appliance.control.bundle_gate import BundleGate
@@ -103,6 +104,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes, deprived
         ),
     )
+    handled = HandledAlarms(base.store)
     looks = Queries(
         parts,
         trail,
@@ -118,6 +120,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         blocks=blocks.status,
         standby=standby.state,
         bundles=bundles.status,
+        handled=handled.marked,
     )
     orders = StandbyOrders(standby, trail)
     administration = Administration(
@@ -133,6 +136,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             blocks=blocks,
             evidence=EvidenceOrders(base.audit, trail),
             standby=orders,
+            alarms=AlarmOrders(handled, trail, looks.present),
             limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),
         ),
         durable=partial(_durable, base),

@@ -61,7 +61,8 @@ class Queries:
     `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
     recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
     that is switched off. `blocks()` and `bundles()` return the states of the blocks and the bundles. `standby()`
-    returns the state of the two appliances, or None if this one is not one of two.
+    returns the state of the two appliances, or None if this one is not one of two. `handled(status)` adds the alarms
+    that operators have acknowledged or silenced.
     """
 
     parts: Parts
@@ -78,12 +79,13 @@ class Queries:
     blocks: Callable[[], BlocksState]
     standby: Callable[[], StandbyState | None]
     bundles: Callable[[], BundlesState | None]
+    handled: Callable[[Status], Status]
     started: float = field(default_factory=wall)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
     async def status(self, _request: admin.StatusWanted) -> Status:
         """Return the status of all parts of the appliance."""
-        return self._status()
+        return self.present()
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
         """Return the parts of the appliance, and the kernel features in use."""
@@ -157,12 +159,16 @@ class Queries:
     async def metrics(self, _request: admin.MetricsWanted) -> Measures:
         """Return the status and all counters."""
         return measures_of(
-            self.parts, self.trail.meter, self._status(), self.hosts.rows(), self.queued_deliveries()
+            self.parts, self.trail.meter, self.present(), self.hosts.rows(), self.queued_deliveries()
         )
 
     async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
         """Return all live rights that a change of the policy may end."""
         return Registrations([Registration(**live.fields()) for live in self.live()])
+
+    def present(self) -> Status:
+        """Return the status of all parts of the appliance."""
+        return self.handled(self._status())
 
     def _status(self) -> Status:
         parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay

@@ -6,6 +6,7 @@ from typing import Any, Generic
 
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
+from appliance.control.alarm_orders import AlarmOrders
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.limit_use import LimitQueries
@@ -45,11 +46,15 @@ def request_methods(
     evidence: EvidenceOrders,
     standby: StandbyOrders,
     limits: LimitQueries,
+    alarms: AlarmOrders,
 ) -> tuple[RequestMethod[Any], ...]:
     """Return the methods of these parts: one for each request."""
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
+        RequestMethod(admin.AlarmsWanted, alarms.listed, order=False),
+        RequestMethod(admin.AlarmAcknowledge, alarms.acknowledge, who=True),
+        RequestMethod(admin.AlarmSilence, alarms.silence, who=True),
         RequestMethod(admin.LimitsWanted, limits.use, order=False),
         RequestMethod(admin.GraphWanted, queries.graph, order=False),
         RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),

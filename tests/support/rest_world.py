@@ -29,6 +29,7 @@ from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.administration import Administration
+from appliance.control.alarm_orders import AlarmOrders
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.limit_use import LimitQueries
@@ -150,6 +151,7 @@ class RestWorld:
             evidence=idle(EvidenceOrders),
             standby=idle(StandbyOrders),
             limits=idle(LimitQueries),
+            alarms=idle(AlarmOrders),
         )
         administration = Administration(
             queries,

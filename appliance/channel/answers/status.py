@@ -213,6 +213,16 @@ class MinuteState(msgspec.Struct, frozen=True):
     attention_at: Annotated[int, doc("the least number of denials that needs attention")] = 10
 
 
+class HandledAlarm(msgspec.Struct, frozen=True):
+    """An alarm that an operator has acknowledged, or silenced for a time."""
+
+    kind: Annotated[str, doc("the alarm's name")]
+    who: Annotated[str, doc("name of the token, or `operator`")]
+    since: Moment
+    until: Annotated[Moment | None, doc("when the silence ends; null: it is acknowledged, and not silenced")]
+    note: str = ""
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -245,3 +255,6 @@ class Status(msgspec.Struct, frozen=True):
     last_minute: MinuteState = MinuteState(0, {})
     standby: Annotated[StandbyState | None, doc("null: this appliance is not one of two")] = None
     bundles: Annotated[BundlesState | None, doc("null: no bundles of a fleet are configured")] = None
+    handled_alarms: Annotated[
+        list[HandledAlarm], doc("alarms that an operator acknowledged or silenced")
+    ] = []

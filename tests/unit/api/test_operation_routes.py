@@ -101,7 +101,8 @@ NAMED = [operation for operation in OPERATIONS if operation.name]
 LEAST = {
     **dict.fromkeys(
         (
-            "status", "inventory", "limits", "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
+            "status", "alarms", "inventory", "limits",
+            "policy_revisions", "policy_revision", "graph", "monitors", "monitor_revisions",
             "monitor_revision",
             "recordings", "recording", "hosts", "host_blocks", "challenge", "standby",
         ),

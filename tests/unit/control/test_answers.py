@@ -9,6 +9,7 @@ from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
+from appliance.control.alarm_orders import AlarmOrders
 from appliance.control.block_orders import BlockOrders
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.limit_use import LimitQueries
@@ -44,6 +45,7 @@ CLASSES: dict[str, Any] = {
     "evidence": EvidenceOrders,
     "standby": StandbyOrders,
     "limits": LimitQueries,
+    "alarms": AlarmOrders,
 }
 METHODS = request_methods(**CLASSES)
 REQUESTS: tuple[type[Any], ...] = tuple(

@@ -1,10 +1,11 @@
 """Derive alarms (present conditions that need attention) from the status: for the console, REST, `rosrv status`."""
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Literal
 
 import msgspec
+from msgspec import structs
 
 from appliance.base import clock
 from appliance.channel.answers.field_docs import doc
@@ -22,9 +23,16 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """A condition that holds now. `kind` is a stable name; the alarm ends together with the condition."""
 
     kind: str
-    severity: Severity
+    severity: Annotated[Severity, doc("`notice` for a silenced alarm")]
     text: Annotated[str, doc("the problem and what to do, for a person")]
-    about: About
+    about: Annotated[About, doc("what it belongs to")]
+    handled: Annotated[str, doc("who acknowledged or silenced it; empty: nobody")] = ""
+
+
+class AlarmList(msgspec.Struct, frozen=True):
+    """The present alarms."""
+
+    alarms: Annotated[list[Alarm], doc("the most severe first, then denials and drops of the last minute")]
 
 
 def open_alarms(status: Status) -> list[Alarm]:
@@ -39,7 +47,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     alarms = (
         Alarm(kind=kind, severity=severity, text=text, about=about) for severity, kind, about, text in found
     )
-    return sorted(alarms, key=lambda alarm: _ORDER.index(alarm.severity))
+    return sorted(_handled(status, alarms), key=lambda alarm: _ORDER.index(alarm.severity))
 
 
 def activity(status: Status) -> list[Alarm]:
@@ -58,7 +66,21 @@ def activity(status: Status) -> list[Alarm]:
     if recent.denials >= recent.attention_at:
         text = f"{recent.denials} denials in the last minute; rosrv audit summary --since 1m"
         found.insert(0, Alarm(kind="denials", severity="warning", text=text, about="audit"))
-    return found
+    return list(_handled(status, found))
+
+
+def _handled(status: Status, alarms: Iterable[Alarm]) -> Iterator[Alarm]:
+    """Yield the alarms, those that an operator acknowledged or silenced with a note about it."""
+    rows = {row.kind: row for row in status.handled_alarms}
+    for alarm in alarms:
+        row = rows.get(alarm.kind)
+        if row is None:
+            yield alarm
+            continue
+        end = "acknowledged" if row.until is None else f"silenced until {_moment(row.until)}"
+        how = f"{end} by {row.who}{f': {row.note}' if row.note else ''}"
+        severity = alarm.severity if row.until is None else "notice"
+        yield structs.replace(alarm, severity=severity, text=f"{alarm.text} ({how})", handled=how)
 
 
 def _system(status: Status) -> Iterator[_Condition]:

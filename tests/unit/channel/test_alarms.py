@@ -1,10 +1,10 @@
-"""Tests of `appliance.api.alarms`."""
+"""Tests of `appliance.channel.alarms`."""
 
 from typing import Any
 
 import pytest
 
-from appliance.api.alarms import activity, open_alarms
+from appliance.channel.alarms import activity, open_alarms
 from appliance.channel.answers.status import Status
 from tests.support.answers import example
 

@@ -1,0 +1,73 @@
+"""`rosrv alarm list|acknowledge|silence`: the present alarms, and who takes care of them."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.channel.admin import AlarmAcknowledge, AlarmSilence, AlarmsWanted
+from appliance.channel.alarms import AlarmList
+from appliance.channel.rest_bodies import LONGEST_SILENCE_SECONDS
+from appliance.cli.connection.target import Appliance, speaks
+from appliance.cli.durations import span_given
+from appliance.cli.output import say_json, usage_error
+from rosmop.tool.terminal import say
+
+_STYLES = {"alarm": "bold red", "warning": "yellow", "notice": ""}
+_Kind = Annotated[
+    str, typer.Argument(help="Name of the alarm, as `rosrv alarm list` prints it", show_default=False)
+]
+_Note = Annotated[str, typer.Option(help="Why, for other operators")]
+
+
+@speaks
+def list_alarms(appliance: Appliance) -> None:
+    """List the present alarms with their names, the most severe first.
+
+    Example: rosrv alarm list
+    """
+    _say(appliance.ask_or_exit(AlarmsWanted()), as_json=appliance.as_json)
+
+
+@speaks
+def acknowledge(appliance: Appliance, kind: _Kind, *, note: _Note = "") -> None:
+    """Record that you take care of an alarm. It stays an alarm, with your name, until its condition is over.
+
+    Example: rosrv alarm acknowledge audit-not-forwarded --note "the receiver is being replaced"
+    """
+    _say(appliance.ask_or_exit(AlarmAcknowledge(kind, note)), as_json=appliance.as_json)
+
+
+@speaks
+def silence(
+    appliance: Appliance,
+    kind: _Kind,
+    *,
+    time: Annotated[
+        str | None,
+        typer.Option("--for", metavar="TIME", help="For this time: 30m, 12h; at most 7d", show_default=False),
+    ] = None,
+    end: Annotated[bool, typer.Option("--end", help="End the silence, or an acknowledgement, now")] = False,
+    note: _Note = "",
+) -> None:
+    """Make an alarm a notice for a time, so that `rosrv status` exits with 0. Metrics do not change.
+
+    Example: rosrv alarm silence audit-not-forwarded --for 2h
+    """
+    if (time is None) is not end:
+        raise usage_error("give either --for TIME or --end", "rosrv alarm")
+    seconds = None if time is None else span_given("--for", time, "30m, 12h or 7d", "rosrv alarm")
+    if seconds is not None and not 1 <= seconds <= LONGEST_SILENCE_SECONDS:
+        raise usage_error(f"--for {time}: an alarm is silenced for 1s to 7d", "rosrv alarm")
+    _say(appliance.ask_or_exit(AlarmSilence(kind, seconds, note)), as_json=appliance.as_json)
+
+
+def _say(body: AlarmList, *, as_json: bool) -> None:
+    for alarm in body.alarms:
+        if as_json:
+            say_json(alarm)
+        else:
+            say(f"{alarm.severity}  {alarm.kind}", _STYLES[alarm.severity])
+            for line in alarm.text.splitlines():
+                say(f"    {line}")
+    if not body.alarms and not as_json:
+        say("no alarms")
