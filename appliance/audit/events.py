@@ -53,7 +53,8 @@ EVENTS: dict[str, str] = {
     "specifications refused": "Specifications have errors and were rejected as a whole; the previous ones stay in"
     " force.",
     "monitor not built": "The file of a monitor has an error at the start, for example after an upgrade. The appliance"
-    " starts without the monitor, which holds its topics unless it is declared `begin`.",
+    " starts without the monitor, which holds its topics unless it is declared `begin`. If the topics of the file are"
+    " not known (`resource` is the file), nothing holds them.",
     "monitor enabled": "A monitor was enabled; `detail` has who enabled it.",
     "monitor disabled": "A monitor was disabled: its topics' messages pass unchanged; `detail` has who disabled it,"
     " and `until` if it is enabled again automatically.",

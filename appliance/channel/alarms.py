@@ -145,6 +145,9 @@ def _monitors(status: Status) -> Iterator[_Condition]:
         why = monitors.why_held.get(name, "a relay was restarted")
         text = f"topics are held ({name}: {why}): rosrv monitor resume {name}"
         yield "alarm", f"monitor-held:{name}", "monitors", text
+    for file, error in monitors.left_out.items():
+        text = f"{file} is left out, so nothing guards its topics: {error}: rosrv monitor load {file}"
+        yield "alarm", f"monitor-left-out:{file}", "monitors", text
     for name in monitors.failing:
         text = f"monitors fail: {name}; its messages are dropped"
         yield "alarm", f"monitor-failing:{name}", "monitors", text

@@ -123,8 +123,10 @@ def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
         try:
             check(sources, site_keys)
         except SpecificationsRefusedError as error:
-            unbuilt = check(sources, site_keys, compiler=contents_at_start).unbuilt
-            refused([*error.findings, f"started without {', '.join(unbuilt)}: rosrv monitor list"])
+            started = check(sources, site_keys, compiler=contents_at_start)
+            without = ", ".join([*started.unbuilt, *started.left_out])
+            unguarded = "; nothing guards the topics of files that cannot be read" if started.left_out else ""
+            refused([*error.findings, f"started without {without}{unguarded}: rosrv status"])
     except SpecificationsRefusedError as error:
         return "\n".join(error.findings)
     return ""

@@ -162,7 +162,7 @@ def _make_monitors(
         check_at_start=compiler.check_at_start,
         try_out=compiler.try_out,
         parts=compiler.parts,
-        live=lambda: published_now(core.registry, core.carried.traffic),
+        live=lambda: published_now(core.registry, core.carried),
     )
 
 

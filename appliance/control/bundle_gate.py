@@ -11,6 +11,7 @@ Invariants:
 2. The bundle in force changes in one write, at the end of a healthy trial.
 3. Going back never undoes a change that an operator made during the trial.
 4. A refused bundle changes nothing; the last good one stays in force.
+5. A bundle whose monitors would hold topics that carry messages waits: the robot would get no command, not even a stop.
 """
 
 import asyncio
@@ -117,6 +118,7 @@ class BundleGate:
         self._store, self._trail, self._measured = store, trail, health
         self._earlier: Policy | None = None  # the policy before the bundle
         self._lost: LostRights | None = None
+        self._held = frozenset[str]()  # monitors that hold topics since the bundle replaced them
         self.link = Link(self._heard)
         self._record = msgspec.json.decode(store.settings().get(_SETTING, "{}"), type=BundleRecord)
         self._poll = messages.BundlePollReported()
@@ -238,8 +240,12 @@ class BundleGate:
         try:
             parse_declared(contents.hosts, IN_BUNDLE)
             await self._policies.attempt(contents.policy, contents.policy_signature, _cases(contents))
+            held = await self._monitors.held_by_bundle(_sources(contents))
         except _REFUSALS as error:
             self._refuse(offered.path, offered.sha256, str(error))
+            return
+        if held:
+            self._waits = f"{offered.path} waits until no message passes for a minute: {held[0]}"
             return
         trial = Trial(
             offered.path,
@@ -262,11 +268,12 @@ class BundleGate:
         before, self._earlier = self._health(), self._policies.current
         try:
             await self._put_in_force(trial, contents)
+            self._held = frozenset(self._monitors.rollout.held - before.failing)
             reason = await self._watched(before)
         except _REFUSALS as error:
             reason = str(error)
         if reason:
-            self._earlier = None
+            self._earlier, self._held = None, frozenset()
             await self._undo(trial)
             self._refuse(trial.path, trial.sha256, reason)
             return
@@ -292,8 +299,7 @@ class BundleGate:
 
     async def _put_in_force(self, trial: Trial, contents: messages.BundleContents) -> None:
         """Bring all parts into force. Raises one of `_REFUSALS`; then some parts may be in force."""
-        sources = Sources(contents.files, contents.definitions, contents.signatures)
-        await self._monitors.take_bundle(sources, trial.who, "of the bundle")
+        await self._monitors.take_bundle(_sources(contents), trial.who, "of the bundle")
         load = admin.PolicyLoad(contents.policy, "of the bundle", signature=contents.policy_signature)
         await self._policies.load_with(load, trial.who, _cases(contents))
         await self._hosts.take_bundle(contents.hosts or "\n", trial.who)
@@ -312,13 +318,17 @@ class BundleGate:
             await asyncio.sleep(min(_TICK_SECONDS, max(0.0, deadline - clock.now())))
 
     def _health(self) -> RobotHealth:
-        """Return the present health, without denials of hosts from which the bundle took a right."""
+        """Return the present health, without the effects that every activation of the bundle has.
+
+        These are denials of hosts from which it took a right, and monitors that lost their state and hold.
+        """
         old, new, lost = self._earlier, self._policies.current, self._lost
         if old is None:
             return self._measured(lambda _host: False)
         if lost is None or (lost.old, lost.new) != (old, new):
             lost = self._lost = LostRights(old, new)
-        return self._measured(lost.took_from)
+        health = self._measured(lost.took_from)
+        return health._replace(failing=health.failing - self._held)
 
     def _refuse(self, path: str, sha256: str, reason: str) -> None:
         refused = RefusedBundle(path, sha256, reason[:4000])
@@ -370,6 +380,10 @@ class BundleGate:
     def _save(self, record: BundleRecord) -> None:
         self._record = record
         self._store.save_setting(_SETTING, msgspec.json.encode(record).decode())
+
+
+def _sources(contents: messages.BundleContents) -> Sources:
+    return Sources(contents.files, contents.definitions, contents.signatures)
 
 
 def _cases(contents: messages.BundleContents) -> PolicyCases:

@@ -1,13 +1,11 @@
 """Describe the states of monitors for operators."""
 
-from collections.abc import Mapping
-
 import msgspec
 
 from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import MonitorRow
-from appliance.master.endpoints.traffic import Traffic
+from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Kind, Registry
 from appliance.specifications.live_topics import LiveType, Published
 from appliance.specifications.specification_manager import SpecificationManager
@@ -49,6 +47,7 @@ def monitors_status(monitors: SpecificationManager) -> MonitorsState:
         confirm_by=monitors.confirm_by,
         shadow=[row.name for row in rows if row.shadow],
         why_held={row.name: row.why_held for row in rows if row.why_held},
+        left_out=monitors.checked.left_out,
     )
 
 
@@ -85,15 +84,17 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
     )
 
 
-def published_now(registry: Registry, traffic: Mapping[tuple[str, str], Traffic]) -> Published:
+def published_now(registry: Registry, relayed: RelayTraffic) -> Published:
     """Return the nodes that publish each topic, with their types; omit the appliance's own nodes."""
     found: dict[str, dict[str, LiveType]] = {}
     for kind, topic, nodes in registry.resources():
         if kind is Kind.PUBLICATION:
             for node in nodes:
                 if not node.own:
-                    carried = traffic.get((node.key, topic))
+                    carried = relayed.traffic.get((node.key, topic))
                     found.setdefault(topic, {})[node.name] = LiveType(
-                        node.registrations[kind, topic].detail, "" if carried is None else carried.md5sum
+                        node.registrations[kind, topic].detail,
+                        "" if carried is None else carried.md5sum,
+                        relayed.moving(node.key, topic),
                     )
     return found

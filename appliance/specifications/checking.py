@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
+import msgspec
+
 from appliance.channel.messages import Contents, PartNames, StateOwner
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -86,22 +88,24 @@ def contents(
 
 
 def contents_at_start(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
-    """Compile these files; the monitors of files with errors do nothing (`Contents.unbuilt`).
+    """Compile these files; the monitors of files with errors do nothing (`Contents.unbuilt`, `Contents.left_out`).
 
-    Raises `SpecificationsRefusedError` with the errors if the topics of a file with errors are not known: it cannot be
-    parsed, or the type of a message is not defined.
+    Raises `SpecificationsRefusedError` if they exceed a limit.
     """
     try:
         return contents(files, texts, load=True)
     except SpecificationsRefusedError as error:
         refusal = error
     good, errors = _good(files, texts)
+    bad = {file: errors[file] for file in files if file not in good}
+    left_out = {file: error for file, error in bad.items() if not _topics_known(files[file], file, texts)}
+    rest = {file: text for file, text in files.items() if file not in left_out}
+    unbuilt = {file: error for file, error in bad.items() if file in rest}
     try:
-        return contents(
-            files, texts, load=True, unbuilt={file: errors[file] for file in files if file not in good}
-        )
+        found = contents(rest, texts if rest else {}, load=True, unbuilt=unbuilt)
     except SpecificationsRefusedError:
         raise refusal from None
+    return msgspec.structs.replace(found, left_out=left_out)
 
 
 def check(
@@ -115,6 +119,14 @@ def check(
         return CheckedSpecifications()
     require_bounded(sources)
     return checked(compiler(sources.files, sources.definitions), sources, site_keys)
+
+
+def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
+    try:
+        contents({file: text}, texts, unbuilt={file: ""})
+    except SpecificationsRefusedError:
+        return False
+    return True
 
 
 def _good(files: Mapping[str, str], texts: Mapping[str, str]) -> tuple[set[str], dict[str, str]]:

@@ -15,10 +15,14 @@ from appliance.specifications.specification_files import CheckedSpecifications
 
 
 class LiveType(NamedTuple):
-    """The type that a node registered, and the md5sum in its header (empty if no relay has seen the header)."""
+    """The type that a node registered, and the md5sum in its header (empty if no relay has seen the header).
+
+    `moving`: it has published in the last minute, as far as is known.
+    """
 
     name: str
     md5sum: str = ""
+    moving: bool = True
 
 
 Published = Mapping[str, Mapping[str, LiveType]]
@@ -83,9 +87,10 @@ def judge_holds(
     moved: Collection[str],
     hold: bool,
 ) -> TopicFindings:
-    """Find the monitors that will lose their state and hold topics with a publisher; with `hold`, these are warnings.
+    """Find the monitors that will lose their state and hold topics with a publisher.
 
-    Only monitors that are `acting` now and later hold topics. The files `moved` go to another relay.
+    Topics that carry messages are conflicts unless `hold` is set. Only monitors that are `acting` now and later hold
+    topics. The files `moved` go to another relay.
     """
     found = TopicFindings([], [])
     for name in (one for one in acting if one in present.states and coming.states[one].holds):
@@ -95,8 +100,9 @@ def judge_holds(
         if topics and (changed or coming.monitors[name] in moved):
             why = "its text, or a definition, changes" if changed else "it moves to another relay"
             text = f"{name} loses its state, because {why}, and then holds {', '.join(topics)}: it drops every message"
-            (found.warnings if hold else found.conflicts).append(
-                f"{owner.position}: {'warning' if hold else 'error'}: {text}; {_RESUME if hold else _HOLD} {name}"
+            refused = not hold and any(live.moving for topic in topics for live in published[topic].values())
+            (found.conflicts if refused else found.warnings).append(
+                f"{owner.position}: {'error' if refused else 'warning'}: {text}; {_HOLD if refused else _RESUME} {name}"
             )
     return found
 

@@ -37,7 +37,7 @@ from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.live_topics import Published, judge_holds, judge_topics
+from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.rollout import SHADOW, Parts, Relays, Revision, Rollout, Switch
 from appliance.specifications.specification_files import (
@@ -201,6 +201,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self._say_folder_refused(refused)
         for name, error in checked.unbuilt.items():
             self._say_unbuilt(name, error)
+        for file, error in checked.left_out.items():
+            self._say_left_out(file, error)
         self.returns.start(self._disabled())
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown:  # the monitors were removed while the robot ran
@@ -328,6 +330,13 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if self.in_force.who != DISK and sources == self.sources:
                 return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
             return await self._change(sources, who, who, note, consent=_Consent(hold=True))
+
+    async def held_by_bundle(self, sources: Sources) -> list[str]:
+        """Return why these sources would hold topics that carry messages. Raises `SpecificationsRefusedError`."""
+        if sources == self.sources:
+            return []
+        checked = await self._check(sources, self.site_keys)
+        return self._held(checked, self._in_shadow(checked), hold=False).conflicts
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replacement:
         """Remove files, given by their names or the names of their monitors.
@@ -491,6 +500,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             category="monitor",
             resource=name,
         )
+
+    def _say_left_out(self, file: str, error: str) -> None:
+        text = f"{file} is left out, because it has an error: {error}; its topics are not known, so nothing holds them"
+        _log.error(text)
+        fix = f"load a version without the error: rosrv monitor load {file}"
+        self._trail.happened("monitor not built", f"{text}; {fix}", category="monitor", resource=file)
 
     def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
         until = self.returns.until(name)
@@ -658,24 +673,29 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         promoted: Collection[str] = (),
     ) -> list[str]:
         """Return warnings about topics. Raises `SpecificationsRefusedError` if a topic would be cut, or held."""
-        present, live, states = self.checked, self._live(), self.switches.states_of(coming)
-        cut = judge_topics(coming, present, live, shadow=shadow, forced=consent.force, promoted=promoted)
+        cut = judge_topics(
+            coming, self.checked, self._live(), shadow=shadow, forced=consent.force, promoted=promoted
+        )
+        held = self._held(coming, shadow, hold=consent.hold)
+        if cut.conflicts or held.conflicts:
+            raise SpecificationsRefusedError([*cut.conflicts, *held.conflicts, *cut.warnings, *held.warnings])
+        return cut.warnings + held.warnings
+
+    def _held(self, coming: CheckedSpecifications, shadow: Collection[str], *, hold: bool) -> TopicFindings:
+        states = self.switches.states_of(coming)
         acting = {
             name
             for name in coming.monitors
             if self.switches.enabled(name) and states[name] and name not in shadow
         }
-        held = judge_holds(
+        return judge_holds(
             coming,
-            present,
-            live,
+            self.checked,
+            self._live(),
             acting=acting - self.rollout.held,
             moved=self.rollout.moved_files(coming),
-            hold=consent.hold,
+            hold=hold,
         )
-        if cut.conflicts or held.conflicts:
-            raise SpecificationsRefusedError([*cut.conflicts, *held.conflicts, *cut.warnings, *held.warnings])
-        return cut.warnings + held.warnings
 
     def _replaced(
         self,

@@ -69,7 +69,7 @@ async def specifications_at_start(
     If a reload would refuse the folder, they are those of `kept`, the revision that was in force before.
 
     Raises `SpecificationsRefusedError`, also if they are not of an operator and lack a monitor that is `named` to be
-    enabled.
+    enabled, unless a file is left out.
     """
     refused: list[str] = []
     if last is None:
@@ -77,7 +77,7 @@ async def specifications_at_start(
     else:
         sources, checked = sources_of(last), await _check_kept(check, last, site_keys)
     unknown = sorted(set(named) - checked.monitors.keys())
-    if unknown and (last is None or last.who == DISK):
+    if unknown and not checked.left_out and (last is None or last.who == DISK):
         raise SpecificationsRefusedError([f"--enable: {unknown_monitors(unknown, checked)}"])
     return StartingSpecifications(sources, checked, refused)
 
@@ -89,7 +89,7 @@ async def _folder_or_kept(
     try:
         sources = folder.read()
         checked = await check(sources, site_keys)
-        findings = [*checked.unbuilt.values()]
+        findings = [*checked.unbuilt.values(), *checked.left_out.values()]
     except SpecificationsRefusedError as error:
         if kept is None:
             raise
@@ -97,7 +97,7 @@ async def _folder_or_kept(
     if findings and kept is not None and sources_of(kept) != sources:
         with contextlib.suppress(SpecificationsRefusedError):
             before = await check(sources_of(kept), site_keys)
-            if not before.unbuilt:
+            if not (before.unbuilt or before.left_out):
                 return StartingSpecifications(sources_of(kept), before, findings)
     if sources is None or checked is None:
         raise SpecificationsRefusedError(findings)

@@ -12,6 +12,7 @@ import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite, bundle_files
+from tests.support.nodes import RosSession
 from tests.support.rosmaster import master_at
 from tests.support.waiting import eventually
 
@@ -21,6 +22,13 @@ quiet() {
     event said(std::string text) /chatter std_msgs/String '{data:text}' {
         ROS_INFO("%s", text.c_str());
     }
+}
+"""
+LATCH = """\
+latch() {
+    bool on;
+    event stop(bool b) /stop std_msgs/Bool '{data:b}' { on = !b; }
+    event said() /chatter std_msgs/String '{}' { if (!on) { return; } }
 }
 """
 
@@ -156,6 +164,24 @@ def test_an_unhealthy_bundle_goes_back_in_all_parts(site: tuple[BundleSite, str]
         assert appliance.status()["monitors"]["loaded"] == 0
         assert "Publishers" in appliance.rosrv("policy", "show").stdout
         assert "ocu-9" not in appliance.rosrv("host", "list").stdout
+
+
+def test_a_bundle_that_would_hold_a_moving_topic_waits(site: tuple[BundleSite, str], tmp_path: Path) -> None:
+    """A robot that drives keeps its commands; once it stands, the bundle comes into force, and its monitor holds."""
+    served, url = site
+    served.selection = ""
+    with robot(served, url) as appliance:
+        in_force(appliance, served.add(bundle_files(OPEN_POLICY, monitors__latch_dot_rv=LATCH)))
+        with RosSession(appliance.master_uri, tmp_path) as ros:
+            ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: false")
+            talker = ros.talker("roscpp", "/chatter")
+            path = served.add(bundle_files(OPEN_POLICY, monitors__latch_dot_rv=LATCH.replace("on", "is_on")))
+            eventually(lambda: "latch loses its state" in bundles_of(appliance)["trouble"], appliance.story)
+            assert not bundles_of(appliance)["refused"]
+            assert appliance.status()["monitors"]["held"] == []
+            talker.stop()
+        eventually(lambda: bundles_of(appliance)["in_force"] == str(path), appliance.story, seconds=120.0)
+        assert appliance.status()["monitors"]["held"] == ["latch"]
 
 
 def test_a_kill_during_the_trial_goes_back_and_tries_again(site: tuple[BundleSite, str]) -> None:

@@ -110,6 +110,10 @@ class MonitorsState(msgspec.Struct, frozen=True):
     why_held: Annotated[
         dict[str, str], doc("monitors that hold their topics because their state was lost, with the reason")
     ] = {}
+    left_out: Annotated[
+        dict[str, str],
+        doc("files that the start left out, because their topics are not known, with the error"),
+    ] = {}
 
 
 class ForwardingState(msgspec.Struct, frozen=True):

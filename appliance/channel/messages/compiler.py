@@ -26,7 +26,8 @@ class Contents(msgspec.Struct, frozen=True):
     `compiled` (`PartsWanted`).
 
     `unbuilt` has the monitors of files with errors, each with its first error. They do nothing; the relay holds their
-    topics.
+    topics. `left_out` has the files whose topics are not known, because they cannot be parsed or a type is not defined,
+    each with its first error; nothing holds their topics.
     """
 
     monitors: dict[str, str] = {}
@@ -43,6 +44,7 @@ class Contents(msgspec.Struct, frozen=True):
     places: dict[str, str] = {}
     unbuilt: dict[str, str] = {}
     states: dict[str, StateOwner] = {}
+    left_out: dict[str, str] = {}
 
 
 class ContentsWanted(Message):

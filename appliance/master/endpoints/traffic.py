@@ -21,6 +21,7 @@ MOST_RESOURCES = 2000
 OTHERS = "(others)"  # ROS names cannot contain brackets
 
 _STILL_SECONDS = 3.0  # after this time without a report, rates are 0
+_MOVING_SECONDS = 60.0
 
 
 @dataclass(slots=True)
@@ -31,6 +32,7 @@ class Traffic:
     bytes: int = 0
     dropped: int = 0
     seconds: float = 0.0  # the time of the last report (monotonic)
+    moved: float = 0.0  # the time of the last report with messages (monotonic)
     messages_per_second: float = 0.0  # the rate between the last two reports
     bytes_per_second: float = 0.0
     delays: list[int] = field(default_factory=list)  # as in `TopicTraffic`
@@ -44,6 +46,7 @@ class Traffic:
         self.bytes += row.bytes
         self.dropped += row.dropped
         self.md5sum = row.md5sum or self.md5sum
+        self.moved = now if row.messages else self.moved
         passed = max(now - self.seconds, 1.0) if self.seconds else max(over, 1.0)
         self.messages_per_second = row.messages / passed
         self.bytes_per_second = row.bytes / passed
@@ -79,6 +82,7 @@ class RelayTraffic:
         self._cut_off = cut_off
         self._registry = registry
         self._relays = relays
+        self._began = clock.now()
         self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
         """The connections, by relay and the relay's own number. `number` is unique among all relays."""
         self.traffic: dict[tuple[str, str], Traffic] = {}
@@ -122,6 +126,11 @@ class RelayTraffic:
             bytes_per_second=round(traffic.bytes_per_second, 1) if flows else 0.0,
             delay_seconds=round(traffic.delay, 6) if flows else 0.0,
         )
+
+    def moving(self, key: str, resource: str) -> bool:
+        """Whether messages have passed in the last minute, or may have, because control started later."""
+        moved = self.traffic.get((key, resource), Traffic()).moved
+        return clock.now() - max(moved, self._began) < _MOVING_SECONDS
 
     def lost(self, relay: int) -> None:
         """Forget the connections and memory of a relay that is gone."""

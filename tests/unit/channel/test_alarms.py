@@ -54,6 +54,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("monitors.held", ["safeTrigger"], "monitor-held:safeTrigger", "alarm", "monitors"),
         ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),
         ("monitors.refused", ["a.rv:1:1: no"], "monitors-refused", "warning", "monitors"),
+        ("monitors.left_out", {"a.rv": "a.rv:1:1: no"}, "monitor-left-out:a.rv", "alarm", "monitors"),
         ("monitors.differs_from_folder", True, "monitors-differ", "notice", "monitors"),
         ("ipsec.troubles", ["a certificate ends"], "ipsec", "warning", "hosts"),
         ("blocks.hosts", 1, "hosts-blocked", "warning", "hosts"),

@@ -13,6 +13,9 @@ from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraf
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.specifications.live_topics import LiveType
 from roswire.uris import parse_node_uri
+from tests.support.virtual_clock import let_time_pass
+
+API = parse_node_uri("http://10.0.0.5:4000/")
 
 
 def test_sums_by_name() -> None:
@@ -68,15 +71,26 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
 
 def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
     """The registration gives the type and a header the md5sum; a later report without an md5sum changes nothing."""
-    registry, uri = Registry(), "http://10.0.0.5:4000/"
-    host = ipaddress.ip_address("10.0.0.5")
-    node = Incarnation("k", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+    registry = Registry()
+    node = Incarnation("k", "/node", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2)
     registry.add(node)
     registry.register(node, Kind.PUBLICATION, "/a", "std_msgs/String")
     counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
-    assert published_now(registry, counted.traffic) == {"/a": {"/node": LiveType("std_msgs/String")}}
+    assert published_now(registry, counted) == {"/a": {"/node": LiveType("std_msgs/String")}}
     for md5sum in ("992c", ""):
         counted.reported([TopicTraffic("k", "/a", 1, 1, 0, 1, md5sum=md5sum)])
-        assert published_now(registry, counted.traffic) == {
-            "/a": {"/node": LiveType("std_msgs/String", "992c")}
-        }
+        assert published_now(registry, counted) == {"/a": {"/node": LiveType("std_msgs/String", "992c")}}
+
+
+def test_a_topic_moves_for_a_minute_after_its_last_message() -> None:
+    """For the first minute of control it counts as moving, because an earlier control may have seen messages."""
+    registry = Registry()
+    registry.add(Incarnation("k", "/n", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2))
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    seen = []
+    for messages in (None, None, 1, 0, None):
+        if messages is not None:
+            counted.reported([TopicTraffic("k", "/a", messages, 1, 0, 1)])
+        seen.append(counted.moving("k", "/a"))
+        let_time_pass(61.0 if messages is None else 30.0)
+    assert seen == [True, False, True, True, False]

@@ -46,10 +46,19 @@ def test_nothing_is_left_out_without_an_error() -> None:
 
 
 @pytest.mark.parametrize("text", ["wrong() {", "wrong() { event e() /x nobody/Knows '{}' { } }"])
-def test_a_file_whose_topics_are_unknown_is_refused_at_a_start(text: str) -> None:
-    """Nothing could hold its topics."""
-    with pytest.raises(SpecificationsRefusedError, match=r"wrong\.rv"):
-        unbuilt(good=GOOD, wrong=text)
+@pytest.mark.parametrize("others", [{}, {"b.rv": WRONG}, {"b.rv": WRONG, "c.rv": GOOD, "d.rv": USER}])
+def test_a_file_whose_topics_are_unknown_is_left_out_at_a_start(text: str, others: dict[str, str]) -> None:
+    """Nothing can hold its topics, which the start reports; the robot keeps its master and its other monitors."""
+    found = contents_at_start({"a.rv": text} | others, {})
+    assert [error.partition(":")[0] for error in found.left_out.values()] == ["a.rv"]
+    assert len(found.unbuilt) == bool(others)
+    assert set(found.monitors.values()) == others.keys()
+
+
+def test_a_definition_that_cannot_be_read_leaves_out_all_files() -> None:
+    """The types of no file are known then; the robot keeps its master."""
+    found = contents_at_start({"a.rv": GOOD}, {"own/Own.msg": "int32 int32 x\n"})
+    assert (found.monitors, list(found.left_out)) == ({}, ["a.rv"])
 
 
 def test_a_defect_of_the_compiler_leaves_out_one_file(monkeypatch: pytest.MonkeyPatch) -> None:

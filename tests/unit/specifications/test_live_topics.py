@@ -126,6 +126,15 @@ def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
     )
 
 
+def test_a_change_that_holds_a_topic_without_traffic_warns_only() -> None:
+    """The robot stands, so nothing is cut off; one publisher that moves is enough."""
+    still = LiveType("geometry_msgs/Twist", moving=False)
+    conflicts, [warning] = held(CHANGED, {"/cmd_vel": {"/teleop": still}})
+    assert conflicts == []
+    assert "holds /cmd_vel" in warning
+    assert held(CHANGED, {"/cmd_vel": {"/a": still, **DRIVING["/cmd_vel"]}})[0] == held(CHANGED)[0]
+
+
 def test_a_move_to_another_relay_that_holds_a_topic_needs_consent() -> None:
     """The state stays in the relay that the monitor leaves."""
     [conflict], _ = held(DEADMAN, moved=["d.rv"])

@@ -354,3 +354,17 @@ async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, 
     assert [fields["who"] for fields in refused] == ["adam", "disk", "disk"]
     (desk.folder / "a.rv").write_text(A + " ")
     assert (await desk.monitors()).revision == 2
+
+
+async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) -> None:
+    """The robot gets its master, also if `--enable` names a monitor of the file; the alarm says that nothing guards."""
+    (desk.folder / "a.rv").write_text("nonsense")
+    for _ in range(2):
+        monitors = await desk.monitors()
+        assert list(monitors.checked.left_out) == ["a.rv"]
+    [first, again] = [fields for event, fields in desk.trail.heard if event == "monitor not built"]
+    assert first == again
+    assert first["resource"] == "a.rv"
+    (desk.folder / "a.rv").write_text(A)
+    await monitors.reload(admin.MonitorReload(), "adam")
+    assert (monitors.checked.left_out, monitors.names()) == ({}, ["a"])
