@@ -193,12 +193,14 @@ class PassiveControl:
                 " take over; check the network between the two"
             )
         try:
-            await self._receiver.want_switchover()
+            refusal = await self._receiver.want_switchover()
         except ReplicationError as error:
             raise HandOverError(
                 f"{self._membership.other} ({self._membership.other_address}): {error}; if it is away, this"
                 " appliance takes over automatically once the lease has expired"
             ) from error
+        if refusal:
+            raise HandOverError(refusal)
 
     def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
         """Serve the api and the process for charon; leave the supervisor's other messages to the active control."""

@@ -173,7 +173,9 @@ class _Control:
                     note_times, base.store, base.pair, base.blocks.age_now
                 )
             work["the orders of the standby"] = partial(
-                operators.standby.obey, base.replication.switchover_wanted
+                operators.standby.obey,
+                base.replication.switchover_wanted,
+                base.replication.sender.refuse_switchover,
             )
         if self._recorder is not None:
             work["the replication of checkpoints"] = self._recorder.follow

@@ -1,7 +1,6 @@
 """Answer operators about the two appliances, and order a planned switchover (docs/standby.md)."""
 
 import asyncio
-import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
@@ -144,13 +143,15 @@ class StandbyOrders:
             raise
         return _state_of(self._source)
 
-    async def obey(self, wanted: asyncio.Event) -> None:
-        """Carry out the orders that operators give on the standby, until cancelled."""
+    async def obey(self, wanted: asyncio.Event, refuse: Callable[[str], Awaitable[None]]) -> None:
+        """Carry out the orders that operators give on the standby, until cancelled; `refuse(reason)` answers it."""
         while True:
             await wanted.wait()
             wanted.clear()
-            with contextlib.suppress(HandOverError):  # recorded
+            try:
                 await self.promote(admin.StandbyPromote(), _STANDBY)
+            except HandOverError as error:
+                await refuse(str(error))
 
 
 class StandbyAdministration:

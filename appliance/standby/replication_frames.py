@@ -3,7 +3,8 @@
 A frame is a length (4 bytes) and one message as MessagePack. The standby sends `Stored`: first its position, then one
 for each message that it received; between them, it sends an `Introduction` every hour, and an
 `ObstacleFound` when its obstacle to a takeover changes; at first it has none. The active appliance sends `Changes`
-after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`.
+after that position, at least one a second, or a snapshot: `SnapshotBegin`, `SnapshotRows` and `SnapshotEnd`. It
+answers the order `SwitchoverWanted` only if it refuses it.
 """
 
 import asyncio
@@ -41,6 +42,12 @@ class Stored(msgspec.Struct, frozen=True, array_like=True, tag="stored"):
 
 class SwitchoverWanted(msgspec.Struct, frozen=True, array_like=True, tag="switchover"):
     """An operator of the standby wants it to take over."""
+
+
+class SwitchoverRefused(msgspec.Struct, frozen=True, array_like=True, tag="switchover refused"):
+    """The active appliance does not hand over, for this reason. An earlier version ends the link at this message."""
+
+    reason: Annotated[str, msgspec.Meta(max_length=_LONGEST_REASON)]
 
 
 class Introduction(msgspec.Struct, frozen=True, array_like=True, tag="introduction"):
@@ -106,13 +113,18 @@ class SnapshotEnd(msgspec.Struct, frozen=True, array_like=True, tag="end"):
     rows: _Number
 
 
-FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused
+FromActive = Changes | SnapshotBegin | SnapshotRows | SnapshotEnd | Refused | SwitchoverRefused
 FromStandby = Stored | Introduction | ObstacleFound | Refused | SwitchoverWanted
 
 
 def reason_of(error: Exception) -> Refused:
     """Return the message with the reason why this side ends the link."""
     return Refused(str(error)[:_LONGEST_REASON])
+
+
+def refusal_of(reason: str) -> SwitchoverRefused:
+    """Return the message with the reason why the active appliance does not hand over."""
+    return SwitchoverRefused(reason[:_LONGEST_REASON])
 
 
 def obstacle_of(reason: str) -> ObstacleFound:

@@ -13,6 +13,7 @@ from appliance.standby.replication_frames import (
     ReplicationLink,
     SnapshotBegin,
     SnapshotEnd,
+    SwitchoverRefused,
     SwitchoverWanted,
     obstacle_of,
     reason_of,
@@ -24,6 +25,7 @@ from appliance.store.writer_thread import StoreError
 _INTRODUCED_SECONDS = 3600.0
 _FEW = 16  # changes
 _SMALL = 16 << 10  # bytes of one value
+_REFUSAL_SECONDS = 3.0  # the active appliance waits for 2 s at most until its changes are stored here
 _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 
@@ -53,12 +55,27 @@ class ReplicationReceiver:
         self._obstacle = obstacle
         self._reported = ""  # the obstacle that the active appliance knows
         self._revised = revised
+        self._refusal: asyncio.Future[str] | None = None
 
-    async def want_switchover(self) -> None:
-        """Ask the active appliance to hand over. Raises `ReplicationError` if it is not connected."""
+    async def want_switchover(self) -> str:
+        """Ask the active appliance to hand over; return why it refuses, or an empty text.
+
+        Raises `ReplicationError` if it is not connected.
+        """
         if self._link is None:
             raise ReplicationError("the active appliance is not connected")
+        refusal: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._refusal = refusal
         await self._link.send(SwitchoverWanted())
+        try:
+            async with asyncio.timeout(_REFUSAL_SECONDS):
+                return await refusal
+        except TimeoutError:
+            return ""
+
+    def _refused(self, reason: str) -> None:
+        if self._refusal is not None and not self._refusal.done():
+            self._refusal.set_result(reason)
 
     async def follow(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Take changes until the link ends. Raises `ReplicationError`, and `StoreError` if the disk is full."""
@@ -73,6 +90,9 @@ class ReplicationReceiver:
                 message = await link.receive(_SILENCE_SECONDS)
                 if isinstance(message, Refused):
                     raise ReplicationError(f"the active appliance refuses: {message.reason}")
+                if isinstance(message, SwitchoverRefused):
+                    self._refused(message.reason)
+                    continue
                 try:
                     self._require_accepted(message)
                     await self._take(message)
@@ -85,6 +105,7 @@ class ReplicationReceiver:
                 await link.send(self._replica.position)
         finally:
             self._link = None
+            self._refused("")  # the active appliance ends the link when it hands over
             await link.close()
             await asyncio.to_thread(self._replica.abandon_snapshot)
 

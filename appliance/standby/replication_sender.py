@@ -37,6 +37,7 @@ from appliance.standby.replication_frames import (
     Stored,
     SwitchoverWanted,
     reason_of,
+    refusal_of,
 )
 from appliance.store.changes import ROWS, Put
 from appliance.store.writer_thread import Database, StoreError
@@ -105,6 +106,7 @@ class ReplicationSender:
         self._answered = asyncio.Event()
         self._reason = self._obstacle = ""
         self.link: asyncio.Task[None] | None = None
+        self._open: ReplicationLink[FromStandby] | None = None
         self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
         self.alone = False
         self._introduced: Callable[[Introduction], None] = lambda _introduction: None
@@ -128,6 +130,12 @@ class ReplicationSender:
     def on_introduction(self, introduced: Callable[[Introduction], None]) -> None:
         """Call this for each introduction of the standby."""
         self._introduced = introduced
+
+    async def refuse_switchover(self, reason: str) -> None:
+        """Tell the standby why its order to hand over is not carried out, if it is still connected."""
+        if self._open is not None:
+            with contextlib.suppress(ReplicationError):
+                await self._open.send(refusal_of(reason))
 
     def answer_alone(self) -> None:
         """Answer without the standby until it has all changes: the witness has removed it from the in-sync set."""
@@ -215,6 +223,7 @@ class ReplicationSender:
         if position is not None:
             self._sent = position
             self.take(begin)
+        self._open = link
         ends = [
             self._loop.create_task(self._receive(link)),
             self._loop.create_task(self._send(link, position)),
@@ -224,6 +233,7 @@ class ReplicationSender:
             for task in ended:
                 task.result()
         finally:
+            self._open = None
             for task in ends:
                 task.cancel()
             await asyncio.gather(*ends, return_exceptions=True)

@@ -21,6 +21,7 @@ _VERB = "rosrv standby"
 _WATCH_SECONDS = 2.0
 _SWITCH_SECONDS = 20.0
 _AGAIN_SECONDS = 0.2
+_SHOW_SECONDS = 2.0
 
 
 @speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object; with --watch one a line")])
@@ -76,6 +77,7 @@ def promote(appliance: Appliance) -> None:
     """
     before = appliance.ask_or_exit(StandbyWanted())
     name = before.other.name if before.role == "active" else before.name
+    typer.echo(f"{_VERB}: {printable(name)} is to take over from {_holder(before)}", err=True)
     lost = ""
     try:
         appliance.body_or_exit(appliance.ask(StandbyPromote()))
@@ -105,10 +107,21 @@ def _look(appliance: Appliance) -> StatusView:
     return standby_view(appliance.body_or_exit(answer))
 
 
+def _holder(state: StandbyState) -> str:
+    return printable(state.witness.holder) or "no appliance"
+
+
 def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
-    """Return the state once the appliance with this name holds the lease; None if it does not in time."""
-    pause, until = threading.Event(), clock.now() + _SWITCH_SECONDS
-    while clock.now() < until:
+    """Return the state once the appliance with this name holds the lease; None if it does not in time.
+
+    Every few seconds, a line on standard error says that the command waits.
+    """
+    pause, began = threading.Event(), clock.now()
+    shown, until = began, began + _SWITCH_SECONDS
+    while (now := clock.now()) < until:
+        if now - shown >= _SHOW_SECONDS:
+            shown = now
+            typer.echo(f"{_VERB}: waiting for {printable(name)}, {now - began:.0f} s", err=True)
         try:
             answer = appliance.ask(StandbyWanted())
         except NotRunningError:

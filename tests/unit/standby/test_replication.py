@@ -719,3 +719,32 @@ async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str 
     fields = msgspec.structs.asdict(INTRODUCTION) | bad
     with pytest.raises(msgspec.ValidationError):
         msgspec.msgpack.decode(msgspec.msgpack.encode(Introduction(**fields)), type=Introduction)
+
+
+async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link(tmp_path: Path) -> None:
+    """The operator of the standby need not wait for a takeover that does not come."""
+    (tmp_path / "active").mkdir()
+    (tmp_path / "standby").mkdir()
+    store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
+    replica = Replica(tmp_path / "standby" / "state.db", STATE_SCHEMA, failed=pytest.fail)
+    wanted = asyncio.Event()
+    sender = ReplicationSender(store.database, lambda: 1, switchover_wanted=wanted.set)
+    receiver = ReplicationReceiver(replica, lambda _epoch: True)
+    with pytest.raises(ReplicationError, match="not connected"):
+        await receiver.want_switchover()
+    ends, others = await pair_of_streams()
+    tasks = [asyncio.create_task(sender.serve(*ends)), asyncio.create_task(receiver.follow(*others))]
+    async with asyncio.timeout(SECONDS):
+        await sender.acknowledged(store.database.number)
+        for reason in ("b is blind", ""):
+            order = asyncio.create_task(receiver.want_switchover())
+            await wanted.wait()
+            wanted.clear()
+            if reason:
+                await sender.refuse_switchover(reason)
+            else:
+                sender.close()
+            assert await order == reason
+    await asyncio.gather(*tasks, return_exceptions=True)
+    replica.close()
+    store.close()

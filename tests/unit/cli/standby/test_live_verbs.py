@@ -16,6 +16,7 @@ from tests.support.fake_appliance import FakeAppliance
 
 pytestmark = pytest.mark.nightly
 
+BEGINS = "rosrv standby: b is to take over from a\n"
 AWAY = AdminAnswer[Any](False, error="RVMaster is being restarted", trouble="failed")
 
 
@@ -63,7 +64,7 @@ def test_it_waits_for_the_other_appliance(pair: Pair) -> None:
     pair.answers = [
         state("active", 4, "a"), state("active", 4, "a"), AWAY, state("standby", 4, ""), state("standby", 5, "b"),
     ]  # fmt: skip
-    assert pair.promote() == (0, "b is active, epoch 5\n", "")
+    assert pair.promote() == (0, "b is active, epoch 5\n", BEGINS)
     assert (pair.ordered, len(pair.answers)) == (1, 1)
 
 
@@ -87,5 +88,5 @@ def test_a_standby_that_does_not_take_over_is_an_error(pair: Pair, monkeypatch: 
     assert pair.promote() == (
         1,
         "",
-        "rosrv standby: b is not active after 0.3 s; see: rosrv standby status\n",
+        f"{BEGINS}rosrv standby: b is not active after 0.3 s; see: rosrv standby status\n",
     )
