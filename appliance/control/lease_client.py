@@ -45,10 +45,10 @@ class LeaseClient:
             self._present = False
             self.send(messages.ControlUnready())
 
-    async def report_service(self, obstacle: Callable[[], str]) -> None:
+    async def report_service(self, report: Callable[[], messages.ControlServes]) -> None:
         """Report until cancelled that this process serves, or why it cannot: if reports stop, it does not."""
         while True:
-            self.send(messages.ControlServes(obstacle()))
+            self.send(report())
             await asyncio.sleep(_SERVES_SECONDS)
 
     def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:

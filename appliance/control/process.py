@@ -206,16 +206,20 @@ class _Control:
         base.lifeline.say(messages.Ready(detail))
         if base.pair is not None:
             reports = run_always(
-                "the reports to the lease", partial(base.pair.lease.report_service, self._obstacle)
+                "the reports to the lease", partial(base.pair.lease.report_service, self._service)
             )
             self._tasks.append(asyncio.get_running_loop().create_task(reports))
 
-    def _obstacle(self) -> str:
-        """Return why this appliance cannot serve now; empty: it can."""
-        failed = self._base.audit.failed
-        if failed is None or self._base.settings.audit.on_audit_failure != "deny":
-            return ""
-        return f"nothing is granted, because the audit log cannot be written: {failed}"
+    def _service(self) -> messages.ControlServes:
+        """Return whether this appliance can serve now, and what a takeover would lose."""
+        failed, monitors = self._base.audit.failed, self._parts.monitors
+        obstacle = ""
+        if failed is not None and self._base.settings.audit.on_audit_failure == "deny":
+            obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
+        keeps_state = any(
+            owner.holds and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
+        )
+        return messages.ControlServes(obstacle, keeps_state)
 
     async def end(self) -> None:
         base, parts, ends = self._base, self._parts, self._parts.endpoints

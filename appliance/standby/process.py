@@ -130,7 +130,7 @@ class LeaseProcess:
 
     def _give_away(self, now: float) -> None:
         """Let the other appliance take over if this one holds the lease, but does not serve."""
-        fault = self._service.fault(now, active=self._lease.is_active(now))
+        fault = self._service.fault(now, active=self._lease.is_active(now), present=self._present)
         if not fault:
             return
         with contextlib.suppress(LeaseError):  # the other appliance could not serve, either
@@ -240,8 +240,8 @@ class LeaseProcess:
                 self._present = True
             case messages.ControlUnready():
                 self._present = False
-            case messages.ControlServes(obstacle):
-                self._service.reported(clock.since_boot(), obstacle)
+            case messages.ControlServes(obstacle, keeps_state):
+                self._service.reported(clock.since_boot(), obstacle, keeps_state=keeps_state)
             case messages.HandOverWanted():
                 self._hand_over()
             case _:

@@ -3,7 +3,10 @@
 An appliance that holds the lease and does not serve is worse than none: the other one sees a healthy holder. So the
 lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready after a start.
 
-The first start after a takeover has `START_SECONDS`. Each time that the lease is given away, all limits are doubled
+A control that stood by is ready soon after the activation; it has `START_SECONDS`, as has one that starts again. But a
+lease that comes back after a lapse meets a control that has just begun to start: the other appliance takes over sooner,
+and gets the lease, unless a monitor would hold its topics then, because only this appliance has its state.
+Each time that the lease is given away, all limits are doubled
 until this appliance has served for a minute: two appliances on busy machines must not pass the lease back and forth.
 """
 
@@ -21,7 +24,8 @@ class ServiceWatch:
 
     def __init__(self) -> None:
         self._active = False
-        self._linked = False
+        self._cold = False
+        self._keeps_state = True
         self._served = 0.0  # time of the last report without an obstacle; at first of the activation
         self._steady_since: float | None = None
         self._serves = False  # whether the present control has served
@@ -33,10 +37,11 @@ class ServiceWatch:
         """Note that control has a new link, or none."""
         self._serves, self._obstacle = False, ""
 
-    def reported(self, now: float, obstacle: str) -> None:
+    def reported(self, now: float, obstacle: str, *, keeps_state: bool) -> None:
         """Take a report of control; an empty obstacle: it serves."""
+        self._keeps_state = keeps_state
         if not obstacle:
-            self._served, self._serves = now, True
+            self._served, self._serves, self._cold = now, True, False
             self._steady_since = now if self._steady_since is None else self._steady_since
             if now - self._steady_since > _STEADY_SECONDS:
                 self._doublings = 0
@@ -45,14 +50,16 @@ class ServiceWatch:
             self._obstacle_since = self._obstacle_since if self._obstacle else now
         self._obstacle = obstacle
 
-    def fault(self, now: float, *, active: bool) -> str:
-        """Return why the lease should be given away; empty: it should not."""
+    def fault(self, now: float, *, active: bool, present: bool = True) -> str:
+        """Return why the lease should be given away; empty: it should not. `present`: control stands by or serves."""
         if active and not self._active:
-            self._served, self._steady_since = now, None
+            self._served, self._steady_since, self._cold = now, None, not present
             self.linked()
         self._active = active
         if not active:
             return ""
+        if self._cold and not self._keeps_state:
+            return "control has just started when the lease came back"
         scale = 1 << self._doublings
         if self._obstacle:
             late = now - self._obstacle_since > scale * OBSTACLE_SECONDS

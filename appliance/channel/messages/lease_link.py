@@ -73,9 +73,13 @@ class ControlUnready(Message):
 
 
 class ControlServes(Message):
-    """Control of an active appliance serves the robot; with an obstacle: it runs, but cannot serve. Sent repeatedly."""
+    """Control of an active appliance serves the robot; with an obstacle: it runs, but cannot serve. Sent repeatedly.
+
+    `keeps_state`: a monitor holds its topics if its state is lost, as it is at an unplanned takeover.
+    """
 
     obstacle: str
+    keeps_state: bool
 
 
 class HandOverWanted(Message):

@@ -15,10 +15,11 @@ import pytest
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.standby.lease import PromiseRequest
+from appliance.standby.lease import ClaimPromise, PromiseRequest
 from appliance.standby.membership import Membership
 from appliance.standby.peer_link import PeerChannel
 from appliance.standby.process import LeaseProcess
+from appliance.standby.service_watch import OBSTACLE_SECONDS
 from appliance.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_root
@@ -50,11 +51,11 @@ class Site:
         self.failures: list[BaseException] = []
         self._thread = threading.Thread(target=lambda: self.hosts[OWN].run(self._run))
         self.record = LeaseRecord(1, "", ("a", "b"), "boot")
-        self._rules = Witness(
+        self.rules = Witness(
             record=self.record, save=self._save, admit=lambda _: None, boot="boot", clock=clock.since_boot
         )
         peers = {"a": AppliancePeer(OWN, KEY), "b": AppliancePeer(OTHER, b"\xbb" * 32)}
-        self.gate = WitnessGate(self._rules, peers, "nonce")
+        self.gate = WitnessGate(self.rules, peers, "nonce")
 
     def bound(self, address: str, port: int) -> socket.socket:
         sock = self.hosts[address].run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -184,6 +185,18 @@ def test_garbage_and_forgeries_change_nothing(site: Site) -> None:
     assert int(site.epoch.read_text()) == 2
 
 
+def test_a_greater_epoch_of_the_other_appliance_is_stored_by_a_passive_one(site: Site) -> None:
+    """While it is active, only the witness can end its epoch."""
+    site.start()
+    site.until(site.held)
+    channel = PeerChannel("b", "a", PEER_KEY)
+    for number, serving in ((1, True), (2, False), (3, False)):
+        assert int(site.epoch.read_text()) == 2
+        site.peer.sendto(channel.write(PromiseRequest(9, "theirs", number)), (OWN, MEMBERSHIP.port))
+        site.until(lambda: isinstance(site.reports[-1], messages.LeaseEnded) or serving, serving=serving)  # noqa: B023  called in this turn
+    site.until(lambda: int(site.epoch.read_text()) == 9, serving=False)
+
+
 def test_a_damaged_epoch_file_keeps_it_passive(site: Site) -> None:
     """The process ends with the reason, and claims nothing."""
     site.epoch.write_text("7x\n")
@@ -214,3 +227,26 @@ def test_it_claims_only_while_control_is_ready(site: Site) -> None:
     site.control.send(messages.ControlPresent())
     site.until(site.held)
     assert site.record.epoch == 2
+
+
+def test_a_holder_that_does_not_serve_gives_the_lease_away(site: Site) -> None:
+    """It keeps the lease as long as the other appliance could not serve, either; then it releases the lease."""
+    site.start()
+    site.until(site.held)
+    theirs, able = PeerChannel("b", "a", PEER_KEY), [False]
+
+    def given_away() -> bool:
+        site.control.send(messages.ControlServes("the disk is full", keeps_state=True))
+        with contextlib.suppress(TimeoutError):
+            asked = theirs.read(site.peer.recv(2048))
+            if isinstance(asked, PromiseRequest):
+                promise = ClaimPromise(asked.epoch, asked.session, asked.number, able[0])
+                site.peer.sendto(theirs.write(promise), (OWN, MEMBERSHIP.port))
+        return not site.held()
+
+    later = clock.since_boot() + 3 * OBSTACLE_SECONDS
+    site.until(lambda: given_away() or clock.since_boot() > later)
+    assert site.held()
+    able[0] = True
+    site.until(given_away)
+    site.until(lambda: not site.rules.left())

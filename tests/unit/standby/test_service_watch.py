@@ -13,7 +13,7 @@ def serving() -> ServiceWatch:
     watch = ServiceWatch()
     assert watch.fault(100.0, active=True) == ""
     watch.linked()
-    watch.reported(102.0, "")
+    watch.reported(102.0, "", keeps_state=False)
     return watch
 
 
@@ -24,6 +24,17 @@ def test_a_start_has_some_seconds() -> None:
     assert watch.fault(100.0 + START_SECONDS, active=True) == ""
     assert watch.fault(100.1 + START_SECONDS, active=True) == "control has not been ready for 5.1 s"
     assert watch.fault(200.0, active=False) == ""
+
+
+def test_a_lease_that_comes_back_before_control() -> None:
+    """After a lapse, control was killed. The other appliance takes over sooner, but lacks the state of monitors."""
+    for keeps_state in (True, False):
+        watch = serving()
+        watch.reported(102.5, "", keeps_state=keeps_state)
+        assert watch.fault(103.0, active=False) == ""
+        assert ("just started" in watch.fault(103.3, active=True, present=False)) is not keeps_state
+        watch.reported(105.0, "", keeps_state=keeps_state)
+        assert watch.fault(105.0, active=True) == ""
 
 
 def test_a_control_that_hangs_and_one_that_starts_again() -> None:
@@ -40,10 +51,10 @@ def test_an_obstacle_that_lasts() -> None:
     """A full disk is reported again and again; one that ends in time changes nothing."""
     watch = serving()
     for now in (103.0, 102.9 + OBSTACLE_SECONDS):
-        watch.reported(now, "full")
+        watch.reported(now, "full", keeps_state=False)
         assert watch.fault(now, active=True) == ""
     assert watch.fault(103.1 + OBSTACLE_SECONDS, active=True) == "full"
-    watch.reported(105.0, "")
+    watch.reported(105.0, "", keeps_state=False)
     assert watch.fault(105.0, active=True) == ""
 
 
@@ -56,5 +67,5 @@ def test_two_appliances_do_not_pass_the_lease_back_and_forth() -> None:
     assert watch.fault(200.0 + 2 * START_SECONDS, active=True) == ""
     assert watch.fault(200.1 + 2 * START_SECONDS, active=True)
     for now in range(210, 280):
-        watch.reported(float(now), "")
+        watch.reported(float(now), "", keeps_state=False)
     assert watch.fault(279.1 + SILENT_SECONDS, active=True)
