@@ -30,6 +30,7 @@ CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted
 CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different speeds
 SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
 FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
+_RENEWABLE = 2 * EXPIRY  # in this time after its lease has lapsed, the other appliance has claimed, or cannot
 _MOST_PENDING = 16
 
 Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
@@ -167,6 +168,12 @@ class ApplianceLease:
     def is_active(self, now: float) -> bool:
         """Whether this appliance may decide, relay and answer."""
         return self.held is not None and self._promised_until <= now < self._valid_until
+
+    def may_be_renewed(self, now: float) -> bool:
+        """Whether a lapsed lease may soon be renewed in its epoch; then no other appliance was active since."""
+        if self.held is None or self._switching_until is not None:
+            return False
+        return self.answers_alone or now < self._valid_until + _RENEWABLE
 
     def may_answer(self, now: float, *, acknowledged: bool) -> bool:
         """Whether a change may be answered now; `acknowledged` by the standby."""

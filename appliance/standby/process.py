@@ -1,7 +1,7 @@
 """Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
 
 The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
-the supervisor. If no further extension arrives, the supervisor ends the processes that serve the robot. So the
+the supervisor. If no further extension arrives, the supervisor stops the processes that serve the robot. So the
 appliance also becomes passive if this process hangs or dies. The epoch is on the disk before it is used.
 
 This appliance claims only while its control is present. The control of a standby also withdraws its presence while it
@@ -83,7 +83,7 @@ class LeaseProcess:
         self._service = ServiceWatch()
         self._permission = 0
         self._alone = False
-        self._held = 0.0
+        self._reported: messages.LeaseHeld | messages.LeaseEnded = messages.LeaseEnded()
         self._answer: WitnessAnswer | None = None
         self._answered: float | None = None
         self._told: messages.LeaseState | None = None
@@ -190,14 +190,14 @@ class LeaseProcess:
 
     def _tell_supervisor(self) -> None:
         lease, now = self._lease, clock.since_boot()
-        until = lease.valid_until if lease.is_active(now) else 0.0
-        if until == self._held:
-            return
-        self._held = until
-        if lease.held is not None and until:
-            self.supervisor.send(messages.LeaseHeld(until, lease.held))
+        report: messages.LeaseHeld | messages.LeaseEnded
+        if lease.held is not None and lease.is_active(now):
+            report = messages.LeaseHeld(lease.valid_until, lease.held)
         else:
-            self.supervisor.send(messages.LeaseEnded())
+            report = messages.LeaseEnded(renewable=lease.may_be_renewed(now))
+        if report != self._reported:
+            self._reported = report
+            self.supervisor.send(report)
 
     def _tell_control(self) -> None:
         lease, now = self._lease, clock.since_boot()

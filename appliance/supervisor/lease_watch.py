@@ -1,64 +1,104 @@
 """Decide by the reports of the lease whether this appliance may serve.
 
-A report has the time to which the lease is valid. If no later time follows, the appliance is passive from that time
+A report has the time to which the lease is valid. If no later time follows, the appliance does not serve from that time
 on: also if the process of the lease hangs, dies, or is not scheduled.
+
+A lease that has lapsed may be renewed in the same epoch. Then no other appliance was active in between, and the state
+in memory is still the newest. So a lapse only suspends the processes that serve the robot. They go on after a renewal
+in the same epoch; in all other cases they end.
 """
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from appliance.base import clock
 
+_LONGEST_LAPSE = 10.0  # seconds; then the appliance stands by, and answers its operators again
 
-class LeaseWatch:
-    """The role of this appliance: `activate(epoch)` and `passivate()` are called at each change.
 
-    An appliance that is not one of two (`member` is False) is always active.
+@dataclass(frozen=True)
+class RoleChanges:
+    """The orders at a change of the role.
+
+    `activate(epoch)` and `passivate()` begin and end the service. `suspend()` stops it, with all state kept; it returns
+    False if that is not possible now. `resume()` goes on.
     """
 
-    def __init__(
-        self, *, member: bool, activate: Callable[[int], None], passivate: Callable[[], None]
-    ) -> None:
+    activate: Callable[[int], None]
+    passivate: Callable[[], None]
+    suspend: Callable[[], bool]
+    resume: Callable[[], None]
+
+
+class LeaseWatch:
+    """The role of this appliance. An appliance that is not one of two (`member` is False) is always active."""
+
+    def __init__(self, changes: RoleChanges, *, member: bool) -> None:
         self.member = member
         self.epoch: int | None = None if member else 0
-        self._activate = activate
-        self._passivate = passivate
+        self.suspended = False
+        self._renewable = True
+        self._changes = changes
         self._until = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
     @property
     def active(self) -> bool:
         """Whether this appliance may serve."""
-        return self.epoch is not None
+        return self.epoch is not None and not self.suspended
 
     def held(self, until: float, epoch: int) -> None:
         """Take a report: the lease is valid until `until` (seconds of CLOCK_BOOTTIME), in this epoch."""
         if self.epoch not in (None, epoch):
             self.ended()
-        self._until = until
-        if self.epoch is None and self._left() > 0:
-            self.epoch = epoch
-            self._activate(epoch)
-        self._check()
+        self._until, self._renewable = until, True
+        if self._left() > 0:
+            if self.epoch is None:
+                self.epoch = epoch
+                self._changes.activate(epoch)
+            elif self.suspended:
+                self.suspended = False
+                self._changes.resume()
+        if not self.suspended:
+            self._check()
+
+    def lapsed(self) -> None:
+        """Take a report: the lease is not valid, but it may be renewed."""
+        if not self.member or self.epoch is None or self.suspended:
+            return
+        self._stop_timer()
+        if not self._renewable or not self._changes.suspend():
+            self.ended()
+            return
+        self.suspended = True
+        self._timer = asyncio.get_running_loop().call_later(_LONGEST_LAPSE, self.ended)
 
     def ended(self) -> None:
-        """Take a report: the lease is not valid any more."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+        """Take a report: the lease is not valid any more, and is not renewed."""
+        self._stop_timer()
         if self.member and self.epoch is not None:
-            self.epoch = None
-            self._passivate()
+            self.epoch, self.suspended = None, False
+            self._changes.passivate()
+
+    def not_renewable(self) -> None:
+        """Note that the process of the lease has ended: the next process gets the lease only in a new epoch."""
+        self._renewable = False
+        if self.suspended:
+            self.ended()
 
     def _check(self) -> None:
+        self._stop_timer()
+        left = self._left()
+        if left <= 0:
+            self.lapsed()
+        elif self.epoch is not None:
+            self._timer = asyncio.get_running_loop().call_later(left, self._check)
+
+    def _stop_timer(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        left = self._left()
-        if left <= 0:
-            self.ended()
-        else:
-            self._timer = asyncio.get_running_loop().call_later(left, self._check)
 
     def _left(self) -> float:
         return self._until - clock.since_boot()

@@ -41,6 +41,13 @@ class ProcessSlot:
         return self.process is None and self.due is None
 
     @property
+    def is_starting(self) -> bool:
+        """Whether the appliance does not serve yet because this process is not ready."""
+        if self.role.on_demand or self.role.dispensable:
+            return False
+        return self.process is None or not (self.process.ready or self.process.is_program)
+
+    @property
     def is_failing(self) -> bool:
         """Whether the last runs were all short, so that operators must be notified."""
         return self.short_runs >= FAILING_AFTER
@@ -95,7 +102,7 @@ class ProcessSlot:
             path=str(role.path(facts)) if role.path else None,
             capabilities=role.capabilities,
             ended_early=role.ended_early,
-            nice=role.nice,
+            nice=max(0, role.nice + facts.raised),
             takes_secret=role.secret is not None,
             secret=str(secret) if role.secret is not None and (secret := role.secret(facts)) else None,
         )

@@ -22,6 +22,7 @@ ROSMASTER = Path("/usr/bin/rosmaster")
 _ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
+LEASE_NICE = -10  # as the unit of the witness has
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
@@ -41,6 +42,7 @@ class Facts:
     fleet_reads: tuple[Path, ...] = ()
     collector_port: int | None = None
     view: PrivateView | None = None
+    raised: int = 0  # by which the supervisor has lowered its own niceness; its children inherit this
 
     def part(self, name: str) -> Path:
         """Return the part of the state directory with this name."""
@@ -81,7 +83,7 @@ class Role:
     role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
     besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
     kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
-    no console delays a stop.
+    no console delays a stop. A negative one has effect if the supervisor could lower its own.
     """
 
     name: str
@@ -137,7 +139,7 @@ _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
 ROLES = (
     Role(
         "lease", "rosrv-lease", "lease", "appliance.standby.process:main",
-        path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True,
+        path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True, nice=LEASE_NICE,
         sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
     ),
     Role(

@@ -23,10 +23,10 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
-from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit
+from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.rings import RecorderRings
-from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.roles import LEASE_NICE, Facts, Role
 from appliance.supervisor.sandbox.private_view import (
     PrivateView,
     program_folders,
@@ -83,10 +83,21 @@ def run_appliance(
             "node when it reconnects",
             mediation=settings.mediation,
         )
+    raised = _weigh() if standby is not None else 0
     drop_unused_capabilities()
     refuse_half_restored(settings.state)
     with signals.held():
-        _run(settings, roles, ready, node_ports, standby)
+        _run(settings, roles, ready, node_ports, standby, raised=raised)
+
+
+def _weigh() -> int:
+    """Give the supervisor of one of two appliances the weight of the witness, so that no load delays the lease."""
+    raised = raise_priority(-LEASE_NICE)
+    if not raised:
+        log.warning(
+            "a busy machine can interrupt the service, because the lease has no priority: give CAP_SYS_NICE"
+        )
+    return raised
 
 
 def _run(
@@ -95,6 +106,8 @@ def _run(
     ready: Callable[[ControlReady, Settings], None],
     node_ports: range,
     standby: StandbyStart | None,
+    *,
+    raised: int,
 ) -> None:
     manager = ServiceManager.of(os.environ)
     manager.starting("locks its state, builds its firewall")
@@ -132,6 +145,7 @@ def _run(
                 manager=manager,
                 rosout_ports=ports.own_node,
                 stands_by=standby.announce if standby is not None else None,
+                raised=raised,
             )
         finally:
             isolation.remove()
@@ -229,6 +243,7 @@ def _supervise(
     manager: ServiceManager,
     rosout_ports: range,
     stands_by: Callable[[], None] | None,
+    raised: int,
 ) -> None:
     with isolation.inside():
         require_free(*settings.listen_address)
@@ -263,6 +278,7 @@ def _supervise(
                 else None,
                 ca_passphrase_file=settings.ipsec.ca_passphrase_file,
                 view=view,
+                raised=raised,
             ),
             admin=state.open_admin_socket(),
             ready=say_ready,

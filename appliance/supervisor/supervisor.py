@@ -8,8 +8,9 @@
    after at most a minute.
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
-5. One of two appliances (docs/standby.md) is passive until the lease is held. When the lease ends, all processes that
-   serve the robot are killed and start again, passive: no state in memory is older than the next takeover.
+5. One of two appliances (docs/standby.md) is passive until the lease is held. When the lease lapses, all processes that
+   serve the robot are stopped (SIGSTOP). They go on if the lease is renewed in the same epoch. Otherwise they are
+   killed and start again, passive: no state in memory is older than the next takeover.
 6. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
@@ -35,7 +36,7 @@ from appliance.supervisor.inherited_listeners import InheritedListeners, Listene
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
-from appliance.supervisor.lease_watch import LeaseWatch
+from appliance.supervisor.lease_watch import LeaseWatch, RoleChanges
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
@@ -57,6 +58,7 @@ _START_SECONDS = 180.0  # a longer start must show progress
 _LOOK_SECONDS = 10.0
 OUTPUT_LINES = 40  # last lines kept of a failing process
 _LONGEST_LINE = 500  # characters
+_SUSPENDED_SECONDS = 0.2  # until a start is tried again that a lapse of the lease delays
 _MOST_UNANSWERED = 4096  # requests of control at once
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
@@ -131,8 +133,10 @@ class Supervisor:
         self._stands_by = stands_by
         self._parked = False
         self._lease = LeaseWatch(
-            member=stands_by is not None, activate=self._activate, passivate=self._passivate
+            RoleChanges(self._activate, self._passivate, self._suspend, self._resume),
+            member=stands_by is not None,
         )
+        self._suspended_at = 0.0
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self._reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
@@ -235,6 +239,9 @@ class Supervisor:
     def start(self, slot: ProcessSlot) -> None:
         """Start the process of a slot; after a failure try again with growing delays."""
         slot.due = None
+        if self._lease.suspended and not slot.role.outlives_takeover:
+            slot.due = asyncio.get_running_loop().call_later(_SUSPENDED_SECONDS, self.start, slot)
+            return
         slot.wanted = False
         if self.stopping.is_set() or not self._may_start(slot):
             return
@@ -309,8 +316,8 @@ class Supervisor:
                 self._cannot_serve(process, _printable(said), output)
             case messages.LeaseHeld(until, epoch):
                 self._lease.held(until, epoch)
-            case messages.LeaseEnded():
-                self._lease.ended()
+            case messages.LeaseEnded(renewable):
+                self._lease.lapsed() if renewable else self._lease.ended()
             case _:
                 self.control_said(process, message, descriptors)
 
@@ -436,6 +443,27 @@ class Supervisor:
                 slot.pardoned = True
                 slot.process.kill()
 
+    def _suspend(self) -> bool:
+        """Stop everything that serves the robot; return False if something is only starting."""
+        serving = [slot for slot in self.slots if not slot.role.outlives_takeover]
+        if any(slot.is_starting for slot in serving):
+            return False
+        for slot in serving:
+            if slot.process is not None:
+                slot.process.kill(signal.SIGSTOP)
+        self._suspended_at = clock.now()
+        log.warning("the lease has lapsed; nothing is answered or relayed until it is renewed")
+        return True
+
+    def _resume(self) -> None:
+        """Let everything go on that `_suspend` stopped."""
+        seconds = clock.now() - self._suspended_at
+        for slot in self.slots:
+            if slot.process is not None and not slot.role.outlives_takeover:
+                slot.process.kill(signal.SIGCONT)
+                slot.process.discount_pause(seconds)
+        log.warning("the lease is renewed in the same epoch; the service goes on", seconds=round(seconds, 3))
+
     # --- readiness ----------------------------------------------------------------------------------------
 
     async def control_ready(self, process: ProcessHandle, said: ControlReady) -> None:
@@ -518,7 +546,8 @@ class Supervisor:
             now = clock.now()
             slept, before = now - before - 1.0, now
             for slot in self.slots:
-                if slot.process is not None:
+                suspended = self._lease.suspended and not slot.role.outlives_takeover
+                if slot.process is not None and not suspended:
                     self._look_at(slot, slot.process, slept)
                 if slot.recovers():
                     self._tell_processes()
@@ -560,6 +589,10 @@ class Supervisor:
         self._process_died.set()
         if self.stopping.is_set():
             return
+        if slot.role.name == "lease":
+            self._lease.not_renewable()
+        elif self._lease.suspended and not slot.role.outlives_takeover:
+            self._lease.ended()
         if slot.role.on_demand and code == 0:
             self._ended(slot)
             return

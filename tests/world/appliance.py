@@ -17,7 +17,7 @@ from appliance.relay.connections.admission import missing
 from appliance.relay.grant_table import GrantTable
 from appliance.standby.membership import LINK_FILE, Membership, save_membership
 from appliance.standby.process import EPOCH, LeaseProcess
-from appliance.supervisor.lease_watch import LeaseWatch
+from appliance.supervisor.lease_watch import LeaseWatch, RoleChanges
 from tests.world.loop import BrokenPromiseError, Machine, Process
 from tests.world.network import LinkEnd
 from tests.world.ros import RosMaster
@@ -111,6 +111,9 @@ class Relay:
         connection = Connection(self.keys.get(port, ""), kind, resource, host, caller_id)
         if not self.process.alive:
             return None
+        if self.process.paused:
+            self.process.call(0.0, self.connect, port, kind, resource, host, caller_id)
+            return None
         if connection not in self.connections and not self.refusal(connection):
             self._opened += 1
             self.connections[connection] = self._opened
@@ -186,7 +189,8 @@ class Appliance:
         self.start_rosmaster()
         self.start_relay()
         self.watch = LeaseWatch(
-            member=self.membership is not None, activate=self._activate, passivate=self._passivate
+            RoleChanges(self._activate, self._passivate, self._suspend, lambda: self._pause(paused=False)),
+            member=self.membership is not None,
         )
 
     def start(self) -> None:
@@ -228,13 +232,35 @@ class Appliance:
         match message:
             case messages.LeaseHeld(until, epoch):
                 self.watch.held(until, epoch)
-            case messages.LeaseEnded():
-                self.watch.ended()
+            case messages.LeaseEnded(renewable):
+                self.watch.lapsed() if renewable else self.watch.ended()
 
     def _activate(self, epoch: int) -> None:
         self.world.activated(self, epoch)
         if self._lifeline is not None:
             self._lifeline.send(messages.Activated(epoch))
+
+    def _suspend(self) -> bool:
+        if self.ready:
+            self._pause(paused=True)
+        return self.ready
+
+    def _pause(self, *, paused: bool) -> None:
+        self.world.say(f"{self.address} is {'suspended' if paused else 'active again'}")
+        for process in (self.control, self.relay.process, self.rosmaster.process):
+            if process is not None:
+                process.paused = paused
+
+    def _end_lapse(self) -> None:
+        """Become passive, because a process ended that would start again unpaused."""
+        if self.watch.suspended:
+            self.watch.ended()
+
+    def pause_lease(self, seconds: float) -> None:
+        """Let the process `lease` run no callback for some seconds."""
+        if self.lease is not None:
+            self.lease.paused = True
+            self.world.loop.outside.call(seconds, setattr, self.lease, "paused", False)
 
     def _passivate(self) -> None:
         """End everything that serves the robot; each process starts again, passive."""
@@ -246,6 +272,7 @@ class Appliance:
 
     def restart_rosmaster(self) -> None:
         """Start a new `rosmaster` without state, in place of the present one."""
+        self._end_lapse()
         self.rosmaster.process.kill()
         self.start_rosmaster()
 
@@ -259,6 +286,7 @@ class Appliance:
 
     def restart_relay(self) -> None:
         """Start a new relay without state, in place of the present one."""
+        self._end_lapse()
         self.relay.process.kill()
         self.start_relay()
 
@@ -305,6 +333,7 @@ class Appliance:
     def kill_control(self) -> None:
         """Kill control, and start it again after some time."""
         if self.control is not None and self.control.alive:
+            self._end_lapse()
             self.control.kill()
             self.ready = False
             self.supervisor.call(self.world.random.choice(_RESTART_SECONDS), self._start_again)

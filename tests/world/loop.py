@@ -64,6 +64,7 @@ class Process:
     name: str
     machine: Machine
     alive: bool = True
+    paused: bool = False  # as by SIGSTOP: its callbacks wait
     ends: list[Callable[[], None]] = field(default_factory=list)
     ready: deque[asyncio.Handle] = field(default_factory=deque)
     doom: tuple[int, Callable[[], None]] | None = None  # what happens after this number of its callbacks
@@ -217,8 +218,9 @@ class WorldLoop(asyncio.BaseEventLoop):
         self._run_some()
 
     def _queues(self) -> list[Process]:
+        """Return the processes that can run."""
         self._waiting = [process for process in self._waiting if process.ready]
-        return self._waiting
+        return [process for process in self._waiting if not process.paused]
 
     def _run_some(self) -> None:
         waiting = self._queues()
@@ -226,7 +228,7 @@ class WorldLoop(asyncio.BaseEventLoop):
             return
         process = waiting[0] if len(waiting) == 1 else self.random.choice(waiting)
         for _ in range(len(process.ready)):
-            if not process.ready:  # it was killed
+            if not process.ready or process.paused:  # empty: it was killed
                 return
             handle = process.ready.popleft()
             if not handle.cancelled():

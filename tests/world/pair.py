@@ -26,6 +26,7 @@ ADDRESSES = {"a": "10.0.0.101", "b": "10.0.0.102"}
 WITNESS = "10.0.0.10"
 _KEYS = {"a": "a1" * 32, "b": "b2" * 32}
 _AGAIN_SECONDS = 1.0
+_STALL_SECONDS = (0.8, 1.1, 1.6, 3.0, 12.0)
 
 
 class PairWorld(World):
@@ -142,7 +143,8 @@ class PairWorld(World):
         """Return the kinds of faults."""
         return [
             self.crashes, self.crashes, self.crashes, self.link_is_cut, self.link_is_cut, self.link_is_cut,
-            self.switches_over, self.witness_ends, self.control_dies, self.rosmaster_dies, self.is_cut_off, self.dies,
+            self.switches_over, self.lease_stalls, self.witness_ends, self.control_dies, self.rosmaster_dies,
+            self.is_cut_off, self.dies,
         ]  # fmt: skip
 
     def crashes(self) -> None:
@@ -169,6 +171,12 @@ class PairWorld(World):
         """Order a switchover."""
         self.say("a switchover is ordered")
         self.loop.outside.start(self.order(admin.StandbyPromote()))
+
+    def lease_stalls(self) -> None:
+        """Pause the process `lease` of the appliance that became active last."""
+        seconds = self.random.choice(_STALL_SECONDS)
+        self.say(f"the lease of {self.appliance.address} is paused for {seconds} s")
+        self.appliance.pause_lease(seconds)
 
     def witness_ends(self) -> None:
         """Kill the witness, which starts again."""

@@ -200,7 +200,7 @@ class StateGiven(Message):
 class LeaseHeld(Message):
     """The lease reports that this appliance is active until `until` (seconds of CLOCK_BOOTTIME), in this epoch.
 
-    If no later time follows, the supervisor ends all processes that serve the robot.
+    If no later time follows, the supervisor stops all processes that serve the robot.
     """
 
     until: float
@@ -208,7 +208,12 @@ class LeaseHeld(Message):
 
 
 class LeaseEnded(Message):
-    """The lease reports that this appliance is not active any more."""
+    """The lease reports that this appliance is not active any more.
+
+    `renewable`: no other appliance can have had a grant so far, so a renewal in the same epoch may follow.
+    """
+
+    renewable: bool = False
 
 
 class Activated(Message):

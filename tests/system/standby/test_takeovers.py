@@ -10,6 +10,7 @@ import signal
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -127,6 +128,31 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
         robot.lost_nothing()
     site.until_both_in_sync()
     assert site.pair() == (active, passive)
+
+
+def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
+    """Nothing serves until the lease is renewed; then all goes on in the same epoch, with the same processes.
+
+    Without the standby no other appliance can claim, however long the process of the lease is paused.
+    """
+    active, passive = site.pair()
+    site.cut(passive)
+    eventually(lambda: site.in_sync() == {active}, site.story)
+    epoch, before = site.lease.read().epoch, site.pids(active)
+    serving = [pid for role in ("control", "relay", "rosmaster") for pid in site.pids(active, role)]
+    (lease,) = site.pids(active, "lease")
+    os.kill(lease, signal.SIGSTOP)
+    eventually(lambda: all(stopped(pid) for pid in serving), site.story)
+    os.kill(lease, signal.SIGCONT)
+    robot.lost_nothing()
+    assert (site.lease.read().epoch, site.pids(active)) == (epoch, before)
+    site.restore(passive)
+    site.until_both_in_sync()
+
+
+def stopped(pid: int) -> bool:
+    """Whether a process is stopped by a signal."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
 
 
 def test_a_cut_between_the_active_appliance_and_the_robot(site: StandbySite, robot: StandbyRobot) -> None:

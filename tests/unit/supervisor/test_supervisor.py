@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,8 @@ from typing import Any, cast
 import pytest
 from structlog.testing import capture_logs
 
-from appliance.channel.messages import CompilerWanted, RouteWanted
+from appliance.base import clock
+from appliance.channel.messages import CompilerWanted, LeaseEnded, LeaseHeld, RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.process_handle import ProcessHandle
@@ -34,16 +36,24 @@ class StandIn:
         self.heard_of = 0
         self.told: list[str] = []
         self.killed = False
+        self.signals: list[signal.Signals] = []
         self.pid = 1
+        self.started = 0.0
+        self.sandbox_state = "", list[str]()
+        self.congestion = ""
         self.since = ""
         self.reason = ""
         self.output: tuple[str, ...] = ()
         self.ready = False
         self.stalled_seconds = 0.0
 
-    def kill(self) -> None:
+    def kill(self, number: signal.Signals = signal.SIGKILL) -> None:
         """Record the call."""
-        self.killed = True
+        self.killed = number is signal.SIGKILL
+        self.signals.append(number)
+
+    def discount_pause(self, _seconds: float) -> None:
+        """Do nothing."""
 
     def send(self, message: object, _descriptors: tuple[int, ...] = ()) -> None:
         """Record the kind of the call."""
@@ -192,4 +202,34 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     supervisor.died(slot.process, -9)
     assert slot.due is not None  # each death is followed by a new start
     slot.due.cancel()
+    supervisor.kept.close()
+
+
+@pytest.mark.parametrize("end", ["renewed", "a death", "a new epoch"])
+async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(tmp_path: Path, end: str) -> None:
+    """A renewal in the same epoch lets it go on. Otherwise it is killed, also if a process ends in the meantime."""
+    roles = (CONTROL, Role("relay", "u", "p", "m:f"), Role("lease", "u", "p", "m:f", outlives_takeover=True))
+    admin = socket.create_server(("127.0.0.1", 0))
+    facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
+    supervisor = Supervisor(roles, facts, admin=admin, ready=lambda _said: None, stands_by=lambda: None)
+    control, relay, lease = stand_ins = [StandIn() for _ in roles]
+    for slot, process in zip(supervisor.slots, stand_ins, strict=True):
+        slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
+
+    def report(message: object) -> None:
+        supervisor._reports.received(cast(ProcessHandle, lease), message, ())
+
+    report(LeaseHeld(clock.since_boot() + 60, 5))
+    report(LeaseEnded(renewable=True))
+    assert [one.signals for one in stand_ins] == [[signal.SIGSTOP], [signal.SIGSTOP], []]
+    supervisor.start(supervisor.slots[1])
+    assert supervisor.slots[1].due is not None  # a start that was due waits
+    supervisor.slots[1].due.cancel()
+    if end == "a death":
+        supervisor.died(cast(ProcessHandle, relay), -9)
+        supervisor.slots[1].due.cancel()
+    else:
+        report(LeaseHeld(clock.since_boot() + 60, 5 if end == "renewed" else 7))
+    assert control.signals[1:] == [signal.SIGCONT if end == "renewed" else signal.SIGKILL]
+    assert lease.signals == []
     supervisor.kept.close()
