@@ -53,10 +53,14 @@ def _append(data: Path, fields: dict[str, str]) -> None:
         end = os.fstat(file).st_size
         if end and os.pread(file, 1, end - 1) != b"\n":  # a full disk or a crash cut the last line off
             line = b"\n" + line
-        if os.write(file, line) < len(line):
+        try:
+            written = os.write(file, line)
+            os.fsync(file)
+            os.fsync(folder)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(data / FILE)) from error
+        if written < len(line):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(data / FILE))
-        os.fsync(file)
-        os.fsync(folder)
 
 
 def _user() -> str:

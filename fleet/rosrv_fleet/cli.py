@@ -49,6 +49,12 @@ _ERRORS = (
     FleetConfigError, ServerCertificateError, EnrolmentError, TokenError, ReceiptKeyError, FilterError, TimestampError,
     SearchTooLongError, IndexDownError, OSError, ssl.SSLError, psycopg.Error,
 )  # fmt: skip
+_ADVICE = {
+    errno.ENOSPC: "; free space on this disk, and run the command again",
+    errno.EDQUOT: "; free space on this disk, and run the command again",
+    errno.EACCES: "; run this as the collector's user",
+    errno.EPERM: "; run this as the collector's user",
+}
 _MOST_WAITING = 1000
 
 
@@ -59,8 +65,16 @@ def main() -> None:
     try:
         app()
     except _ERRORS as error:
-        sys.stderr.write(f"rosrv-fleet: {printable(str(error).strip())}\n")
+        sys.stderr.write(f"rosrv-fleet: {printable(_reason(error))}\n")
         sys.exit(2)
+
+
+def _reason(error: BaseException) -> str:
+    """Return what failed, where and what to do."""
+    if not isinstance(error, OSError) or error.strerror is None or isinstance(error, ssl.SSLError):
+        return str(error).strip()
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror}{_ADVICE.get(error.errno or 0, '')}"
 
 
 @app.command()

@@ -1,7 +1,8 @@
 """Limit the bytes of each robot in a day, and pause a robot after refused uploads.
 
 The used bytes are on the disk, one file for each robot, so that a restart gives no robot a new quota. They decrease
-evenly, by the quota in a day. The files are not synced: a power cut may lose the last changes.
+evenly, by the quota in a day, down to those that a robot has saved (below 0): a robot that was off may send its backlog
+faster. A new robot has saved none. The files are not synced: a power cut may lose the last changes.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from rosrv_fleet.config import Limits
 from rosrv_fleet.robots import make_folder
 
 _DAY_SECONDS = 86_400.0
+_SAVED_DAYS = 7.0
 _LEAST_BYTES = 64 << 10  # a segment costs at least this: files, markers and folders also cost
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 600.0
 _REST = 10.0  # a refused segment costs this many times its processor time
@@ -31,7 +33,10 @@ class OverQuotaError(Exception):
 
 
 class UsedBytes(msgspec.Struct, frozen=True):
-    """The bytes that a robot has used at a time (seconds since the epoch): compressed and uncompressed ones."""
+    """The bytes that a robot has used at a time (seconds since the epoch): compressed and uncompressed ones.
+
+    Negative ones are saved.
+    """
 
     time: float = 0.0
     received: float = 0.0
@@ -64,9 +69,11 @@ class RobotQuotas:
             ("robot_unpacked_bytes_per_day", used.unpacked, limits.robot_unpacked_bytes_per_day),
         ):
             if value >= quota:
+                seconds = (value - quota) * _DAY_SECONDS / quota
                 raise OverQuotaError(
-                    f"this robot has used its limit of bytes for a day (limits.{name})",
-                    (value - quota) * _DAY_SECONDS / quota,
+                    f"this robot has used its limit of bytes for a day (limits.{name}), and continues in"
+                    f" {seconds / 60:.0f} min; a backlog takes several days",
+                    seconds,
                 )
 
     def charge(self, robot: str, received: int, unpacked: int) -> None:
@@ -105,6 +112,10 @@ class RobotQuotas:
         days, limits = max(0.0, now - used.time) / _DAY_SECONDS, self._limits
         return UsedBytes(
             now,
-            max(0.0, used.received - days * limits.robot_bytes_per_day),
-            max(0.0, used.unpacked - days * limits.robot_unpacked_bytes_per_day),
+            _after(used.received, days, limits.robot_bytes_per_day),
+            _after(used.unpacked, days, limits.robot_unpacked_bytes_per_day),
         )
+
+
+def _after(used: float, days: float, quota: int) -> float:
+    return max(-_SAVED_DAYS * quota, used - days * quota)

@@ -53,7 +53,9 @@ class KeyFolder:
             if name is not None and name[1] == role and any(keyid.startswith(name[2]) for keyid in keyids):
                 found.append(self._load(path))
         if not found:
-            raise KeyFileError(f"{self.folder} has no key of role {role}: give its folder with --keys")
+            raise KeyFileError(
+                f"{self.folder} has no key of role {role}: give its folder with --keys{_if_lost(role)}"
+            )
         return found
 
     def _load(self, path: Path) -> CryptoSigner:
@@ -68,6 +70,13 @@ class KeyFolder:
         return self._signers[path]
 
 
+def _if_lost(role: str) -> str:
+    """Return what to do if the key of a role is lost. A new root key needs the old one."""
+    if role == "root":
+        return "; if it is lost, make a new repository, and give its root.json to the robots"
+    return f"; if it is lost: rosrv-fleet bundle rotate {role}"
+
+
 def make_online_key(path: Path) -> Key:
     """Make the collector's timestamp key without a passphrase; return its public half."""
     signer = CryptoSigner.generate_ed25519()
@@ -80,7 +89,8 @@ def load_online_key(path: Path) -> CryptoSigner:
     try:
         key = load_pem_private_key(path.read_bytes(), None)
     except (OSError, ValueError, TypeError) as error:
-        raise KeyFileError(f"{path}: the timestamp key cannot be read: {error}") from error
+        advice = f"copy it from the repository{_if_lost('timestamp')}"
+        raise KeyFileError(f"{path}: the timestamp key cannot be read: {error}; {advice}") from error
     if not isinstance(key, Ed25519PrivateKey):
         raise KeyFileError(f"{path} is not an Ed25519 key")
     return CryptoSigner(key)

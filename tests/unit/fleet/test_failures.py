@@ -1,6 +1,8 @@
 """Tests of `rosrv_fleet.failures`: the collector's background work continues after an unexpected error."""
 
 import asyncio
+import errno
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import Any, NoReturn
 import psycopg
 import pytest
 import structlog
-from rosrv_fleet import indexer, retention
+from rosrv_fleet import cli, indexer, retention
 from rosrv_fleet.config import FleetConfig, RetentionConfig
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.enrolment import RobotGroup
@@ -139,3 +141,19 @@ def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
     shown = capfd.readouterr().err
     assert "raise RuntimeError" in shown
     assert secret not in shown
+
+
+def test_a_command_on_a_full_disk_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The error names the file and the remedy, in a line."""
+
+    def fail() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "data/tokens.json")
+
+    monkeypatch.setattr(cli, "app", fail)
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert capsys.readouterr().err == (
+        "rosrv-fleet: data/tokens.json: No space left on device; free space on this disk, and run the command again\n"
+    )

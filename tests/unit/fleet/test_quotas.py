@@ -52,6 +52,21 @@ def test_used_bytes_survive_a_restart_and_return_evenly(
     found.check("arm1")
 
 
+def test_a_robot_that_was_off_sends_its_backlog_faster(clock: _Clock, tmp_path: Path) -> None:
+    """It has saved the quota of its last week, and not more; a new robot has saved none."""
+    found = quotas(tmp_path, clock)
+    found.charge("arm1", 65_536, 65_536)
+    clock.now += 30 * _DAY
+    for _ in range(8):
+        found.check("arm1")
+        found.charge("arm1", 1_000_000, 0)
+    with pytest.raises(OverQuotaError, match="continues in 0 min"):
+        found.check("arm1")
+    found.charge("arm2", 1_000_000, 0)
+    with pytest.raises(OverQuotaError):
+        found.check("arm2")
+
+
 def test_a_tiny_segment_has_its_price(clock: _Clock, tmp_path: Path) -> None:
     """A robot cannot store countless files with few bytes."""
     found = quotas(tmp_path, clock)
