@@ -188,7 +188,7 @@ class HiddenMaster:
 
     def _write(self, method: str, key: str, *value: Value) -> Answer:
         there = mirror(self.parameters)
-        was = standing_at(there.tree, key)[0]
+        was = standing_at(there.tree, key)[0] if key != "/" else None  # the root cannot be deleted
         if value:
             put(there, key, value[0], HOST)
             self.parameters = there.tree

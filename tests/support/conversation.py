@@ -37,7 +37,7 @@ store state for a restart of control are left out. No socket is opened and no na
 RVMaster can be compared with the text.
 
 A file has policies (`policy NAME`, or `policy NAME like OTHER` for more sections, with indented lines), and then
-conversations (`# title`).
+conversations (`# title`). A file that begins with `only answers` lists all answers and no other effects.
 """
 
 import asyncio
@@ -46,7 +46,7 @@ import json
 import re
 import shlex
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from appliance.channel import messages
 from appliance.configuration.settings import LivenessSection
@@ -89,8 +89,9 @@ _WORDS = {
 class Conversation:
     """RVMaster and its clients; `policies` maps the names in `policy NAME` to texts."""
 
-    def __init__(self, parts: ControlParts, policies: dict[str, str]) -> None:
+    def __init__(self, parts: ControlParts, policies: dict[str, str], *, only_answers: bool = False) -> None:
         self.parts = parts
+        self._only_answers = only_answers
         self._policies = policies
         self._names: dict[str, str] = {}  # of incarnations, by their keys
         self._begun: dict[str, asyncio.Task[list[str]]] = {}  # calls without an answer, by their lines
@@ -113,6 +114,8 @@ class Conversation:
             answers = await (self._call_by(line) if is_call(line) else self._event(line))
         await self._settle()
         answers += self._finished()
+        if self._only_answers:
+            return answers
         shown = [self._shown(effect) for effect in self.parts.enactor.noted]
         refused = [f"record {record}" for record in self.parts.records.refused]
         withheld = [f"withhold {one.resource}" for one in self.parts.records.denied]
@@ -145,7 +148,7 @@ class Conversation:
         call = call_of(line)
         answer = await self._ask(call)
         if not call.parts:
-            return self._answered(call.method, answer, raw=call.raw)
+            return self._answered(call.method, answer, raw=call.raw or self._only_answers)
         assert isinstance(answer, list)
         return [
             f"{number}. {shown}"
@@ -172,7 +175,7 @@ class Conversation:
         """Return the lines of an answer; none if a call was only carried out."""
         if isinstance(answer, dict):
             return [f"fault: {answer['faultString']}"]
-        if raw and not isinstance(answer[0], int):
+        if raw and not (answer and isinstance(answer[0], int)):
             return [f"{number}. {one}" for number, part in enumerate(answer, 1) for one in self._part(part)]
         code, text, value = answer
         if code == 0:
@@ -180,7 +183,9 @@ class Conversation:
         if code == -1 and (raw or method not in QUESTIONS):
             return [f"error: {text}: {json.dumps(value)}"]
         if raw or method in QUESTIONS:
-            return [f"answer: {self._value(text)}: {self._value(value)}" if code == 1 else f"answer: {text}"]
+            return [
+                self._with_names(f"answer: {text}: {json.dumps(value)}") if code == 1 else f"answer: {text}"
+            ]
         return []
 
     def _part(self, part: Any) -> list[str]:
@@ -349,7 +354,9 @@ class Conversation:
     def _value(self, value: Value) -> str:
         if isinstance(value, list):
             return f"[{', '.join(self._value(one) for one in value)}]"
-        text = str(value)
+        return self._with_names(str(value))
+
+    def _with_names(self, text: str) -> str:
         for one in self.parts.registry.all():
             name = self._names[one.key]
             for uri in (one.outer_uri(one.told), f"rosrpc://{one.told}:{one.relay_port}"):
@@ -362,22 +369,31 @@ def _listed(registrations: Iterable[tuple[Kind, str]]) -> str:
     return ", ".join(f"{kind} {resource}" for kind, resource in registrations) or "nothing"
 
 
-def conversations_of(text: str) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the policies and the conversations of a file, by name and title."""
+class ConversationFile(NamedTuple):
+    """The policies and conversations of a file, by name and title."""
+
+    only_answers: bool
+    policies: dict[str, str]
+    conversations: dict[str, str]
+
+
+def conversations_of(text: str) -> ConversationFile:
+    """Return the contents of a file."""
     head, *conversations = f"\n{text}".split("\n# ")
     policies: dict[str, str] = {}
     for part in head.split("\npolicy ")[1:]:
         name, _, rules = part.partition("\n")
         name, _, base = name.partition(" like ")
         policies[name] = policies.get(base, "") + re.sub(r"(?m)^    ", "", f"{rules}\n")
-    return policies, dict(one.strip().split("\n", 1) for one in conversations)
+    titled = dict(one.strip().split("\n", 1) for one in conversations)
+    return ConversationFile(text.startswith("only answers\n"), policies, titled)
 
 
-async def taken_place(written: str, policies: dict[str, str]) -> str:
+async def taken_place(file: ConversationFile, title: str) -> str:
     """Return a conversation with the effects that its actions have."""
-    conversation = Conversation(await ControlParts.begun(), policies)
+    conversation = Conversation(await ControlParts.begun(), file.policies, only_answers=file.only_answers)
     lines: list[str] = []
-    for line in written.splitlines():
+    for line in file.conversations[title].splitlines():
         if not line.startswith(" "):
             lines += [line, *(f"    {effect}" for effect in await conversation.say(line))]
     return "\n".join(lines)
