@@ -75,7 +75,6 @@ def test_publisher_of_the_wrong_machine(appliance: Appliance, ros: RosSession, s
 
 @pytest.mark.real
 def test_second_machine_may_publish_elsewhere(ros: RosSession, second: Host) -> None:
-    """The second machine can publish the topics that the policy grants it, as with any master."""
     listener = ros.listener("rospy", "/topic2")
     ros.on(second).talker("roscpp", "/topic2", name="guest")
     assert listener.wait_for(event="received")["publisher"] == "/guest"
@@ -96,7 +95,6 @@ def test_kill_from_the_wrong_machine(appliance: Appliance, ros: RosSession, seco
 
 @pytest.mark.real
 def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, second: Host) -> None:
-    """A name in use on one machine cannot be taken over from another, even if the policy lets both use it."""
     listener = ros.listener("rospy", "/topic2")
     ros.talker("rospy", "/topic2", "--text", "mine", name="voice")
     listener.wait_for(event="received")
@@ -115,7 +113,6 @@ def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, se
 
 
 def test_rest_can_be_disabled(appliance: Appliance) -> None:
-    """With `--api off` there is no REST process, port or token."""
     assert appliance.ready["api"] is None
     assert "token" not in appliance.ready
     assert appliance.pids("api") == []

@@ -68,7 +68,6 @@ def forwarding_status(appliance: Appliance) -> dict[str, Any]:
 def test_every_record_arrives_and_verifies(
     collector: StreamCollector, appliance: Appliance, tmp_path: Path
 ) -> None:
-    """The receiver gets the whole log in order, and its checkpoints prove the log even against root."""
     work(appliance, 50)
     wanted = all_sequences(appliance)
     collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
@@ -91,7 +90,6 @@ def test_every_record_arrives_and_verifies(
 
 
 def test_an_unavailable_receiver(collector: StreamCollector, appliance: Appliance) -> None:
-    """While the receiver is away, nodes are served and the status reports it; then every record arrives."""
     appliance.ignore_earlier_records()
     collector.wait_for(lambda messages: messages)
     collector.close()
@@ -111,7 +109,6 @@ def test_an_unavailable_receiver(collector: StreamCollector, appliance: Applianc
 
 
 def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
-    """After repeated kills of the forwarder and control, and a restart of the appliance, no record is missing."""
     for role in ("syslog", "control", "syslog"):
         work(appliance, 60)
         before = appliance.pids(role)
@@ -127,8 +124,6 @@ def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
 
 
 def test_only_denials() -> None:
-    """With `send: denials`, of all decisions only denials are sent, each with caller and reason."""
-
     def decided(messages: list[Message]) -> bool:
         return any(one.event == "decision" for one in messages)
 
@@ -147,7 +142,6 @@ def test_only_denials() -> None:
 
 
 def test_a_log_rewritten_by_root(tmp_path: Path) -> None:
-    """Root rewrites the log with the real key: the log verifies locally, but the receiver's copy reveals the change."""
     with StreamCollector() as collector, forwarding(collector.port) as appliance:
         with master_at(appliance.master_uri) as master:
             assert master.noSuchCall("/thief")[0] == 0

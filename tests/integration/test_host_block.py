@@ -91,7 +91,6 @@ def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, ro
 
 
 def test_a_block_survives_a_crash_right_after_its_order(appliance: Appliance, robot: Robot) -> None:
-    """Control is killed as soon as the order is answered, and later the whole appliance is restarted."""
     appliance.rosrv("host", "block", TABLET)
     appliance.kill("control")
     assert robot.heard() == {"/friend"}
@@ -104,7 +103,6 @@ def test_a_block_survives_a_crash_right_after_its_order(appliance: Appliance, ro
 
 
 def test_a_block_ends_on_time_also_while_the_appliance_is_off(appliance: Appliance, robot: Robot) -> None:
-    """The host's nodes are heard again, and new ones can register without an order."""
     appliance.rosrv("host", "block", TABLET, "--for", "2s")
     appliance.recorded("--event", "host block ended")
     robot.hears("/stranger")

@@ -110,7 +110,6 @@ def test_only_the_publisher_beyond_its_limit_loses_messages(
 def test_two_subscribers_have_different_throttles_and_a_reload_lifts_one(
     appliance: Appliance, hosts: tuple[Host, Host], ros: RosSession, client: Client
 ) -> None:
-    """The tablet gets five messages a second, the robot twenty; without the limit, the same connection gets all."""
     tablet, robot = ros.on(hosts[1]).listener(client, "/camera"), ros.listener(client, "/camera")
     began = time.monotonic()
     ros.talker(client, "/camera", "--rate", "100", name=f"camera_{client}")

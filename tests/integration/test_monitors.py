@@ -97,7 +97,6 @@ def test_changed_and_dropped_messages_are_recorded(appliance: Appliance, ros: Ro
 def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """No message is lost, the order stays, and each change is recorded with its author."""
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
@@ -129,7 +128,6 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
 def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     appliance: Appliance, ros: RosSession
 ) -> None:
-    """No message is lost, and the first changed message directly follows the last unchanged one."""
     assert appliance.rosrv("monitor", "enable", "words", "--shadow").stdout == "shadow mode: words\n"
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
@@ -185,7 +183,6 @@ watch() {
 def test_a_missing_message_is_published_at_the_deadline(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """The appliance publishes the message, with a record; and `check` predicts it."""
     spec = tmp_path / "watch.rv"
     spec.write_text(WATCH)
     said = "enforced: at the deadline raise_alarm publishes the due message (/alarm)"
@@ -247,7 +244,6 @@ def test_a_new_relay_reports_that_it_begins_in_the_initial_state(
 
 @pytest.mark.real
 def test_loaded_and_switched_monitors_survive_a_restart(appliance: Appliance, tmp_path: Path) -> None:
-    """A restart of the appliance or of control keeps them; ROSRV's calls and flags report the same."""
     spec = tmp_path / "more.rv"
     spec.write_text(WORDS.replace("words()", "more()").replace("/chatter", "/other"))
     appliance.rosrv("monitor", "load", str(spec))
@@ -294,7 +290,6 @@ def test_an_incompatible_stored_revision_can_be_discarded(appliance: Appliance, 
 
 
 def test_a_file_with_an_error_does_not_keep_the_robot_without_a_master(tmp_path: Path) -> None:
-    """The others come into force; its monitor holds its topics until a corrected file is loaded, over restarts."""
     broken = "broken() { event e() /held std_msgs/String '{}' { if (lost) { return; } } }"
     with Appliance(monitors={"words": WORDS, "broken": broken}, options=("--api", "off")) as running:
         for _ in range(2):
@@ -370,7 +365,6 @@ def said(listener: Process, prefix: str) -> None:
 def test_monitors_change_during_a_thousand_messages_a_second(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
-    """One listener is fast, one is stopped for a while, one is late: each gets the messages in order, without gaps."""
     spec = tmp_path / "words.rv"
     steady, stopped = ros.listener("rospy", "/chatter"), ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", "--rate", "1000", name="voice")
@@ -448,7 +442,6 @@ for line in sys.stdin:
 
 @pytest.mark.parametrize("relay", ["all", "monitored"])
 def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -> None:
-    """The gun does not fire while it points at the robot itself, in either mode of the relay."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     options = (
         "--monitors",

@@ -24,7 +24,6 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_first: bool) -> None:
-    """Messages arrive in order and from the right node, whichever of the two nodes started first."""
     if subscriber_first:
         listener = ros.listener(to, "/chatter")
         ros.talker(by, "/chatter", name="voice")
@@ -39,7 +38,6 @@ def test_talker_to_listener(ros: RosSession, by: Client, to: Client, subscriber_
 @pytest.mark.parametrize("to", CLIENTS)
 @pytest.mark.parametrize("by", CLIENTS)
 def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
-    """Late subscribers get the last message of a latched topic once each."""
     talker = ros.talker(by, "/map", "--latch")
     talker.wait_for(event="sent")
     for number in range(2):
@@ -50,7 +48,6 @@ def test_latched_message(ros: RosSession, by: Client, to: Client) -> None:
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -> None:
-    """ROS's own rule holds: a new node of the same name on the same host ends the old one."""
     listener = ros.listener("rospy", "/chatter")
     first = ros.talker(by, "/chatter", "--text", "first", name="voice")
     listener.wait_for(event="received")
@@ -61,7 +58,6 @@ def test_second_node_of_a_name_replaces_the_first(ros: RosSession, by: Client) -
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_talker_notices_that_the_listener_left(ros: RosSession, by: Client) -> None:
-    """A publisher is notified when a subscriber connects, and when the last subscriber leaves."""
     talker = ros.talker(by, "/chatter")
     listener = ros.listener("roscpp", "/chatter")
     talker.wait_for(event="connected")
@@ -90,7 +86,6 @@ def test_service(ros: RosSession, by: Client, to: Client) -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_persistent_service_connection(ros: RosSession, client: Client) -> None:
-    """A client that keeps its connection is served on it."""
     ros.service_server("roscpp", "/negate")
     asker = ros.service_client(client, "/negate", "--persistent")
     for number in range(3):
@@ -100,7 +95,6 @@ def test_persistent_service_connection(ros: RosSession, client: Client) -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_missing_service(ros: RosSession, client: Client) -> None:
-    """A call of a missing service fails, and the client continues."""
     asker = ros.service_client(client, "/nobody")
     asker.send("true")
     asker.wait_for(event="failed")
@@ -111,7 +105,6 @@ def test_missing_service(ros: RosSession, client: Client) -> None:
 
 @pytest.mark.real
 def test_watched_parameter(ros: RosSession) -> None:
-    """A parameter set by one node reaches the nodes that watch it, rospy and roscpp."""
     python, cpp = ros.parameters("rospy"), ros.parameters("roscpp")
     python.send(json.dumps({"do": "set", "key": "/speed", "value": "slow"}))
     python.wait_for(event="done", do="set")
@@ -132,7 +125,6 @@ def test_watched_parameter(ros: RosSession) -> None:
     ids=repr,
 )
 def test_parameter_values(ros: RosSession, value: object) -> None:
-    """Every kind of parameter value is returned as it was set."""
     node = ros.parameters("rospy")
     for told in ({"do": "set", "key": "/value", "value": value}, {"do": "get", "key": "/value"}):
         node.send(json.dumps(told))
@@ -144,7 +136,6 @@ def test_parameter_values(ros: RosSession, value: object) -> None:
 
 
 def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
-    """A node on the operator's machine hears the robot, and the robot hears it."""
     elsewhere = ros.on(site.ocu)
     here, there = ros.listener("rospy", "/down"), elsewhere.listener("roscpp", "/up")
     ros.talker("roscpp", "/up", name="robot_voice")
@@ -155,7 +146,6 @@ def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
 
 @pytest.mark.real
 def test_relative_and_private_names(ros: RosSession) -> None:
-    """Namespaces and remappings are resolved as usual."""
     listener = ros.listener("roscpp", "/left/chatter")
     ros.talker("rospy", "chatter", "__ns:=/left")
     listener.wait_for(event="received")

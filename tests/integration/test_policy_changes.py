@@ -24,7 +24,6 @@ def appliance(own_appliance: Appliance) -> Appliance:
 def test_a_rollback_restores_rights_of_running_nodes(
     appliance: Appliance, ros: RosSession, client: Client, without: str
 ) -> None:
-    """Messages stop with the bad revision and return with the rollback; no node is restarted."""
     listener = ros.listener(client, "/chatter")
     ros.talker(client, "/chatter", name="voice")
     listener.wait_for(event="received")
@@ -45,7 +44,6 @@ def test_a_rollback_restores_rights_of_running_nodes(
 def test_revocations_survive_a_crash_of_control(
     appliance: Appliance, ros: RosSession, client: Client
 ) -> None:
-    """A crash of control between the bad revision and the rollback makes no difference."""
     listener = ros.listener(client, "/chatter")
     ros.talker(client, "/chatter", name="voice")
     listener.wait_for(event="received")

@@ -53,7 +53,6 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
 
 
 def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path: Path) -> None:
-    """If `--write` to the file in force finds no disk space, the file stays complete, and the error says so."""
     record = refused(appliance, "registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     with small_disk(tmp_path, "8k"):
         policy = tmp_path / "policy.ini"
@@ -166,7 +165,6 @@ def test_every_denial_explains_itself(appliance: Appliance) -> None:
 
 
 def test_a_revocation_explains_the_change_that_would_undo_it(appliance: Appliance) -> None:
-    """If a new policy ends a publication, the record has the change that would allow the publication again."""
     open_to_all = CLOSED.replace("[Publishers]\ndefault = ocu", "[Publishers]\ndefault = *")
     appliance.reload(open_to_all)
     with ServerProxy(appliance.master_uri) as master:

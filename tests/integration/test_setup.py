@@ -37,7 +37,6 @@ def run_setup(folder: Path, *, busy: int, said: str) -> subprocess.CompletedProc
 
 
 def test_it_waits_for_the_lock_of_apt(tmp_path: Path) -> None:
-    """The script says once that it waits, and then installs the packages."""
     need_root()
     done = run_setup(
         tmp_path, busy=3, said="E: Could not get lock /var/lib/apt/lists/lock. It is held by process 9"
@@ -49,7 +48,6 @@ def test_it_waits_for_the_lock_of_apt(tmp_path: Path) -> None:
 
 
 def test_another_failure_of_apt_ends_it(tmp_path: Path) -> None:
-    """The script prints apt-get's output and does not try again."""
     need_root()
     done = run_setup(tmp_path, busy=1, said="E: Unable to fetch some archives")
     assert done.returncode == 1
@@ -108,7 +106,6 @@ def test_the_demo_keeps_the_packages_of_a_developer(checkout: Path) -> None:
 
 
 def test_a_failure_prints_the_whole_output(checkout: Path) -> None:
-    """The command and everything that it printed, and the next run tries again."""
     (checkout / "broken").touch()
     done = set_up(checkout)
     assert (done.returncode, "this command failed: .venv/bin/uv pip sync" in done.stderr) == (1, True)

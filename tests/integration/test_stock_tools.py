@@ -39,7 +39,6 @@ def ros(site: Site, tmp_path: Path) -> Iterator[RosSession]:
 
 @pytest.mark.real
 def test_rostopic_list(ros: RosSession) -> None:
-    """`rostopic list` prints the topics, and `-v` their publishers and subscribers."""
     ros.talker("rospy", "/chatter")
     ros.listener("roscpp", "/chatter")
     assert "/chatter" in ros.run("rostopic", "list").stdout.split()
@@ -51,21 +50,18 @@ def test_rostopic_list(ros: RosSession) -> None:
 @pytest.mark.real
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rostopic_echo(ros: RosSession, client: Client) -> None:
-    """`rostopic echo -n 2` prints two messages and ends."""
     ros.talker(client, "/chatter")
     printed = ros.run("rostopic", "echo", "-n", "2", "/chatter").stdout
     assert len(re.findall(r'^data: "hello \d+"$', printed, re.MULTILINE)) == 2
 
 
 def test_rostopic_echo_does_not_stay_in_the_graph(ros: RosSession) -> None:
-    """A tool that has ended is not a subscriber any more."""
     ros.talker("rospy", "/chatter", name="voice")
     ros.run("rostopic", "echo", "-n", "1", "/chatter")
     assert "Subscribers: None" in ros.run("rostopic", "info", "/chatter").stdout
 
 
 def test_rostopic_hz(ros: RosSession) -> None:
-    """`rostopic hz` measures the publishing rate of the node."""
     ros.talker("roscpp", "/chatter")
     hz = ros.start(["rostopic", "hz", "/chatter"])
     hz.wait_for(lambda event: _window(event) >= 20)
@@ -80,7 +76,6 @@ def _window(event: Event) -> int:
 
 
 def test_rostopic_pub(ros: RosSession) -> None:
-    """`rostopic pub -1` reaches rospy and roscpp."""
     listeners = [ros.listener("rospy", "/told"), ros.listener("roscpp", "/told")]
     ros.run("rostopic", "pub", "-1", "/told", "std_msgs/String", "data: hi")
     for listener in listeners:
@@ -89,7 +84,6 @@ def test_rostopic_pub(ros: RosSession) -> None:
 
 @pytest.mark.real
 def test_rostopic_info_and_type(ros: RosSession) -> None:
-    """`rostopic info` prints type, publisher and subscriber; `type` and `find` agree."""
     ros.talker("roscpp", "/chatter", name="voice")
     ros.listener("rospy", "/chatter", name="ear")
     info = ros.run("rostopic", "info", "/chatter").stdout
@@ -101,7 +95,6 @@ def test_rostopic_info_and_type(ros: RosSession) -> None:
 
 
 def test_rosnode_list(ros: RosSession) -> None:
-    """`rosnode list` prints the robot's nodes and `/rosout`, and no node of the appliance."""
     ros.talker("rospy", "/chatter", name="voice")
     assert ros.run("rosnode", "list").stdout.split() == ["/rosout", "/voice"]
 
@@ -109,7 +102,6 @@ def test_rosnode_list(ros: RosSession) -> None:
 @pytest.mark.real
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rosnode_info(ros: RosSession, client: Client) -> None:
-    """`rosnode info` prints publications, subscriptions, services, and the node's connections."""
     ros.talker(client, "/chatter", name="voice")
     ros.listener("rospy", "/chatter", name="ear").wait_for(event="received")
     info = ros.run("rosnode", "info", "/voice").stdout
@@ -122,14 +114,12 @@ def test_rosnode_info(ros: RosSession, client: Client) -> None:
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rosnode_ping(ros: RosSession, client: Client) -> None:
-    """`rosnode ping` reaches the node."""
     ros.talker(client, "/chatter", name="voice")
     assert "xmlrpc reply from" in ros.run("rosnode", "ping", "-c", "1", "/voice").stdout
 
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_rosnode_kill(ros: RosSession, client: Client) -> None:
-    """`rosnode kill` ends the node."""
     talker = ros.talker(client, "/chatter", name="voice")
     assert "killed" in ros.run("rosnode", "kill", "/voice").stdout
     talker.wait()
@@ -138,7 +128,6 @@ def test_rosnode_kill(ros: RosSession, client: Client) -> None:
 
 @pytest.mark.real
 def test_rosparam(ros: RosSession, tmp_path: Path) -> None:
-    """`rosparam` sets, gets, lists, dumps, loads and deletes."""
     ros.run("rosparam", "set", "/arm", "{speed: 0.5, joints: [1, 2], name: left}")
     assert yaml.safe_load(ros.run("rosparam", "get", "/arm/speed").stdout) == 0.5
     assert {"/arm/speed", "/arm/joints", "/arm/name"} <= set(ros.run("rosparam", "list").stdout.split())
@@ -154,7 +143,6 @@ def test_rosparam(ros: RosSession, tmp_path: Path) -> None:
 
 @pytest.mark.real
 def test_rosservice(ros: RosSession) -> None:
-    """`rosservice` lists, shows the type and the node, and calls."""
     ros.service_server("roscpp", "/negate", name="negator")
     assert "/negate" in ros.run("rosservice", "list").stdout.split()
     assert ros.run("rosservice", "type", "/negate").stdout.strip() == "std_srvs/SetBool"
@@ -166,7 +154,6 @@ def test_rosservice(ros: RosSession) -> None:
 
 @pytest.mark.real
 def test_rosbag(ros: RosSession, tmp_path: Path) -> None:
-    """A bag recorded from the running robot plays back to a listener."""
     bag = tmp_path / "run.bag"
     talker = ros.talker("roscpp", "/chatter")
     ros.run("rosbag", "record", "-l", "5", "-O", str(bag), "/chatter")
@@ -193,7 +180,6 @@ def package_of_two_nodes(workspace: Path) -> Path:
 
 @pytest.mark.real
 def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
-    """`roslaunch` sets its parameters, starts two nodes that communicate, and ends them when interrupted."""
     file = package_of_two_nodes(tmp_path / "workspace")
     launch = ros.start(["roslaunch", "--wait", str(file)], ROS_PACKAGE_PATH=str(tmp_path / "workspace"))
     assert launch.wait_for(event="received")["publisher"] == "/pair/voice"
@@ -206,7 +192,6 @@ def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
 
 
 def test_tools_run_on_another_host(site: Site, ros: RosSession) -> None:
-    """The tools work on the operator's machine as on the robot."""
     ros.talker("roscpp", "/chatter", name="voice")
     elsewhere = ros.on(site.ocu)
     assert "hello" in elsewhere.run("rostopic", "echo", "-n", "1", "/chatter").stdout

@@ -26,7 +26,6 @@ def echoed(appliance: Appliance, *arguments: str) -> list[dict[str, object]]:
 def test_echo_shows_the_subscribers_messages_and_is_recorded(
     appliance: Appliance, ros: RosSession, client: Client, tmp_path: Path
 ) -> None:
-    """The output has messages before and after a monitor changes them; the graph shows no new subscriber."""
     topic = f"/{client}_chatter"
     ros.talker(client, topic, "--text", "word", name="voice").wait_for(event="ready")
     shown = echoed(appliance, topic, "-n", "3")
@@ -43,7 +42,6 @@ def test_echo_shows_the_subscribers_messages_and_is_recorded(
 
 
 def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
-    """The message is shown once, even if more are requested; a later message counts as new."""
     ros.talker("rospy", "/map", "--latch", "--count", "1", name="server")
     ros.listener("rospy", "/map", name="reader").wait_for(event="received")  # now the relay has it
     done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
@@ -72,7 +70,6 @@ def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) ->
 
 
 def test_a_silent_topic_ends_and_blocks_no_other_request(appliance: Appliance, ros: RosSession) -> None:
-    """A silent topic ends the command with status 1 after the time limit; until then other requests are answered."""
     ros.listener("roscpp", "/quiet", name="ear").wait_for(event="ready")
     eventually(
         lambda: appliance.rosrv("topic", "info", "/quiet", check=False).returncode == 0, lambda: "no topic"

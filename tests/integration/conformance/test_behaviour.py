@@ -62,7 +62,6 @@ def test_own_topic_roscpp(ros: RosSession) -> None:
 
 
 def test_dynamic_subscriptions(ros: RosSession) -> None:
-    """A node that unsubscribes and subscribes again, or stops publishing and begins again, is served."""
     node, talker = rospy_node(ros, "orders", "dynamic"), rospy_node(ros, "orders", "source")
     order(talker, "advertise", topic="/d", latch=True)
     for number in range(5):
@@ -84,7 +83,6 @@ def test_dynamic_subscriptions(ros: RosSession) -> None:
 
 @pytest.mark.parametrize("by", CLIENTS)
 def test_publisher_restarted_again_and_again(ros: RosSession, by: Client) -> None:
-    """Persistent subscribers receive each incarnation of a publisher that is killed or stopped, and restarted."""
     ears = [ros.listener(to, "/chatter") for to in CLIENTS]
     for number in range(20 if by == "roscpp" else 4):  # a rospy node takes a second to end
         voice = ros.talker(by, "/chatter", "--text", f"life {number}", name="voice")
@@ -97,7 +95,6 @@ def test_publisher_restarted_again_and_again(ros: RosSession, by: Client) -> Non
 
 
 def test_killed_node_is_replaced(ros: RosSession) -> None:
-    """A killed node can be restarted under its name at once, and its service answers again."""
     ros.service_server("roscpp", "/negate", name="server").kill()
     ros.service_server("rospy", "/negate", name="server")
     asker = ros.service_client("roscpp", "/negate")
@@ -110,7 +107,6 @@ def test_killed_node_is_replaced(ros: RosSession) -> None:
 
 
 def test_actions(ros: RosSession) -> None:
-    """With actionlib, one goal is reached and another is cancelled."""
     rospy_node(ros, "action_server", "counter")
     client = rospy_node(ros, "action_client", "asker")
     assert client.wait_for(event="reached")["result"] == 5
@@ -132,7 +128,6 @@ def test_simulated_time(ros: RosSession) -> None:
 
 
 def test_rosout_is_aggregated(ros: RosSession) -> None:
-    """Log messages of nodes arrive on /rosout_agg."""
     agg = ros.start(["rostopic", "echo", "/rosout_agg/msg"])
     nodes = [rospy_node(ros, "orders", f"logger_{number}") for number in range(3)]
     deadline = time.monotonic() + 2 * LIMIT
@@ -161,7 +156,6 @@ def test_topic_tools(ros: RosSession) -> None:
 
 
 def test_anonymous_and_remapped_names(ros: RosSession) -> None:
-    """Two anonymous publishers coexist; a private name belongs to its node."""
     ear = rospy_node(ros, "orders", "ear")
     order(ear, "subscribe", topic="~inbox")
     pubs = [
@@ -176,7 +170,6 @@ def test_anonymous_and_remapped_names(ros: RosSession) -> None:
 
 
 def test_wrong_type_is_not_connected(ros: RosSession) -> None:
-    """A publisher of another type is ignored and disturbs no one; a publisher of the right type is received."""
     ros.talker("roscpp", "/typed", name="right")
     wrong = ros.start(["rostopic", "pub", "-r", "10", "/typed", "std_msgs/Bool", "true"])
     ear = ros.listener("rospy", "/typed")
@@ -248,7 +241,6 @@ def test_launch_file(ros: RosSession, tmp_path: Path) -> None:
 
 
 def test_hundred_nodes_of_ten_topics(local: Site) -> None:
-    """100 nodes publish and subscribe to 10 topics each as fast as they can: all get connected, in order."""
     with FakeNodes() as nodes, ServerProxy(local.master_uri) as server:
         master: Any = server
         start = time.monotonic()

@@ -187,14 +187,12 @@ def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
 
 @pytest.mark.parametrize("role", KILLED)
 def test_killed(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """SIGKILL one process."""
     strike(robot, signal.SIGKILL, role)
     unharmed(f"{role} killed")
 
 
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
-    """SIGKILL a process, and its successor as soon as it runs."""
     first = processes(robot)[role]
     os.kill(first, signal.SIGKILL)
 
@@ -217,7 +215,6 @@ def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role:
     ids=" and ".join,
 )
 def test_killed_at_once(robot: RobotAtWork, unharmed: Callable[[str], None], roles: tuple[str, ...]) -> None:
-    """SIGKILL several processes at once."""
     strike(robot, signal.SIGKILL, *roles)
     unharmed(f"{' and '.join(roles)} killed")
 

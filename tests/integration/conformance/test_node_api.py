@@ -99,7 +99,6 @@ def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
 
 @pytest.mark.parametrize("step", ERRORS, ids=repr)
 def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    """A caller's error gets -1 and an empty value, from the appliance as from rospy."""
     answers = asked(pair, step)
     assert answers.plain[0] == -1
     found = differences(answers)
@@ -108,7 +107,6 @@ def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) ->
 
 @pytest.mark.parametrize("step", SERVED, ids=repr)
 def test_a_call_that_is_served(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    """Every caller gets the same code, text and value, including a tool without a name."""
     answers = asked(pair, step)
     assert answers.plain[0] == 1
     assert differences(answers) == []

@@ -71,7 +71,6 @@ _WATCHES = st.tuples(
 )
 @given(steps=st.lists(st.one_of(_WATCHES, _WRITES, _WRITES), min_size=3, max_size=12))
 def test_watchers_get_the_same_updates_of_any_sequence(both: BothMasters, steps: list[Step]) -> None:
-    """For any order of watching, setting and deleting, every watcher gets the same updates of every single write."""
     both.reset()
     for node in ("ear", "eye"):
         both.call("subscribeParam", f"/{node}", Api(node), "/settled")
@@ -104,7 +103,6 @@ def _sorted(told: dict[str, list[Any]]) -> dict[str, list[str]]:
 
 
 def test_any_multicall_runs_in_order(both: BothMasters) -> None:
-    """Sequences of sets, deletions and reads, mixed with other calls and errors, are answered as by a plain master."""
     dice = random.Random(20)  # noqa: S311  the same calls in every run
     keys = ["/m/a", "/m/a/b", "/m/a/b/c", "/m/d", "m/relative", "/m", "~private", "/m//x", "/m/bad name"]
     for _ in range(30):

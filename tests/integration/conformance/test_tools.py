@@ -25,27 +25,23 @@ print(json.dumps({"nodes": sorted(graph.nn_nodes), "bad": sorted(graph.bad_nodes
 
 
 def test_rostopic_bw(ros: RosSession) -> None:
-    """`rostopic bw` measures the bandwidth."""
     ros.talker("roscpp", "/chatter")
     assert "average:" in ros.start(["rostopic", "bw", "/chatter"]).wait_for_text("average:")
 
 
 def test_rostopic_delay(ros: RosSession) -> None:
-    """`rostopic delay` measures messages with a header."""
     ros.start(["rostopic", "pub", "-r", "20", "/stamped", "geometry_msgs/PointStamped", "header: auto"])
     line = ros.start(["rostopic", "delay", "/stamped"]).wait_for_text("average delay")
     assert 0 <= float(line.removeprefix("average delay: ")) < 5
 
 
 def test_rostopic_pub_latched(ros: RosSession) -> None:
-    """Every later subscriber gets the message of `rostopic pub -l`."""
     ros.start(["rostopic", "pub", "-l", "/told", "std_msgs/String", "data: kept"])
     for to in CLIENTS * 2:
         assert ros.listener(to, "/told").wait_for(event="received")["data"] == "kept"
 
 
 def test_rostopic_echo_of_a_bag_and_of_a_field(ros: RosSession, tmp_path: Path) -> None:
-    """`rostopic echo` prints a field, also from a bag that `rosbag record -a` wrote of all topics."""
     ros.talker("roscpp", "/chatter")
     assert "hello" in ros.run("rostopic", "echo", "-n", "1", "/chatter/data").stdout
     bag = tmp_path / "all.bag"
@@ -74,7 +70,6 @@ def test_rosnode_of_a_killed_node(ros: RosSession) -> None:
 
 
 def test_rosnode_machine_and_list(local: Site, ros: RosSession) -> None:
-    """`rosnode list -a` prints the address of every node, `rosnode machine` this machine."""
     ros.talker("rospy", "/chatter", name="voice")
     assert re.search(r"http://127\.0\.0\.1:\d+/ \t?\s*/voice", ros.run("rosnode", "list", "-a").stdout)
     assert "127.0.0.1" in ros.run("rosnode", "machine").stdout
@@ -96,7 +91,6 @@ def test_rosnode_kill_all(ros: RosSession) -> None:
 
 
 def test_rosparam_of_a_namespace(ros: RosSession, tmp_path: Path) -> None:
-    """Use `rosparam load` and `dump` on a whole file with private and nested names, and `list` on a namespace."""
     file = tmp_path / "robot.yaml"
     file.write_text(
         "arm: {joints: [1, 2], 'joint-1.left': {p: 0.5, i: 1e-3}}\nbase: {frame: base_link, enabled: true}\n"
@@ -113,7 +107,6 @@ def test_rosparam_of_a_namespace(ros: RosSession, tmp_path: Path) -> None:
 
 
 def test_rosservice_find_args_uri(ros: RosSession) -> None:
-    """`rosservice find`, `args` and `uri` probe the service itself."""
     ros.service_server("rospy", "/negate", name="server")
     assert "/negate" in ros.run("rosservice", "find", "std_srvs/SetBool").stdout.split()
     assert ros.run("rosservice", "args", "/negate").stdout.strip() == "data"
@@ -134,13 +127,11 @@ def test_graph_as_rqt_graph_reads_it(local: Site, ros: RosSession) -> None:
 
 
 def test_rosgraph(ros: RosSession) -> None:
-    """`rosgraph` prints the nodes and their connections."""
     ros.talker("roscpp", "/chatter", name="voice")
     ros.start(["rosgraph"]).wait_for_text("/voice :")
 
 
 def test_rosbag_play_with_a_clock(ros: RosSession, tmp_path: Path) -> None:
-    """A bag of a latched topic, played with `--clock` and remapped, is received as recorded."""
     bag = tmp_path / "map.bag"
     source = rospy_node(ros, "orders", "source")
     order(source, "advertise", topic="/map", latch=True)

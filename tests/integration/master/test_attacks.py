@@ -92,7 +92,6 @@ def outer(field: Field, node: str) -> str:
 
 
 def test_rosout_receives_every_nodes_log(field: Field) -> None:
-    """The rosout aggregator receives every node's log, though the policy names neither it nor this machine."""
     for name in ("voice", "ear"):
         field.recorded(f"is connected to /rosout of /{name}", event="connection opened", caller_id="/rosout")
 
@@ -122,7 +121,6 @@ def test_uri_of_a_third_machine(field: Field) -> None:
 
 
 def test_service_of_a_third_machine(field: Field) -> None:
-    """A service URI that names a third machine leads to the caller's own host only."""
     with (
         Impostor(field.unknown_host, answering([1, "", 0])) as third,
         Impostor(field.attacker, answering([1, "", 0])) as node,
@@ -198,7 +196,6 @@ def test_granted_topic_arrives(field: Field) -> None:
     ids=lambda fields: " ".join(fields.values()),
 )
 def test_relay_port_without_the_grant(field: Field, fields: dict[str, str]) -> None:
-    """A known relay port serves only topics that were permitted to this host and name."""
     answer = knock(field, relay_port(field), header(**fields, **STRING))
     assert b"callerid=/shared_voice" not in answer
     assert b"hello" not in answer
@@ -206,7 +203,6 @@ def test_relay_port_without_the_grant(field: Field, fields: dict[str, str]) -> N
 
 
 def test_permission_of_another_host(field: Field) -> None:
-    """A permission is bound to the requesting host: the same name on another host is denied."""
     uri = field.call(field.ocu, "lookupNode", "/looker2", "/voice")[2]
     code, _text, protocol = field.call(field.ocu, "requestTopic", "/borrowed", "/chatter", TCPROS, uri=uri)
     assert code == 1
@@ -259,7 +255,6 @@ def _listening() -> set[tuple[str, int]]:
 
 
 def test_loopback_listeners_from_another_host(field: Field) -> None:
-    """Listeners for `rosmaster` and for the appliance's own nodes are on loopback and unreachable from other hosts."""
     hidden = {port for address, port in field.middle.run(_listening) if address == LOOPBACK}
     for port in hidden:
         with pytest.raises(OSError, match=r"timed out|refused|unreachable"):

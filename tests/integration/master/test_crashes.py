@@ -105,7 +105,6 @@ def working(battlefield: Field) -> Iterator[Field]:
 
 @pytest.mark.parametrize("roles", [["control"], ["rosmaster"], ["relay"], ["rosmaster", "control"]])
 def test_killed_in_a_burst_of_registrations(working: Field, roles: list[str]) -> None:
-    """`kill -9` during many registrations: each confirmed registration survives, and none fails."""
     pids = [working.appliance.pids(role)[0] for role in roles]
     with Burst(working, f"/burst_{'_'.join(roles)}") as burst:
         for pid in pids:
@@ -115,7 +114,6 @@ def test_killed_in_a_burst_of_registrations(working: Field, roles: list[str]) ->
 
 
 def test_rosmaster_stopped_for_two_seconds(working: Field) -> None:
-    """A stopped `rosmaster` delays writes of parameters; no call fails, and it is not killed."""
     pid = working.appliance.pids("rosmaster")[0]
     with Burst(working, "/burst_stopped") as burst:
         os.kill(pid, signal.SIGSTOP)
@@ -131,7 +129,6 @@ def test_rosmaster_stopped_for_two_seconds(working: Field) -> None:
 
 
 def test_reloads_under_load(working: Field) -> None:
-    """Two hundred reloads, some invalid, while nodes register: each call is decided by one complete policy."""
     even = POLICY.replace("[Subscribers]", "[Subscribers]\n/even_topic = 10.77.0.66")
     odd = POLICY.replace("[Publishers]", "[Publishers]\n/odd_topic = 10.77.0.66")
     over = threading.Event()
@@ -168,7 +165,6 @@ def test_reloads_under_load(working: Field) -> None:
 
 
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:
-    """After `rosrv up` on the same state, running nodes continue with their parameters and are not restarted."""
     field = battlefield
     ears = [
         field.ros.on(field.ocu).listener("rospy", "/chatter", name="python_ear"),

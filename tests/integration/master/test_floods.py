@@ -117,7 +117,6 @@ def test_calls(calm: Field) -> None:
 
 
 def test_calls_whose_answers_are_not_read(calm: Field) -> None:
-    """Requests without reading the answers, on many connections, are limited and finally closed."""
     data = request("getParam", "/flooder", "/") * 200
     held = [calm.connect() for _ in range(100)]
     for one in held:
@@ -131,7 +130,6 @@ def test_calls_whose_answers_are_not_read(calm: Field) -> None:
 
 
 def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
-    """Slow requests that query the rogue's own node do not occupy the slots of other hosts."""
     silence = threading.Event()
     with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
         answer = calm.rogue("registerPublisher", "/black_hole", "/hole", "std_msgs/String", node.uri)
@@ -151,7 +149,6 @@ def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
 
 
 def test_values_for_a_node_that_never_answers(calm: Field) -> None:
-    """Updates of a large parameter for a node that reads none do not accumulate in memory."""
     silence = threading.Event()
     with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
         assert calm.rogue("subscribeParam", "/hoarder", node.uri, "/hoard")[0] == 1
@@ -163,7 +160,6 @@ def test_values_for_a_node_that_never_answers(calm: Field) -> None:
 
 
 def test_queried_names_do_not_accumulate(calm: Field) -> None:
-    """New names in reading calls and topic requests, without end, do not make memory grow."""
     face = calm.rogue("lookupNode", "/looker", "/voice")[2]
 
     def act(number: int, turn: int) -> None:

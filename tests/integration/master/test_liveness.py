@@ -45,7 +45,6 @@ def test_the_monitors_publisher_behind_the_firewall_is_not_lost(
 def test_a_paused_subscriber_gets_a_new_publisher_when_it_goes_on(
     lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
-    """A paused subscriber that missed a new publisher, but was never lost, gets the update when it continues."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     middle = lab.host("appliance", "10.77.0.2/24")
     settings = "limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n"

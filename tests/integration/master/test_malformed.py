@@ -44,7 +44,6 @@ def test_the_limit_of_values_in_one_request(field: Field, method: str) -> None:
 
 
 def test_a_multicall_of_cheap_calls(field: Field) -> None:
-    """Tens of thousands of calls in one request do not delay a node, and are all answered."""
     part = "<value><struct><member><name>methodName</name><value>getPid</value></member><member><name>params</name>" \
         "<value><array><data><value>/m</value></data></array></value></member></struct></value>"  # fmt: skip
     count = 60_000

@@ -123,7 +123,6 @@ def test_a_dry_run_names_exactly_what_a_reload_revokes(
     grants: frozenset[Any],
     tree: dict[str, Any],
 ) -> None:
-    """Publications, subscriptions, services, calls and parameters of all nodes are compared."""
     named, gone, count = autojump.run(taken(text_of(written), registrations, grants, tree))
     assert named == gone
     assert bool(count) == bool(gone)

@@ -133,7 +133,6 @@ async def api(world: World, token: str) -> Api:
 
 
 async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
-    """Names, ids, hashes and salts of tokens do not allow any order or read."""
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     api = Api(world)
     [kept] = world.tokens.usable()
@@ -155,7 +154,6 @@ async def test_public_data_of_a_token_opens_nothing(world: World) -> None:
 
 
 async def test_a_signed_order_is_carried_out_unchanged(world: World, token: str, api: Api) -> None:
-    """A signed order is carried out once, in the name of its signer."""
     answer = await api.ask(admin.HostRevoke("laptop", 3), reading_key(token), await api.signed(token, REVOKE))
     assert answer.ok
     assert world.done == [(admin.HostRevoke("laptop", 3), "alice")]
@@ -163,7 +161,6 @@ async def test_a_signed_order_is_carried_out_unchanged(world: World, token: str,
 
 
 async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
-    """A repetition, at once, over a new link or after a restart of control, is refused and recorded."""
     shown = reading_key(token)
     api = Api(world)
     kept_back = await api.signed(token, REVOKE)
@@ -195,7 +192,6 @@ async def test_a_signed_order_is_valid_once(world: World, token: str) -> None:
 async def test_no_byte_of_an_order_can_change(
     change: dict[str, Any], world: World, token: str, api: Api
 ) -> None:
-    """A request that differs in one byte from the signed one is refused, whatever order the api passes on with it."""
     forged = msgspec.structs.replace(await api.signed(token, REVOKE), **change)
     for order in (admin.HostRevoke("laptop", 3), admin.HostRevoke("laptoq", 3), admin.HostRevoke("laptop")):
         assert (await api.ask(order, reading_key(token), forged)).trouble == "forbidden"
@@ -225,7 +221,6 @@ async def test_another_order_under_a_valid_proof_is_an_alarm(
 
 
 async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
-    """Bob's signed order with alice's reading key counts for bob's role only."""
     alice = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
     bob = (await world.tokens.add(TokenAdd("bob", "operator", 600))).token
     api = Api(world)
@@ -238,7 +233,6 @@ async def test_a_proof_is_valid_for_its_signer_only(world: World) -> None:
 
 
 async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, api: Api) -> None:
-    """An order signed before the revocation and delayed by the api is refused."""
     kept_back = await api.signed(token, REVOKE)
     await world.tokens.revoke(TokenRevoke("alice"))
     for shown in (reading_key(token), token):
@@ -250,7 +244,6 @@ async def test_orders_of_a_revoked_token_are_refused(world: World, token: str, a
 
 
 async def test_a_reading_key_changes_nothing(world: World, token: str, api: Api) -> None:
-    """The reading key of a signing client allows reading, but no order without a proof."""
     assert (await api.ask(admin.PolicyWanted(), reading_key(token))).ok
     refused = await api.ask(admin.PolicyLoad("[Nodes]\n", expected=3), reading_key(token), LOAD)
     assert "needs its proof" in refused.error
@@ -276,7 +269,6 @@ async def test_bare_tokens_are_accepted_by_configuration_only(
 
 
 async def test_a_token_of_an_earlier_version_stays_valid(world: World) -> None:
-    """A token without saved keys is sent itself and recognised by its hash; its holder cannot sign."""
     row = await world.tokens.add(TokenAdd("alice", "admin", 600))
     token = row.token
     world.store.database.delete("token_keys", id=row.id)

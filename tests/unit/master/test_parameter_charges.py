@@ -98,7 +98,6 @@ def _places(value: Value, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], 
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=14))
 def test_the_host_that_set_a_parameter_is_charged(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """After any sequence, restarts included, each host is charged for the names and values that it set last."""
     owners, ledger = Owners(), Ledger()
     there = mirror(owners=owners)
     for do, key, value, host in steps:
@@ -121,7 +120,6 @@ def test_the_host_that_set_a_parameter_is_charged(steps: list[tuple[str, str, An
 @settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=20))
 def test_no_sequence_exceeds_a_quota(steps: list[tuple[str, str, Any, Address]]) -> None:
-    """However hosts set, replace, take over and delete parameters, no quota and no total is exceeded."""
     there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for do, key, value, host in steps:
         if do == "delete":
@@ -142,7 +140,6 @@ def test_no_sequence_exceeds_a_quota(steps: list[tuple[str, str, Any, Address]])
 def test_a_value_can_always_be_replaced_by_one_of_its_size(
     steps: list[tuple[str, str, Any, Address]], place: int, host: Address
 ) -> None:
-    """Even with all quotas full, a host that may write a parameter may correct it."""
     there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for do, key, value, who in steps:
         if do == "set" and key != "/":
@@ -157,7 +154,6 @@ def test_a_value_can_always_be_replaced_by_one_of_its_size(
 
 
 def test_a_guest_fills_only_its_own_quota() -> None:
-    """When a guest has filled its quota, the robot can still set any parameter; the guest gets the reason."""
     there = mirror(bounds=BOUNDS, quota_class=quota_class)
     for number in range(20):
         with contextlib.suppress(LimitReachedError):
@@ -173,7 +169,6 @@ def test_a_guest_fills_only_its_own_quota() -> None:
 
 
 def test_quota_is_reserved_during_a_call_of_rosmaster() -> None:
-    """Values that are set concurrently get no more room than values set one after the other."""
     there = mirror(whole=1000)
     kept = there.reserve("/a", measure("x" * 400)[0], GUEST)
     second = there.reserve("/b", measure("x" * 300)[0], GUEST)
@@ -186,7 +181,6 @@ def test_quota_is_reserved_during_a_call_of_rosmaster() -> None:
 
 
 def test_charges_survive_restarts_of_rosmaster_and_control() -> None:
-    """After control restarts with its state, or adopts the ROS master's tree, the host that set a value is charged."""
     owners = Owners()
     there = mirror(owners=owners)
     put(there, "/guest/map", "x" * 1000, GUEST)

@@ -156,7 +156,6 @@ def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     st.booleans(),
 )
 def test_all_parts_decide_alike(granted: frozenset[str], missing: frozenset[str], keyed: bool) -> None:
-    """Each call has the same, correct answer in all parts, for any granted or missing sections."""
     policy = compile_policy(text_of(granted, missing, keyed), file="policy")
     nobody = compile_policy("[Nodes]\n", file="nobody")
     for call in ROWS:
@@ -248,7 +247,6 @@ def test_an_action_has_the_answer_of_its_call(rules: dict[str, dict[str, str] | 
 @pytest.mark.anyio
 @pytest.mark.parametrize("kind", list(Kind))
 async def test_live_registrations_are_decided_as_their_calls(kind: Kind) -> None:
-    """A reload revokes exactly the registrations and grants that the gate would deny now."""
     world = ControlParts()
     call = MASTER_CALLS[GRANTS[kind]]
     resource = KEY_GIVEN if kind is Kind.PARAMETER else THING
@@ -269,7 +267,6 @@ async def test_live_registrations_are_decided_as_their_calls(kind: Kind) -> None
     "tree", [{}, {"arm": {"speed": 1}}, {"arm": {"speed": {"max": 1}}}], ids=["empty", "value", "namespace"]
 )
 def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[str, Value]) -> None:
-    """A policy that was learned from the records of a call grants the whole call."""
     key = KEY_GIVEN if call.touches is not None else ""
     learned = learn([Observation(deeds(call)[0], call.name, key)])
     assert not learned.left_out
@@ -280,26 +277,22 @@ def test_a_policy_learned_from_a_call_grants_it(call: RosCall[Any], tree: dict[s
 
 
 def test_every_command_can_be_granted() -> None:
-    """`[Commands]` accepts the name of each call that it decides, and no other name."""
     named = {call.policy_name for call in ROWS if call.category is Category.COMMAND}
     assert named | {"lookupService"} == COMMANDS
 
 
 def test_a_call_that_makes_a_node_binds_its_name() -> None:
-    """The gate binds a node's name to a host for exactly the calls that [Nodes] decides on."""
     for call in ROWS:
         assert needs_node(deeds(call)[0]) == (call.identity is Identity.NODE), call.name
 
 
 def test_each_registering_call_has_an_unregistering_one() -> None:
-    """Each kind of registration has one call that makes it and one that ends it."""
     assert {call.kind: call.name for call in ROWS if call.verb is CallVerb.REGISTER} == GRANTS
     assert {call.name: call.kind for call in ROWS if call.verb is CallVerb.UNREGISTER} == GIVES_UP
     assert {GIVES_UP[name]: (GRANTS[GIVES_UP[name]], name) for name in GIVES_UP} == CALLS
 
 
 def test_a_command_records_its_topic() -> None:
-    """A call without a category of its own is decided by its name alone; its record has the topic of its parameter."""
     row = RosCall("countPublishers", method(LookupCalls.lookup_node, TOPIC), CallVerb.READ)
     attempt = Attempt(Caller(Peer(HOST, str(HOST), "10.0.0.1"), NAME, 0), row, (THING,))
     assert (attempt.request.category, attempt.request.resource) == (Category.COMMAND, "countPublishers")
@@ -307,7 +300,6 @@ def test_a_command_records_its_topic() -> None:
 
 
 def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:
-    """A host that may call a service but not look it up is denied by the gate and by every explanation."""
     policy = compile_policy(
         "[Groups]\nocu = 10.0.0.5\nrobot1 = 10.0.0.9\n[Nodes]\ndefault = ocu\n[Clients]\ndefault = ocu\n"
         "[Commands]\ndefault = robot1\n",

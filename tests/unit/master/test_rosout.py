@@ -27,7 +27,6 @@ class Desk:
 
 
 def test_a_line_is_a_log_message() -> None:
-    """The message has the appliance as node, the monitor as function, and the monitor's file, level and time."""
     desk = Desk()
     desk.rosout.reported(LINE)
     (said,) = desk.said()
@@ -59,7 +58,6 @@ def test_reports_have_the_level_of_their_kind(kind: str, detail: dict[str, str],
 
 
 def test_a_flood_is_cut_and_reported() -> None:
-    """Fifty messages a second are sent; the next message states how many were dropped."""
     desk = Desk()
     for _ in range(60):
         desk.rosout.reported(LINE)
@@ -75,5 +73,4 @@ def test_a_flood_is_cut_and_reported() -> None:
 
 
 def test_the_header_is_that_of_ros() -> None:
-    """The header's md5sum equals the output of `rosmsg md5 rosgraph_msgs/Log`."""
     assert header(DEFINITIONS).md5sum == "acffd30cd6b6de30f120938c17c593fb"

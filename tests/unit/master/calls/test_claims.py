@@ -10,7 +10,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_one_after_the_other_by_name() -> None:
-    """Calls under one name are served in order of arrival; unused names use no memory."""
     order: list[str] = []
 
     async def register(names: KeyTurns, name: str, mark: str, go: asyncio.Event) -> None:
@@ -36,8 +35,6 @@ async def test_one_after_the_other_by_name() -> None:
 
 
 async def test_a_failure_and_a_cancellation_let_the_next_one_in() -> None:
-    """A call that fails or is cancelled leaves no lock behind."""
-
     async def fail(names: KeyTurns) -> None:
         async with names.of_name("/a"):
             await asyncio.sleep(0)

@@ -42,7 +42,6 @@ class Site:
         return one
 
     def service_granted(self, incarnation: Incarnation, *_given: object) -> None:
-        """Act as `RosGraph`."""
         self.granted.append(incarnation)
 
     async def types(self, subgraph: str = "") -> object:
@@ -51,7 +50,6 @@ class Site:
 
 
 async def test_the_state_lists_all_live_registrations() -> None:
-    """The state lists publishers, subscribers and services in the order of registration, without hidden publishers."""
     site = Site(unseen="/rosrv")
     talker, own = site.node("/talker", 4000), site.node("/rosrv", 4001)
     for node, kind, name in (

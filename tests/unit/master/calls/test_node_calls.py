@@ -33,7 +33,6 @@ class Counted(dict[Any, Any]):
 
 
 async def test_each_connection_is_read_once() -> None:
-    """`getBusStats` and the graph read each connection once, however many topics a node has."""
     registry, uri, host = Registry(), "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
     registry.add(node)

@@ -73,7 +73,6 @@ def oracle() -> Any:
 @settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
 def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) -> None:
-    """After any sequence of settings and deletions both trees are equal, and the mirror's weight fits its tree."""
     oracle.stdin.write(json.dumps(steps) + "\n")
     oracle.stdin.flush()
     there = mirror()
@@ -87,7 +86,6 @@ def test_the_mirror_equals_the_tree_of_rosmaster(oracle: Any, steps: list[Any]) 
 
 
 def test_a_value_beyond_the_bound_is_refused_before_it_is_set() -> None:
-    """The size of all parameters together is limited; deleting a parameter makes room."""
     there = mirror(whole=1000)
     put(there, "/a", "x" * 500, HOST)
     with pytest.raises(LimitReachedError, match="the quota of one host is 1000"):
@@ -122,11 +120,9 @@ class OrderedServer:
         """Act as `Enactor`."""
 
     def parameter_set(self, key: str, _value: Any, caller_id: str) -> None:
-        """Act as `RosGraph`."""
         self.told.append((key, caller_id))
 
     def parameter_deleted(self, key: str) -> None:
-        """Act as `RosGraph`."""
         self.told.append((key, None))
 
     async def call(self, method: str, *params: Any) -> Any:
@@ -162,7 +158,6 @@ def ordered(server: OrderedServer, *calls: tuple[Any, ...]) -> list[Any]:
 
 
 def test_a_run_is_one_request_in_its_order() -> None:
-    """Calls of one run are sent as one request, in order, and the mirror equals the tree of the ROS master."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", {"b": 1}), ("deleteParam", "/a/b"), ("setParam", "/c", 2))
     assert server.requests == [["setParam /a", "deleteParam /a/b", "setParam /c"]]
@@ -174,7 +169,6 @@ def test_a_run_is_one_request_in_its_order() -> None:
 @settings(max_examples=examples(100))
 @given(st.lists(STEP, max_size=12))
 def test_a_run_has_the_effect_of_single_calls(steps: list[tuple[str, str, Any]]) -> None:
-    """A run of any calls gives the same tree as the calls one by one."""
     calls = [("setParam", key, value) if do == "set" else ("deleteParam", key) for do, key, value in steps]
     together, single = (OrderedServer(mirror()) for _ in range(2))
     ordered(together, *copy.deepcopy(calls))
@@ -185,7 +179,6 @@ def test_a_run_has_the_effect_of_single_calls(steps: list[tuple[str, str, Any]])
 
 
 def test_an_unserializable_value_delays_no_other_call() -> None:
-    """Only the call with the unserializable value fails; calls before and after it are carried out in order."""
     server = OrderedServer(mirror())
     answers = ordered(server, ("setParam", "/a", 1), ("setParam", "/b", "unwritable"), ("setParam", "/c", 3))
     assert isinstance(answers[1], EncodingError)
@@ -225,7 +218,6 @@ def test_a_failing_part_and_a_lost_master() -> None:
 @settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=14), st.data())
 def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], data: st.DataObject) -> None:
-    """A stored tree and the changes since then, repeated from any earlier time, give the current tree."""
     noted: list[tuple[str, Any]] = []
     there = mirror(note=lambda key, value: noted.append((key, copy.deepcopy(value))))
     kept = []
@@ -245,7 +237,6 @@ def test_repeated_changes_give_the_same_tree(steps: list[tuple[str, str, Any]], 
 @pytest.mark.nightly
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a run"])
 def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
-    """The ROS master keeps a value even if notifying a subscriber fails; the mirror keeps the value as well."""
     steps: list[Any] = [["/q", {"b": 1, "b/c": 2}], ["/", 7], ["/r", 3]]
     answered = subprocess.run(
         [PYTHON, "-c", WHOLE, json.dumps(steps)], capture_output=True, text=True, check=True, timeout=60
@@ -273,7 +264,6 @@ def test_a_value_that_rosmaster_keeps_despite_its_error(together: bool) -> None:
 
 
 async def test_the_loop_runs_while_thousands_of_names_are_decided() -> None:
-    """`getParamNames` checks each name while the loop runs; its answer has only the readable names."""
     there = mirror(tree={"mine": {f"p{number}": 1 for number in range(5000)}, "hidden": {"key": 1}})
     none: Any = None
     master = SimpleNamespace(reachable=True)

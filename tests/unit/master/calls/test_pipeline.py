@@ -65,26 +65,21 @@ class Records:
         self.events: list[str] = []
 
     def shut_out(self, _host: str) -> str:
-        """Act as `AuditTrail`."""
         return ""
 
     def owing(self, _host: str) -> str:
-        """Act as `AuditTrail`."""
         return self.debt
 
     async def still_owing(self, _host: str) -> str:
-        """Act as `AuditTrail`."""
         return self.debt
 
     def decided(
         self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
     ) -> str:
-        """Act as `AuditTrail`."""
         self.decisions.append((method, about.get("key", resource), decision))
         return "id"
 
     def happened(self, event: str, _reason: str, **_more: Any) -> str:
-        """Act as `AuditTrail`."""
         self.events.append(event)
         return "id"
 
@@ -200,7 +195,6 @@ async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
 
 @pytest.mark.nightly
 async def test_a_long_multicall_yields_after_a_few_parts(site: Site) -> None:
-    """A multicall of 9,000 reads yields to other requests after every few parts."""
     reads: list[Value] = [part("hasParam", f"/arm/{number}") for number in range(9000)]
     asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", reads))
     most = before = 0
@@ -223,7 +217,6 @@ async def test_a_long_multicall_yields_after_a_few_parts(site: Site) -> None:
     ids=["a write elsewhere", "a write below", "a write above", "a read", "another call"],
 )
 async def test_calls_after_a_run_wait_for_it(following: Value, site: Site) -> None:
-    """Calls after a run are decided and answered with the state that the run left."""
     asked = await held(site, [*sets(*RUNS[0]), following, *sets(*RUNS[1])])
     assert len(site.trail.decisions) == len(RUNS[0])
     site.go.set()
@@ -260,7 +253,6 @@ async def test_writes_after_a_waiting_read_are_decided_again() -> None:
 
 
 async def test_a_failure_in_a_run_stops_no_other_part(site: Site) -> None:
-    """A denial, a fault and an invalid part are answered in place; a dying ROS master fails one run only."""
     site.faults, site.dies_at = {RUNS[0][5]}, RUNS[1][30]
     keys = [*RUNS[0][:63], "/leg", *RUNS[1][:62], "bad key!?", "/leg", *RUNS[2]]
     answers = told(await site.ask(OPERATOR, "system.multicall", sets(*keys)))
@@ -273,8 +265,6 @@ async def test_a_failure_in_a_run_stops_no_other_part(site: Site) -> None:
 
 @pytest.mark.timeout(300)
 async def test_a_multicall_equals_its_parts_one_by_one() -> None:
-    """Together and one by one, the calls give the same answers, the same decisions in order, and the same two trees."""
-
     async def scene(dice: random.Random) -> None:
         keys = ["/arm", "/arm/a", "/arm/a/b", "/arm/max", "/leg", "/leg/x", *RUNS[0]]
         likely = [1] * 6 + [2] * len(RUNS[0])
@@ -298,7 +288,6 @@ async def test_a_multicall_equals_its_parts_one_by_one() -> None:
 
 
 async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
-    """A host receives a namespace that appeared after the decision only if it may read all of it."""
     site = Site("read /arm = ocu adm\nread default = adm\nwrite default = adm\n")
     put(site.there, "/arm", {"speed": 4711}, HOST)  # and the mirror does not have it yet
     answer = await site.ask(OPERATOR, "getParam", "/me", "/arm")
@@ -311,7 +300,6 @@ async def test_a_namespace_that_appears_after_the_decision_is_hidden() -> None:
 
 @pytest.mark.nightly
 async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
-    """A small request cannot make the appliance hold many large answers: the rest is refused, with one record."""
     site = Site(tree={"arm": {"model": "x" * 100_000, "speed": 1}}, bytes_limit=1_000_000)
     wanted: list[Value] = [part("getParam", "/arm/model")] * 100
     answers = await site.ask(OPERATOR, "system.multicall", wanted)
@@ -327,7 +315,6 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("together", [False, True], ids=["alone", "in a multicall"])
 async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
-    """Each host gets one large answer at a time, and delays no other host."""
     site = Site(tree={"arm": {"model": "x" * OFFLOAD}, "leg": 1})
 
     async def dump(host: str) -> None:
@@ -352,7 +339,6 @@ async def test_large_answers_are_made_a_few_at_a_time(together: bool) -> None:
 async def test_large_bodies_and_answers_are_not_read_and_written_on_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Large bodies and answers leave the event loop free; small ones use no thread."""
     threads: list[tuple[str, bool]] = []
 
     def observed(name: str) -> None:

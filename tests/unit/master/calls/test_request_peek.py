@@ -43,12 +43,10 @@ def test_a_record_names_what_was_asked_for(
 
 @pytest.mark.parametrize("cut", [120, 200, 4096])
 def test_a_body_that_is_cut_names_its_method(cut: int) -> None:
-    """The beginning of a large body has the method."""
     body = build_call("setParam", ("/evil", "/k", "v" * 100_000))[:cut]
     assert asked_for(PEER, body)[:2] == (Category.COMMAND, "setParam")
 
 
 @pytest.mark.parametrize("body", [b"", b"\0\xff", b"<methodName>", b"<methodName><!-- --></methodName>"])
 def test_a_body_without_a_method(body: bytes) -> None:
-    """A body without a method gives a record without a resource, and raises no error."""
     assert asked_for(PEER, body) == (Category.COMMAND, "", None, {"call": "unknown"})

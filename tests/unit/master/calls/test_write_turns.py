@@ -67,7 +67,6 @@ async def test_first_come_first_served() -> None:
 
 
 async def test_a_cancelled_write_delays_no_other() -> None:
-    """A cancelled or failed write leaves nothing behind, and starts no other write too early."""
     turns, order, go, at_once = KeyTurns(), list[str](), asyncio.Event(), asyncio.Event()
     at_once.set()
     first = asyncio.create_task(write(turns, ["/a"], order, go))

@@ -29,7 +29,6 @@ class Node:
         self.heard: list[Value] = []
 
     async def call(self, _method: str, _caller: str, *parameters: Value) -> None:
-        """Act as `XmlRpcClient`."""
         await self.answers.wait()
         if self.fails:
             raise CallFailedError("it does not answer") from self.fault
@@ -66,7 +65,6 @@ class Post:
 
 
 async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
-    """The queue of a hanging node is limited in bytes; the node receives the dropped lists later."""
     post = Post(queued=Bounds(100_000, 100_000, 0, 0))
     post.push(*(f"/t{number}" for number in range(50)), publishers=LONG)
     assert post.delivery.waiting < 8
@@ -79,7 +77,6 @@ async def test_lists_of_publishers_are_bounded_in_bytes() -> None:
 
 
 async def test_a_dropped_queue_frees_its_bytes() -> None:
-    """When the node is gone, its queue no longer counts."""
     post = Post()
     post.push("/a", "/b", publishers=LONG)
     assert post.delivery.weight > 20_000
@@ -90,7 +87,6 @@ async def test_a_dropped_queue_frees_its_bytes() -> None:
 
 
 async def test_a_call_that_stays_undelivered_is_reported() -> None:
-    """After the last attempt the lost call is reported."""
     post = Post(tries=2)
     post.node.fails = True
     post.node.answers.set()
@@ -100,7 +96,6 @@ async def test_a_call_that_stays_undelivered_is_reported() -> None:
 
 
 async def test_a_call_that_a_node_answers_with_a_fault_has_arrived() -> None:
-    """The call is not repeated, because the answer would be the same."""
     post = Post(tries=2)
     post.node.fails, post.node.fault = True, FaultReceived(1, "not for me")
     post.node.answers.set()
@@ -126,7 +121,6 @@ async def test_a_publisher_is_added_some_time_after_its_removal() -> None:
 
 
 async def test_a_host_loses_only_its_own_calls() -> None:
-    """A guest's queues fill all memory: the robot loses no call, even if its queue is the longest."""
     post = Post(queued=Bounds(400_000, 400_000, 0, 0))
     post.push("/a", "/b", publishers=LONG)
     for number in range(200):
@@ -141,7 +135,6 @@ async def test_a_host_loses_only_its_own_calls() -> None:
 
 
 async def test_silent_nodes_delay_no_call_to_other_hosts() -> None:
-    """All of a guest's calls wait for its nodes; the robot's node is called at once."""
     post = Post()
     robot = Node()
     robot.answers.set()

@@ -30,7 +30,6 @@ async def call(face: MasterSideApi, path: str, method: str, params: tuple[Value,
 @pytest.mark.anyio
 @pytest.mark.parametrize(("method", "params"), CALLS)
 async def test_calls_of_rosmaster_reach_no_node(method: str, params: tuple[Value, ...]) -> None:
-    """A key, value, publisher or order from the ROS master reaches no node, but is acknowledged."""
     world = await ControlParts.begun()
     node = world.node("/robot")
     await world.register(node, Kind.PARAMETER, "/limits/speed", "")
@@ -44,7 +43,6 @@ async def test_calls_of_rosmaster_reach_no_node(method: str, params: tuple[Value
 
 @pytest.mark.anyio
 async def test_a_path_without_a_node() -> None:
-    """A path without a node is answered with a fault."""
     with pytest.raises(FaultReceived, match="this address serves no calls"):
         await call(
             MasterSideApi((await ControlParts.begun()).registry), "/other/", "shutdown", ("/master", "reason")

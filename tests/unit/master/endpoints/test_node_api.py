@@ -18,7 +18,6 @@ class Street(ControlParts):
     """Control, with queues of calls to nodes, and the processes that answer at their ports."""
 
     def surround(self) -> None:
-        """Act as `ControlParts`."""
         self.heard: list[tuple[int, str]] = []
         self.process = 1
         cast(Any, self.nodes).client = lambda node: _Door(self, node)
@@ -61,7 +60,6 @@ async def test_the_name_of_a_dead_node_is_registered_again() -> None:
 
 
 async def test_the_earlier_incarnation_is_shut_down() -> None:
-    """The earlier incarnation is shut down if no other node has its address."""
     street = Street()
     await street.round()
     await street.register(street.node("/first", 1), Kind.SUBSCRIPTION, "/t")
@@ -71,7 +69,6 @@ async def test_the_earlier_incarnation_is_shut_down() -> None:
 
 
 async def test_the_answer_of_another_process_does_not_revive_a_node() -> None:
-    """The dead node counts as lost after the next check; only a registration brings it back."""
     street = Street()
     dead, heir = await street.two_at_one_address()
     street.process = 2

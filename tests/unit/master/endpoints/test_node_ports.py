@@ -81,7 +81,6 @@ def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation
 
 @pytest.mark.nightly
 def test_closed_ports_are_reused_last(first: int) -> None:
-    """Closed ports are given out again only after all others."""
     here = places(first)
     closed = here.open(HOSTS[0])
     here.close(incarnation(closed))
@@ -93,7 +92,6 @@ def test_closed_ports_are_reused_last(first: int) -> None:
 
 @pytest.mark.nightly
 def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
-    """A restarted control begins after the ports in use, so ports closed before the crash come last."""
     before = places(first)
     before.open(HOSTS[0])
     kept = before.open(HOSTS[0])
@@ -108,7 +106,6 @@ def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
 
 @pytest.mark.nightly
 def test_a_port_for_every_relay(first: int) -> None:
-    """An incarnation gets a port for every relay; without a free port, the error says so."""
     here = places(first, relays=3)
     opened = [here.open(HOSTS[0]), here.open(HOSTS[1])]
     assert [len(ports) for ports in opened] == [4, 4]
@@ -121,7 +118,6 @@ def test_a_port_for_every_relay(first: int) -> None:
 
 @pytest.mark.nightly
 def test_another_number_of_relays_after_a_restart(first: int) -> None:
-    """After a restart, a node has a port for each present relay and keeps the ports that it already had."""
     before = places(first, relays=2)
     node = incarnation(before.open(HOSTS[0]))
     had = node.ports
@@ -138,7 +134,6 @@ def test_another_number_of_relays_after_a_restart(first: int) -> None:
 
 @pytest.mark.nightly
 def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without file descriptors a node gets an error; afterwards the whole range is still available."""
     held = places(first)
 
     def exhausted(_host: str, _port: int) -> socket.socket:
@@ -154,7 +149,6 @@ def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytes
 
 @pytest.mark.nightly
 def test_a_port_of_an_earlier_range_is_not_reused(first: int) -> None:
-    """A port outside the policy's new range is closed and not used again."""
     before = places(first + 4, count=4)
     kept = before.open(HOSTS[0])
     dropped: list[str] = []
@@ -171,7 +165,6 @@ def test_a_port_of_an_earlier_range_is_not_reused(first: int) -> None:
 
 
 def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hosts that take all they can, one after the other, leave ports for the next; released ports are free again."""
     here = without_sockets(monkeypatch, 20_000, 800)
     for host in HOSTS[:3]:
         taken = []
@@ -187,14 +180,12 @@ def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_thousand_nodes_fit_the_default_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without `[Ports]`, 1,000 nodes of one network get their ports, with the largest number of relays."""
     here = without_sockets(monkeypatch, DEFAULT_PORTS.start, len(DEFAULT_PORTS))
     assert len({here.open(HOSTS[0]) for _ in range(1000)}) == 1000
     assert (len(DEFAULT_PORTS), DEFAULT_PORTS.stop <= 32768) == (NODE_PORTS.bounds.whole, True)
 
 
 def test_many_addresses_of_one_network_are_one_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two hundred guests that the policy names as one network share three quarters of the ports."""
     here = without_sockets(monkeypatch, 20_000, 800)
     refused = ""
     for number in range(200):

@@ -42,7 +42,6 @@ class Ports:
         self.sockets: dict[int, socket.socket] = {}
 
     def socket(self, port: int) -> socket.socket:
-        """Act as `NodePorts`."""
         if port not in self.sockets:
             self.sockets[port] = socket.socket()
         return self.sockets[port]
@@ -52,7 +51,6 @@ class NoPermissions:
     """A store that keeps no grants."""
 
     def permissions(self) -> list[PermissionRow]:
-        """Act as `StateStore`."""
         return []
 
     def save_permission(self, row: PermissionRow) -> None:
@@ -74,11 +72,9 @@ class Link:
         self.end: Callable[[], None] = lambda: None
 
     def attach(self, _loop: Any, received: Any, closed: Callable[[], None], _refused: object) -> None:
-        """Act as `Channel`."""
         self.say, self.end = received, closed
 
     def send(self, message: messages.Message, descriptors: tuple[int, ...] = (), **_when: bool) -> None:
-        """Act as `Channel`."""
         self.told.append((message, descriptors))
 
     def close(self) -> None:
@@ -161,15 +157,12 @@ class World:
             self.relay.place(self.node, kind, name, detail)
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
-        """Act as `Monitors`."""
         return stated(1, [], {}, {}, restarted=False)
 
     def relay_lost(self, relay: int) -> None:
-        """Act as `Monitors`."""
         self.lost.append(relay)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Act as `AuditTrail`."""
         self.records.append((event, reason, fields))
         return ""
 
@@ -201,7 +194,6 @@ async def world() -> AsyncIterator[World]:
 
 
 async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> None:
-    """A relay that is gone or was restarted counts as confirmed; control does not wait for an absent relay."""
     relay, (first, second) = world.relay, world.links
 
     async def waiting() -> asyncio.Task[None]:
@@ -224,7 +216,6 @@ async def test_an_order_is_done_when_every_relay_confirms_it(world: World) -> No
 
 
 async def test_each_relay_receives_its_topics(world: World) -> None:
-    """Publications, grants, withdrawals, and the state for a restarted relay have the node's port at that relay."""
     relay, node, (first, second) = world.relay, world.node, world.links
     placed = messages.NodePlaced("key", "/node", "10.0.0.5")
     assert (placed, (world.ports.socket(2).fileno(),)) in first.told
@@ -250,7 +241,6 @@ async def test_each_relay_receives_its_topics(world: World) -> None:
 
 
 async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
-    """Publications and grants say whether the policy names their host; if that changes, they are sent again."""
     (first, second) = world.links
     world.grant_topic("/right", HOST, "/ear")
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
@@ -271,7 +261,6 @@ async def test_relays_know_which_hosts_the_policy_names(world: World) -> None:
 
 
 async def test_a_topic_moves_with_its_grants(world: World) -> None:
-    """The topic is withdrawn from the old relay and placed on the new one; other topics do not move."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -293,7 +282,6 @@ async def test_a_topic_moves_with_its_grants(world: World) -> None:
 
 
 async def test_a_grant_that_is_revoked_after_a_move_is_invalid_everywhere(world: World) -> None:
-    """The grant stays invalid on the first relay even if the topic returns there; the same holds for a service."""
     relay, (first, second) = world.relay, world.links
     world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/c"))
     first.heard()
@@ -331,7 +319,6 @@ async def test_a_subscriber_that_lost_its_connection(
 
 
 async def test_a_lost_relay_loses_its_connections(world: World) -> None:
-    """Each relay numbers its own connections; when they are combined, the numbers are unique."""
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
@@ -344,7 +331,6 @@ async def test_a_lost_relay_loses_its_connections(world: World) -> None:
 
 
 async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World) -> None:
-    """Cutting a publisher is recorded as a folded denial with address and name; a broken connection has no record."""
     say = world.links[0].say
     say(messages.UpstreamLost("key", "/left", "the publisher closed the connection"), ())
     assert world.records == []
@@ -358,7 +344,6 @@ async def test_a_publisher_that_is_cut_for_its_messages_is_recorded(world: World
 
 
 async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
-    """A relay reports connections that were not recorded; traffic from the time without control counts as a rate."""
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
     world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
     assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
@@ -368,7 +353,6 @@ async def test_unreported_events_of_a_relay_are_recorded(world: World) -> None:
 
 
 async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: World) -> None:
-    """A topic's relay gets its limits with publications and grants; unchanged limits are not sent again."""
     relay, (first, second) = world.relay, world.links
     world.grant_topic("/right", HOST, "/ear")
     world.grant_topic("/left", HOST, "/ear")
@@ -402,7 +386,6 @@ async def test_limits_of_the_policy_are_sent_and_sent_again_on_change(world: Wor
 
 
 async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None:
-    """Drops of publishers are warnings, intended throttling is information; both are counted."""
     world.policy = policy("/left = publisher 30 Hz, subscriber 5 Hz")
     rows = [
         messages.LimitedRow("key", "/left", "publisher", "10.0.0.5", "/node", 7, 70),
@@ -417,7 +400,6 @@ async def test_drops_of_a_limit_are_recorded_with_its_line(world: World) -> None
 
 
 async def test_grants_of_all_hosts_are_bounded() -> None:
-    """A host at its quota, or the host with most grants, loses unused grants; other hosts lose nothing."""
     world = World(Bounds(whole=100, host=60, unknown=0, kept=0))
     robot = ipaddress.ip_address("10.0.0.9")
     world.grant_topic("/left", robot, "/ear")

@@ -38,7 +38,6 @@ def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
 
 
 def test_no_effect_is_dropped() -> None:
-    """No call in RVMaster or control ignores returned effects."""
     files = [*(ROOT / "master").rglob("*.py"), *(ROOT / "control").rglob("*.py")]
     known = verbs()
     assert [
@@ -47,7 +46,6 @@ def test_no_effect_is_dropped() -> None:
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
-    """A call with an unused result is found; a call whose effects are carried out is not."""
     assert {
         ("graph", "registered"),
         ("registry", "add"),

@@ -67,7 +67,6 @@ def test_rosout_may_make_no_other_call(method: str) -> None:
 
 
 def test_rosout_may_not_subscribe_to_its_own_topic() -> None:
-    """The right to publish a topic does not include subscribing to it."""
     assert rosout_may_have(Kind.PUBLICATION, "/rosout_agg")
     assert not rosout_may_have(Kind.SUBSCRIPTION, "/rosout_agg")
     assert not rosout_may_have(Kind.PARAMETER, "/use_sim_time")

@@ -67,7 +67,6 @@ def in_order(told: list[Any]) -> list[str]:
 def test_updates_equal_those_of_a_plain_master(
     oracle: Any, subscribed: list[tuple[str, str]], key: str, value: Any, caller: str | None
 ) -> None:
-    """For any subscriptions and changes, the nodes, keys and values of the updates are the same."""
     value = {} if caller is None else value  # deleted
     oracle.stdin.write(json.dumps([subscribed, key, value, caller]) + "\n")
     oracle.stdin.flush()
@@ -91,14 +90,12 @@ def test_updates_equal_those_of_a_plain_master(
     st.lists(KEY, max_size=5),
 )
 def test_no_update_has_an_undecided_key(key: str, value: Any, others: list[str]) -> None:
-    """For any names in a value, an update has the key that was set or a subscribed key below it."""
     below = [one for one in others if one != key and one.startswith(key.rstrip("/") + "/")]
     for update in updates_of(key, value, below):
         assert update.key in {key, *below}
 
 
 def test_an_update_has_the_value_that_was_set() -> None:
-    """If a later call sets a member, the value of a waiting update stays the same."""
     tree: dict[str, Value] = {"a": {"b": 1}, "c": [1]}
     kept = settled(tree)
     before = copy.deepcopy(kept)
@@ -110,7 +107,6 @@ def test_an_update_has_the_value_that_was_set() -> None:
 
 @pytest.mark.anyio
 async def test_a_subscription_during_a_write_gets_the_new_value() -> None:
-    """A node that subscribes during a write gets the new value in the answer or in an update."""
     for first in ("subscribeParam", "setParam"):
         world = await ControlParts.begun()
         calls = {
@@ -127,7 +123,6 @@ async def test_a_subscription_during_a_write_gets_the_new_value() -> None:
 
 @pytest.mark.anyio
 async def test_an_update_of_the_whole_tree_needs_the_right_to_all_of_it() -> None:
-    """`conversations.txt` covers the rights to other updates."""
     world = await ControlParts.begun()
     world.reload(f"{OPEN}[Parameters]\nread /arm = 10.0.0.5\nread default = 10.0.0.9\n")
     node = world.node("/n")

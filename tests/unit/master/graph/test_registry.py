@@ -81,7 +81,6 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
 
 
 def test_the_node_that_was_lost_first_makes_room() -> None:
-    """The node of a host that was lost first is dropped first; a live node is never dropped."""
     registry = Registry()
     known = [incarnation(number) for number in (0, 2, 4)]
     for one in known:

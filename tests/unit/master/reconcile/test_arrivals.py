@@ -22,7 +22,6 @@ class FewPorts:
         self._registry = registry
 
     def open(self, _host: Address) -> tuple[int, ...]:
-        """Act as `NodePorts`."""
         taken = {port for node in self._registry.all() for port in node.ports}
         free = [port for port in range(1, 2 * _NODES + 1) if port not in taken]
         if not free:
@@ -34,7 +33,6 @@ class SlowFaces:
     """Proxy endpoints that open only after some turns of the event loop."""
 
     async def open(self, _incarnation: Incarnation) -> None:
-        """Act as `ProxyEndpoints`."""
         for _turn in range(3):
             await asyncio.sleep(0)
 
@@ -43,7 +41,6 @@ class NoFaces:
     """Proxy endpoints of a control that has run out of file descriptors."""
 
     async def open(self, incarnation: Incarnation) -> None:
-        """Act as `ProxyEndpoints`."""
         raise NoPortError(f"no proxy endpoint for {incarnation.name}: Too many open files")
 
 
@@ -64,7 +61,6 @@ async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
 
 
 async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
-    """The node receives the reason and may try again; the registry keeps nothing."""
     world = await world_with(NoFaces())
     answer: Any = await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", "http://10.0.0.5:4000/")
     assert (answer[0], "no proxy endpoint for /n: Too many open files" in answer[1]) == (0, True)
@@ -73,7 +69,6 @@ async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
 
 @pytest.mark.parametrize("count", [2, 4, 8])
 async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) -> None:
-    """With room for one more node, one node gets it, and the others receive an error."""
     world = await world_with(SlowFaces())
 
     async def come(number: int) -> Any:

@@ -60,7 +60,6 @@ def changes(world: ControlParts) -> list[tuple[Any, Any]]:
 
 
 async def test_many_changes_go_in_order_in_few_requests() -> None:
-    """One request is under way at a time, with at most 64 changes."""
     world, requests = await started()
     node = world.node("/n")
     for number in range(200):
@@ -77,7 +76,6 @@ async def test_many_changes_go_in_order_in_few_requests() -> None:
     "failure", [BrokenOffError("gone"), UnansweredError("late"), CallFailedError("fault")]
 )
 async def test_a_failed_change_is_not_repeated(failure: Exception) -> None:
-    """The door is shut until a round has removed the difference; later changes follow after the round."""
     world, requests = await started()
     requests.failure = failure
     await world.ask("registerPublisher", "/n", "/t", TYPE, uri())
@@ -93,7 +91,6 @@ async def test_a_failed_change_is_not_repeated(failure: Exception) -> None:
 
 
 async def test_a_rejected_change_causes_a_round() -> None:
-    """A part of the multicall fails: the others took effect, and the reconcile loop is woken."""
     world, requests = await started()
     requests.answer = [[[1, "", []]], {"faultCode": 1, "faultString": "no such thing"}, [[-1, "invalid", 0]]]
     world.rosmaster.doubtful.clear()
@@ -104,7 +101,6 @@ async def test_a_rejected_change_causes_a_round() -> None:
 
 
 async def test_a_host_leaves_room_in_the_queue() -> None:
-    """A host with its share of waiting changes waits; a call of another host is answered at once."""
     world, _requests = await started()
     world.rosmaster.shut()
     world.fill_part_of_queue("10.0.0.5")
@@ -121,7 +117,6 @@ async def test_a_host_leaves_room_in_the_queue() -> None:
 
 
 async def test_a_round_replaces_the_waiting_changes() -> None:
-    """The queue has an old life of a node: it does not end what the round registers for the new life."""
     world, _requests = await started()
     old, new = world.node("/n", 1), world.node("/n", 2)
     world.rosmaster.shut()
@@ -136,7 +131,6 @@ async def test_a_round_replaces_the_waiting_changes() -> None:
 
 
 async def test_the_ros_master_has_what_the_registry_has() -> None:
-    """Replacements, losses, returns and services that change their provider reach the ROS master in order."""
     world, _requests = await started()
     for name, number in (("/a", 1), ("/b", 2), ("/a", 3), ("/c", 4)):
         await world.ask("registerPublisher", name, "/t", TYPE, uri(number))

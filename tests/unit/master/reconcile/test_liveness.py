@@ -19,7 +19,6 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
-    """A node that was just lost returns with all registrations, whatever date the clock has."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -33,7 +32,6 @@ async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
 
 
 async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lost node is checked long before the next check of all nodes."""
     monkeypatch.setattr(liveness, "_RECENTLY_LOST_SECONDS", 0.0)
     world = await ControlParts.begun()
     node = world.node("/n")
@@ -75,7 +73,6 @@ async def test_a_refusal_of_a_robot_that_shuts_out_is_no_death(monkeypatch: pyte
 
 
 async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An absent node without registrations is kept; when they are granted again, they are restored."""
     monkeypatch.setattr(liveness, "_IDLE_SECONDS", 0.0)
     world = await ControlParts.begun()
     node, idle = world.node("/n", 1), world.node("/idle", 2)
@@ -94,7 +91,6 @@ async def test_a_node_that_lost_all_registrations_is_kept(monkeypatch: pytest.Mo
 
 
 async def test_a_node_that_returns_during_its_removal_is_registered_again() -> None:
-    """The node answers before the ROS master has dropped its registrations: all of them are restored."""
     world = await ControlParts.begun()
     node = world.node("/n")
     for topic in ("/a", "/b", "/c"):
@@ -109,7 +105,6 @@ async def test_a_node_that_returns_during_its_removal_is_registered_again() -> N
 
 
 async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() -> None:
-    """The rebuild restores its registrations with all others."""
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -123,7 +118,6 @@ async def test_a_node_that_returns_to_a_new_master_is_restored_by_the_rebuild() 
 
 
 async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
-    """While 450 nodes of a guest are silent, a dead node of the robot is lost at the first check."""
     world = await ControlParts.begun()
     silence = asyncio.Event()
     robot = world.node("/robot", 1)
@@ -154,7 +148,6 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
 
 
 async def test_a_node_that_is_lost_during_its_call_is_restored() -> None:
-    """Relays carry its topics, subscribers are notified, and the next round registers it at the ROS master."""
     world = await ControlParts.begun()
     node, ear = world.node("/n", 1), world.node("/ear", 2)
     await world.register(ear, Kind.SUBSCRIPTION, "/a")

@@ -13,7 +13,6 @@ NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
 async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
-    """A round that runs before the revocation reaches the ROS master removes the registration there."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -28,7 +27,6 @@ async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
 
 
 async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
-    """If control died while a parameter was set, the next control sends subscribers the ROS master's current value."""
     world = ControlParts()
     node = world.node("/n")
     for key in ("/speed", "/unset"):
@@ -43,7 +41,6 @@ async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
 
 @pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SERVICE])
 async def test_an_unregistration_that_was_not_forwarded_is_not_undone(kind: Kind) -> None:
-    """Control dies after the answer: the next control ends the registration at the ROS master."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -55,7 +52,6 @@ async def test_an_unregistration_that_was_not_forwarded_is_not_undone(kind: Kind
 
 
 async def test_a_new_master_is_complete_before_the_first_call() -> None:
-    """A returning node does not make a new ROS master available; only the complete rebuild does."""
     world = ControlParts(silent=3600.0)
     await world.round()
     node, other = world.node("/n", 1), world.node("/other", 2)
@@ -85,7 +81,6 @@ class _Requests:
 
 
 async def test_a_new_master_is_rebuilt_with_few_requests() -> None:
-    """Parameter calls wait during the rebuild, so thousands of registrations must not take thousands of round trips."""
     world = ControlParts()
     await world.round()
     node = world.node("/n")
@@ -100,7 +95,6 @@ async def test_a_new_master_is_rebuilt_with_few_requests() -> None:
 
 
 async def test_a_lost_node_is_removed_with_few_requests() -> None:
-    """Thousands of registrations without an owner are removed without a round trip each."""
     world = ControlParts()
     await world.round()
     gone = world.faces.inner_uri(world.node("/gone"))
@@ -113,7 +107,6 @@ async def test_a_lost_node_is_removed_with_few_requests() -> None:
 
 
 async def test_a_round_does_not_show_as_a_rebuild() -> None:
-    """Calls wait during a round, but the status shows a rebuild only if there is one."""
     world = ControlParts()
     seen: list[tuple[str, bool, bool]] = []
     call = world.hidden.call

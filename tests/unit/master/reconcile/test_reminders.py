@@ -24,7 +24,6 @@ class Told:
         self.reminded: list[tuple[str, str, list[str]]] = []
 
     def absent(self, subscribers: list[Incarnation]) -> list[tuple[Incarnation, str, list[Incarnation]]]:
-        """Act as `RosGraph`."""
         self.absent_for -= 1
         ear, _other, mouth = subscribers
         return [(ear, "/chatter", [mouth])] if self.absent_for >= 0 else []
@@ -33,7 +32,6 @@ class Told:
         """Act as `Enactor`."""
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
-        """Act as `RosGraph`."""
         self.reminded.append((subscriber.name, topic, [one.key for one in absent]))
 
 
