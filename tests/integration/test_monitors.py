@@ -2,10 +2,7 @@
 
 import itertools
 import json
-import signal
-import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +10,6 @@ import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros, numbers, without_gap
-from tests.support.processes import Process
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
@@ -166,37 +162,6 @@ def test_a_monitor_in_shadow_mode_records_only_until_it_is_promoted(
     assert {one["detail"]["who"] for one in appliance.recorded("--event", "monitor in shadow mode")} == {
         "operator"
     }
-
-
-WATCH = """
-watch() {
-    std_msgs::String missing;
-    raise_alarm() { missing.data = "no answer"; PUBLISH(/alarm, std_msgs/String, missing); }
-    event asked() /chatter std_msgs/String '{}' { }
-    event answered() /answers std_msgs/String '{}' { }
-    pattern: globally: asked causes answered within 200ms enforced by raise_alarm
-    @enforced { ROS_WARN("nobody answered"); }
-}
-"""
-
-
-def test_a_missing_message_is_published_at_the_deadline(
-    appliance: Appliance, ros: RosSession, tmp_path: Path
-) -> None:
-    spec = tmp_path / "watch.rv"
-    spec.write_text(WATCH)
-    said = "enforced: at the deadline raise_alarm publishes the due message (/alarm)"
-    assert said in appliance.rosrv("monitor", "check", str(spec), state=False).stdout
-    appliance.rosrv("monitor", "load", str(spec))
-    alarm = ros.listener("rospy", "/alarm")
-    ros.listener("rospy", "/chatter")
-    ros.talker("rospy", "/chatter", name="voice")
-    alarmed = alarm.wait_for(event="received", data="no answer")
-    assert alarmed["publisher"] == "/rosrv"
-    verdicts = [one["detail"] for one in appliance.recorded(event="monitor verdict")]
-    verdict = next(one for one in verdicts if "count" not in one and one["monitor"] == "watch")
-    assert (verdict["monitor"], verdict["category"]) == ("watch", "enforced")
-    assert appliance.recorded(event="monitor published", resource="/alarm")
 
 
 @pytest.mark.real
@@ -357,49 +322,6 @@ def test_requests_are_refused_and_responses_changed(
         assert refused["detail"]["monitor"] == f"gate_{to}"
 
 
-def said(listener: Process, prefix: str) -> None:
-    """Wait until the listener receives a text that begins with this."""
-    listener.wait_for(lambda event: event.get("data", "").startswith(prefix), since=listener.mark())
-
-
-def test_monitors_change_during_a_thousand_messages_a_second(
-    appliance: Appliance, ros: RosSession, tmp_path: Path
-) -> None:
-    spec = tmp_path / "words.rv"
-    steady, stopped = ros.listener("rospy", "/chatter"), ros.listener("roscpp", "/chatter")
-    ros.talker("roscpp", "/chatter", "--rate", "1000", name="voice")
-    for listener in (steady, stopped):
-        listener.wait_for_count(100, event="received")
-    stopped.popen.send_signal(signal.SIGSTOP)
-    try:
-        for number in range(3):
-            spec.write_text(WORDS.replace("checked ", f"round{number} ").replace("heard == 3", "heard == -1"))
-            appliance.rosrv("monitor", "load", str(spec))
-            said(steady, f"round{number}")
-            if number == 1:
-                stopped.popen.send_signal(signal.SIGCONT)
-            appliance.rosrv("monitor", "disable", "words")
-            said(steady, "hello")
-            appliance.rosrv("monitor", "enable", "words")
-            said(steady, f"round{number}")
-    finally:
-        stopped.popen.send_signal(signal.SIGCONT)
-    late = ros.listener("rospy", "/chatter")
-    appliance.rosrv("monitor", "remove", "words")
-    said(steady, "hello")
-    late.wait_for_count(500, event="received")
-    # A talker without processor time loses messages in its own queue, which no listener gets.
-    mine, others = numbers(steady.seen(event="received")), numbers(late.seen(event="received"))
-    first, last = others[0], min(mine[-1], others[-1])
-    assert first < last
-    assert [one for one in mine if first <= one <= last] == [one for one in others if one <= last]
-    assert mine == sorted(set(mine))
-    # The stopped listener may lose its oldest messages to its full queue; the rest arrives in order.
-    rest = numbers(stopped.seen(event="received"))
-    assert rest == sorted(set(rest))
-    assert stopped.seen(event="received")[-1]["publisher"] == "/voice"
-
-
 LANDSHARK = f"""
 import sys
 sys.path.insert(0, {str(ROOT / "examples" / "landshark" / "nodes")!r})
@@ -513,50 +435,3 @@ def test_each_goal_of_an_action_is_monitored_separately(appliance: Appliance, ro
     client = ros.node("rospy", "action", "client", name="asker")
     assert client.wait_for(event="result")["result"] == 3
     assert all("twin" in one["reason"] for one in appliance.recorded(event="monitor verdict"))
-
-
-JUDGE = """
-judge() {
-    event said(std::string text) /chatter std_msgs/String '{data:text}' when (text != "") {
-        std_msgs::String report;
-        if (text.find("hello") == 0) { text = "checked"; PUBLISH(/alarm, std_msgs/String, report); }
-    }
-    ere: said said
-    @match { int zero = 0; zero = 1 / zero; }
-}
-"""
-
-
-def test_explanations_of_monitors_are_the_same_by_command_and_rest(
-    appliance: Appliance, ros: RosSession, tmp_path: Path
-) -> None:
-    """Verdict, change, publication, fault and drop are explained with author, event, value and line."""
-    file = tmp_path / "judge.rv"
-    file.write_text(JUDGE)
-    appliance.rosrv("monitor", "remove", "words")
-    appliance.rosrv("monitor", "load", str(file))
-    ros.listener("rospy", "/chatter")
-    ros.talker("rospy", "/chatter", name="voice").wait_for_count(3, event="sent")
-    rest = appliance.rest()
-    for event, at in (
-        ("message changed", "judge.rv:5:40"),
-        ("monitor published", "judge.rv:5:"),
-        ("monitor verdict", "judge.rv:7:"),
-        ("monitor fault", "judge.rv:8:"),
-        ("message dropped", "judge.rv:8:"),
-    ):
-        full = next(one for one in appliance.recorded(event=event) if "count" not in one["detail"])
-        lines = appliance.rosrv("audit", "why", full["id"]).stdout.splitlines()
-        why = rest.get(f"/v1/audit/{full['id']}/why").json
-        assert [*why["lines"], *filter(None, [why["refusal"]])] == lines
-        assert ("rosrv monitor disable" in why["refusal"]) is (event == "message dropped")
-        assert lines[0] == full["reason"]
-        assert any(line.startswith("by: message number ") and "/voice on 127.0.0.1" in line for line in lines)
-        assert any(line.startswith(f"at: {at}") for line in lines), (event, lines)
-        assert any(line.startswith("where: judge.rv:3:") and "hello" in line for line in lines), (
-            event,
-            lines,
-        )
-        told = [line for line in lines if line.startswith("because: said at ")]
-        assert len(told) == (2 if event in ("monitor verdict", "message dropped") else 0), (event, lines)
-        assert any("zero = 0" in line for line in lines) is (event in ("monitor fault", "message dropped"))

@@ -10,8 +10,6 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.admin import PolicyReload
-from appliance.cli.connection.admin_client import AdminSocket
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT
@@ -126,42 +124,6 @@ def test_rosmaster_stopped_for_two_seconds(working: Field) -> None:
         burst.finish()
         burst.all_there()
     assert working.appliance.pids("rosmaster") == [pid]
-
-
-def test_reloads_under_load(working: Field) -> None:
-    even = POLICY.replace("[Subscribers]", "[Subscribers]\n/even_topic = 10.77.0.66")
-    odd = POLICY.replace("[Publishers]", "[Publishers]\n/odd_topic = 10.77.0.66")
-    over = threading.Event()
-    odd_answers: list[Any] = []
-
-    def keep_asking() -> None:
-        while not over.is_set():
-            with contextlib.suppress(OSError), xmlrpc.client.ServerProxy(working.master) as server:
-                odd_answers.append(
-                    server.registerPublisher(
-                        "/odd_one", "/odd_topic", "std_msgs/String", "http://10.77.0.20:40404/"
-                    )
-                )
-                server.unregisterPublisher("/odd_one", "/odd_topic", "http://10.77.0.20:40404/")
-
-    asking = threading.Thread(target=working.ocu.run, args=(keep_asking,), daemon=True)
-    asking.start()
-    with Burst(working, "/burst_reload", 120) as burst:
-        for _ in range(67):
-            for text, fine in ((even, True), (odd, True), (odd + "nonsense\n[", False)):
-                working.appliance.policy_file.write_text(text)
-                answer = AdminSocket(working.appliance.state).ask(PolicyReload())
-                assert answer.ok is fine, answer
-        burst.finish()
-        over.set()
-        asking.join(LIMIT)
-        burst.all_there()
-    granted = [one for one in odd_answers if one[0] == 1]
-    denied = [one for one in odd_answers if one[0] != 1]
-    assert granted
-    assert denied
-    assert all("[Publishers] /odd_topic" in one[1] for one in denied), denied[:3]
-    working.appliance.reload(POLICY)
 
 
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:

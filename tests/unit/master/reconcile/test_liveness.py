@@ -145,18 +145,3 @@ async def test_silent_nodes_delay_no_check_of_other_hosts() -> None:
         await asyncio.sleep(1)
     silence.set()
     await world.settle()
-
-
-async def test_a_node_that_is_lost_during_its_call_is_restored() -> None:
-    world = await ControlParts.begun()
-    node, ear = world.node("/n", 1), world.node("/ear", 2)
-    await world.register(ear, Kind.SUBSCRIPTION, "/a")
-    await world.register(node, Kind.PUBLICATION, "/a")
-    world.clients.silent = {"/n"}
-    await world.look(node)
-    world.deliveries.told.clear()
-    await world.register(node, Kind.PUBLICATION, "/b")
-    assert world.relay.returned == ["/n"]
-    assert ("/ear", "publisherUpdate", ("/a", [node.outer_uri("10.0.0.1")])) in world.deliveries.told
-    await world.round()
-    assert world.hidden.has(Kind.PUBLICATION, "/a") == ["/n"]

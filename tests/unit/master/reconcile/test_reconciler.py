@@ -11,21 +11,6 @@ pytestmark = pytest.mark.anyio
 NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
 
 
-@pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION])
-async def test_a_revoked_registration_is_not_adopted(kind: Kind) -> None:
-    world = ControlParts()
-    await world.round()
-    node = world.node("/n")
-    await world.register(node, kind, "/secret")
-    assert world.reload(NO_SECRET) == 1
-    await world.round()
-    assert (node.resources(kind), list(node.shelf)) == ([], [(kind, "/secret")])
-    assert world.hidden.has(kind, "/secret") == []
-    await world.settle()
-    await world.round()
-    assert world.hidden.has(kind, "/secret") == []
-
-
 async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
     world = ControlParts()
     node = world.node("/n")
@@ -37,18 +22,6 @@ async def test_a_parameter_that_was_set_when_control_died_is_sent() -> None:
         ("/n", "paramUpdate", ("/speed/", 2)),
         ("/n", "paramUpdate", ("/unset/", {})),
     ]
-
-
-@pytest.mark.parametrize("kind", [Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SERVICE])
-async def test_an_unregistration_that_was_not_forwarded_is_not_undone(kind: Kind) -> None:
-    world = ControlParts()
-    await world.round()
-    node = world.node("/n")
-    await world.register(node, kind, "/t", "1")
-    world.registry.unregister(node, kind, "/t")
-    world.entries.pid = None
-    await world.round()
-    assert (node.resources(kind), world.hidden.has(kind, "/t")) == ([], [])
 
 
 async def test_a_new_master_is_complete_before_the_first_call() -> None:
