@@ -1,4 +1,4 @@
-"""What control tells a relay that it gets the link of."""
+"""Record the messages of control to a relay with a new link."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -17,7 +17,7 @@ from tests.support.idle import idle
 def told_to_a_new_relay(
     registry: Registry, grants: Grants, policy: Callable[[], Policy]
 ) -> list[messages.Message]:
-    """Return the messages to a relay that starts anew."""
+    """Return the messages to a relay that starts again."""
     link = _Link()
     relay = RelayControl(
         registry,

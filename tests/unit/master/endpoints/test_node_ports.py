@@ -4,10 +4,11 @@ import errno
 import ipaddress
 import os
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
+from appliance.master.endpoints import node_ports
 from appliance.master.endpoints.node_ports import NodePorts, NoPortError
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address
@@ -16,54 +17,34 @@ from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.table import NODE_PORTS
 from roswire.uris import parse_node_uri
 
-
-@pytest.fixture
-def first() -> Iterator[int]:
-    """Return the first of eight free ports."""
-    for port in range(40_000, 60_000, 8):
-        probes = [socket.socket() for _ in range(8)]
-        try:
-            for offset, probe in enumerate(probes):
-                probe.bind(("127.0.0.1", port + offset))
-        except OSError:
-            continue
-        finally:
-            for probe in probes:
-                probe.close()
-        yield port
-        return
-    pytest.fail("no eight free ports in a row")
-
-
-def places(
-    first: int, relays: int = 1, count: int = 8, drop: Callable[[str], None] = lambda _name: None
-) -> NodePorts:
-    """A listener store that keeps no sockets."""
-    return NodePorts(
-        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, named_as=NAMING.named_as,
-        relays=relays,
-    )  # fmt: skip
-
-
-def without_sockets(monkeypatch: pytest.MonkeyPatch, first: int, count: int) -> NodePorts:
-    """Return a store with four relays whose ports are never opened."""
-    here = places(first, relays=4, count=count)
-    monkeypatch.setattr(here, "listen", lambda: Listening(here.unused.popleft()))
-    return here
+FIRST = 20_000
 
 
 class Listening:
-    """Stands in for a listening socket: 800 real sockets would take ports from other programs."""
+    """A listening socket that takes no port from other programs."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, _host: str, port: int) -> None:
         self.port = port
 
     def getsockname(self) -> tuple[str, int]:
-        """Return the socket's address."""
         return "127.0.0.1", self.port
 
     def close(self) -> None:
         """Do nothing: there is no file descriptor."""
+
+
+@pytest.fixture(autouse=True)
+def without_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(node_ports, "listen", Listening)
+
+
+def places(
+    relays: int = 1, first: int = FIRST, count: int = 8, drop: Callable[[str], None] = lambda _name: None
+) -> NodePorts:
+    return NodePorts(
+        "127.0.0.1", range(first, first + count), keep=lambda *_: None, drop=drop, named_as=NAMING.named_as,
+        relays=relays,
+    )  # fmt: skip
 
 
 NAMING = compile_policy("[Nodes]\n/** = 10.0.0.1 10.1.0.0/24\n", file="a.ini")
@@ -79,93 +60,82 @@ def incarnation(ports: tuple[int, ...], host: Address = HOSTS[0]) -> Incarnation
     )
 
 
-@pytest.mark.nightly
-def test_closed_ports_are_reused_last(first: int) -> None:
-    here = places(first)
+def test_closed_ports_are_reused_last() -> None:
+    here = places()
     closed = here.open(HOSTS[0])
     here.close(incarnation(closed))
     others = [here.open(host) for host in HOSTS[1:4]]
     assert closed not in others
     assert here.open(HOSTS[0]) == closed
-    here.close_unclaimed(set())
 
 
-@pytest.mark.nightly
-def test_closed_ports_are_reused_last_after_a_restart(first: int) -> None:
-    before = places(first)
+def test_closed_ports_are_reused_last_after_a_restart() -> None:
+    before = places()
     before.open(HOSTS[0])
     kept = before.open(HOSTS[0])
-    after = places(first)
+    after = places()
     for port in kept:
-        after.adopt(f"port:{port}", before.socket(port).dup())
+        after.adopt(f"port:{port}", before.socket(port))
     after.close_unclaimed(set(kept))
-    assert after.open(HOSTS[0]) == (first + 4, first + 5)
+    assert after.open(HOSTS[0]) == (FIRST + 4, FIRST + 5)
     before.close_unclaimed(set())
-    after.close_unclaimed(set())
 
 
-@pytest.mark.nightly
-def test_a_port_for_every_relay(first: int) -> None:
-    here = places(first, relays=3)
+def test_a_port_for_every_relay() -> None:
+    here = places(relays=3)
     opened = [here.open(HOSTS[0]), here.open(HOSTS[1])]
     assert [len(ports) for ports in opened] == [4, 4]
     here.close(incarnation(opened[0]))
     assert here.open(HOSTS[0]) == opened[0]
     with pytest.raises(NoPortError, match="4 per node"):
         here.open(HOSTS[0])
-    here.close_unclaimed(set())
 
 
-@pytest.mark.nightly
-def test_another_number_of_relays_after_a_restart(first: int) -> None:
-    before = places(first, relays=2)
+def test_another_number_of_relays_after_a_restart() -> None:
+    before = places(relays=2)
     node = incarnation(before.open(HOSTS[0]))
     had = node.ports
     before.close_unclaimed(set())
-    more = places(first, relays=3)
+    more = places(relays=3)
     assert more.reopen(node)
     assert (node.ports[:3], len(set(node.ports))) == (had, 4)
     more.close_unclaimed(set())
-    fewer = places(first, relays=1)
+    fewer = places(relays=1)
     assert fewer.reopen(node)
     assert node.ports == had[:2]
-    fewer.close_unclaimed(set())
 
 
-@pytest.mark.nightly
-def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    held = places(first)
+def test_no_port_is_lost_while_none_can_be_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = places()
 
     def exhausted(_host: str, _port: int) -> socket.socket:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
     with monkeypatch.context() as patch:
-        patch.setattr("appliance.master.endpoints.node_ports.listen", exhausted)
+        patch.setattr(node_ports, "listen", exhausted)
         for _try in range(20):
             with pytest.raises(NoPortError, match="Too many open files"):
                 held.open(HOSTS[0])
-    assert sorted(held.unused) == list(range(first, first + 8))
+    assert sorted(held.unused) == list(range(FIRST, FIRST + 8))
 
 
-@pytest.mark.nightly
-def test_a_port_of_an_earlier_range_is_not_reused(first: int) -> None:
-    before = places(first + 4, count=4)
+def test_a_port_of_an_earlier_range_is_not_reused() -> None:
+    before = places(first=FIRST + 4, count=4)
     kept = before.open(HOSTS[0])
     dropped: list[str] = []
-    after = places(first, count=4, drop=dropped.append)
+    after = places(count=4, drop=dropped.append)
     for port in kept:
-        after.adopt(f"port:{port}", before.socket(port).dup())
+        after.adopt(f"port:{port}", before.socket(port))
     before.close_unclaimed(set())
     after.close_unclaimed(set())
     assert dropped == [f"port:{port}" for port in kept]
-    assert [*after.open(HOSTS[0]), *after.open(HOSTS[1])] == [*range(first, first + 4)]
+    assert [*after.open(HOSTS[0]), *after.open(HOSTS[1])] == [*range(FIRST, FIRST + 4)]
     with pytest.raises(NoPortError):
         after.open(HOSTS[0])
-    after.close_unclaimed(set())
 
 
-def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = without_sockets(monkeypatch, 20_000, 800)
+def test_no_host_takes_all_ports() -> None:
+    here = places(relays=4, count=800)
     for host in HOSTS[:3]:
         taken = []
         with pytest.raises(NoPortError, match=r"3 times as many as are left; widen \[Ports\] range"):
@@ -179,14 +149,14 @@ def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     assert here.open(HOSTS[3])
 
 
-def test_a_thousand_nodes_fit_the_default_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = without_sockets(monkeypatch, DEFAULT_PORTS.start, len(DEFAULT_PORTS))
+def test_a_thousand_nodes_fit_the_default_range() -> None:
+    here = places(4, DEFAULT_PORTS.start, len(DEFAULT_PORTS))
     assert len({here.open(HOSTS[0]) for _ in range(1000)}) == 1000
     assert (len(DEFAULT_PORTS), DEFAULT_PORTS.stop <= 32768) == (NODE_PORTS.bounds.whole, True)
 
 
-def test_many_addresses_of_one_network_are_one_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    here = without_sockets(monkeypatch, 20_000, 800)
+def test_many_addresses_of_one_network_are_one_host() -> None:
+    here = places(relays=4, count=800)
     refused = ""
     for number in range(200):
         try:
