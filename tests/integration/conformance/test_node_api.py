@@ -1,4 +1,4 @@
-"""A rospy node gives its callers the same answers through a plain master and through the appliance.
+"""A rospy node gives the answers to the calls in `conversations/node_api.txt`, behind either master.
 
 Differences by design: URIs and process ids (only their form is compared), the numbers of connections, and the
 text about an invalid parameter, as in `side_by_side`.
@@ -6,56 +6,22 @@ text about an invalid parameter, as in `side_by_side`.
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.integration.conformance.nodes import order, rospy_node
 from tests.integration.conformance.side_by_side import TESTER, Answers, differences
+from tests.support.conversation import conversations_of
+from tests.support.conversation_calls import call_of
 from tests.support.nodes import RosSession
 from tests.support.processes import ThisMachine
 from tests.support.rosmaster import call_on
 from tests.support.site import Masters
 
-TCPROS = [["TCPROS"]]
-READS = (
-    "getPid",
-    "getUri",
-    "getName",
-    "getMasterUri",
-    "getPublications",
-    "getSubscriptions",
-    "getBusInfo",
-    "getBusStats",
-)
-ERRORS: tuple[tuple[Any, ...], ...] = (
-    *((method,) for method in (*READS, "requestTopic", "shutdown")),
-    *((method, TESTER, "more") for method in READS),
-    *((method, 5) for method in READS),
-    ("requestTopic", TESTER),
-    ("requestTopic", TESTER, "/chatter"),
-    ("requestTopic", TESTER, "/chatter", TCPROS, "more"),
-    ("requestTopic", TESTER, "/nothing", TCPROS),
-    ("requestTopic", TESTER, "/heard", TCPROS),
-    ("requestTopic", TESTER, "nothing", TCPROS),
-    ("requestTopic", TESTER, "", TCPROS),
-    ("requestTopic", TESTER, 5, TCPROS),
-    ("requestTopic", TESTER, [], TCPROS),
-    ("requestTopic", TESTER, "/with space", TCPROS),
-    ("requestTopic", TESTER, "/chatter", []),
-    ("requestTopic", TESTER, "/chatter", ""),
-    ("requestTopic", TESTER, "/chatter", 0),
-    ("requestTopic", TESTER, "/chatter", {}),
-    ("shutdown", TESTER),
-    ("shutdown", TESTER, "a", "b"),
-    ("shutdown", 5, "a"),
-)
-SERVED: tuple[tuple[Any, ...], ...] = (
-    *((method, caller) for method in READS[:6] for caller in ("", TESTER)),
-    ("requestTopic", TESTER, "/chatter", TCPROS),
-    ("requestTopic", TESTER, "chatter", TCPROS),
-    ("requestTopic", TESTER, "/chatter", [["UDPROS"], ["TCPROS"]]),
-)
+_TEXT = Path(__file__).parents[2] / "unit" / "master" / "conversations" / "node_api.txt"
+_CONVERSATIONS = conversations_of(_TEXT.read_text(encoding="utf-8")).conversations
 
 
 @pytest.fixture(scope="module")
@@ -97,24 +63,23 @@ def asked(pair: tuple[str, str], step: tuple[Any, ...]) -> Answers:
     return Answers(plain, appliance)
 
 
-@pytest.mark.parametrize("step", ERRORS, ids=repr)
-def test_an_error_of_the_caller(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    answers = asked(pair, step)
-    assert answers.plain[0] == -1
-    found = differences(answers)
-    assert [one for one in found if not one.startswith("value [] / [[], [], []]")] == []
+@pytest.mark.parametrize("title", _CONVERSATIONS)
+def test_answers_are_those_of_rospy(pair: tuple[str, str], title: str) -> None:
+    """rospy's texts about protocols are errors of Python; the appliance names the parameter, or what it relays."""
+    for line in _CONVERSATIONS[title].splitlines():
+        if " of /voice" not in line:
+            continue
+        call = call_of(line)
+        answers = asked(pair, (call.method, *call.params))
+        found = differences(answers)
+        if re.search(r"\[protocols\]|relays only", answers.appliance[1]):
+            found = [one for one in found if not one.startswith("message ")]
+        assert [one for one in found if not one.startswith("value [] / [[], [], []]")] == [], line
 
 
-@pytest.mark.parametrize("step", SERVED, ids=repr)
-def test_a_call_that_is_served(pair: tuple[str, str], step: tuple[Any, ...]) -> None:
-    answers = asked(pair, step)
-    assert answers.plain[0] == 1
-    assert differences(answers) == []
-
-
-@pytest.mark.parametrize("method", ["getBusInfo", "getBusStats"])
+@pytest.mark.parametrize("method", ["getPid", "getBusInfo", "getBusStats"])
 def test_connection_information(pair: tuple[str, str], method: str) -> None:
-    """Connections change at any time, so only the form of the value is compared, with code and text."""
+    """The value differs or changes at any time, so only its form is compared, with code and text."""
     answers = asked(pair, (method, TESTER))
     assert answers.plain[:2] == answers.appliance[:2]
     assert len(answers.plain) == len(answers.appliance) == 3
@@ -122,19 +87,3 @@ def test_connection_information(pair: tuple[str, str], method: str) -> None:
         assert [[row[0] for row in part] for part in answers.plain[2]] == [
             [row[0] for row in part] for part in answers.appliance[2]
         ]
-
-
-@pytest.mark.parametrize("protocols", [5, [5]], ids=repr)
-def test_malformed_protocols(pair: tuple[str, str], protocols: Any) -> None:
-    """The code is rospy's; its text is a Python error, while the appliance names the parameter."""
-    answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
-    assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (-1, [])
-    assert "[protocols]" in answers.appliance[1]
-
-
-@pytest.mark.parametrize("protocols", [[["UDPROS"]], [[]]], ids=repr)
-def test_no_protocol_in_common(pair: tuple[str, str], protocols: list[Any]) -> None:
-    """Without a common protocol the answer is 0, not a caller's error; the appliance lists offered and relayed ones."""
-    answers = asked(pair, ("requestTopic", TESTER, "/chatter", protocols))
-    assert (answers.plain[0], answers.plain[2]) == (answers.appliance[0], answers.appliance[2]) == (0, [])
-    assert "relays only TCPROS" in answers.appliance[1]
