@@ -87,7 +87,10 @@ class Follower:
     """A follower of the log: each `poll` returns the records since the previous one, oldest first."""
 
     def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
-        """Begin after the sequence `after`, or at the end of the log."""
+        """Begin after the sequence `after`, or at the end of the log. Raises `FilterError`."""
+        conditions(wanted)  # an invalid filter is refused now, not at the first record
+        if wanted.text:
+            text_condition(wanted.text)
         self._path = path
         self._wanted = wanted
         self._after = _reading(path, _last_sequence) if after is None else after

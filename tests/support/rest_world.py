@@ -6,6 +6,8 @@ Only the parts of control that answer requests are models. There is no socket, n
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
 import httpx
@@ -54,8 +56,10 @@ from tests.support.memory_channel import memory_link
 from tests.support.virtual_clock import VirtualClock
 
 T = TypeVar("T")
+R = TypeVar("R", bound=AdminRequest[Any])
 ROLES = ("viewer", "investigator", "operator", "admin")
 _NOW = 1_700_000_000.0
+_STATE = Settings().state
 _ANSWERS: dict[type, Any] = {
     admin.PolicyWanted: example(PolicyKnown, revision=7, text="[Nodes]\n", file="f"),
     admin.RegistrationsWanted: example(Registrations),
@@ -72,6 +76,7 @@ class Carried:
     """Answers every request instead of control's parts; an order ends with `error` if it is set."""
 
     def __init__(self) -> None:
+        self.answers = dict(_ANSWERS)
         self.orders: list[tuple[AdminRequest[Any], str | None]] = []
         """The orders that took effect, each with its author."""
         self.error: Exception | None = None
@@ -82,7 +87,7 @@ class Carried:
             if self.error is not None:
                 raise self.error
             self.orders.append((request, who))
-        return _ANSWERS.get(type(request)) or example(cast(Any, answer_to(type(request))))
+        return self.answers.get(type(request)) or example(cast(Any, answer_to(type(request))))
 
 
 class Tokens:
@@ -125,19 +130,21 @@ class Trail:
 
 
 class RestWorld:
-    """The api and control, with an empty audit trail; `asked` sends a request."""
+    """The api and control, with an empty audit trail; `asked` sends a request. The api reads the log in `state`."""
 
-    def __init__(self) -> None:
+    def __init__(self, state: Path = _STATE) -> None:
         with using(VirtualClock(wall=_NOW)):
             self._runner = asyncio.Runner(loop_factory=InlineLoop)
             self._runner.get_loop()  # which keeps this clock
         self.carried, self.tokens, self.trail = Carried(), Tokens(), Trail()
-        self.gate, self.control = make_api()
+        self.gate, self.control = make_api(state)
         self._ends = memory_link(ApiLink)
         self._runner.run(self._connect())
 
     async def _connect(self) -> None:
         queries, hosts = idle(Queries), idle(HostEnrolment)
+        object.__setattr__(queries, "policies", SimpleNamespace(revision=7))
+        object.__setattr__(queries, "parts", SimpleNamespace(monitors=SimpleNamespace(revision=3)))
         hosts.itself, hosts.ports = idle(HostSelfService), idle(PortChecks)
         methods = request_methods(
             queries=queries,
@@ -174,6 +181,15 @@ class RestWorld:
         return [
             one for one in self._ends[0].messages if isinstance(one, RequestMade) and type(one.request) in CHANGES
         ]  # fmt: skip
+
+    def sent(self, kind: type[R]) -> list[R]:
+        """Return the requests of a kind that control got from the api since the last request began."""
+        made = [one.request for one in self._ends[0].messages if isinstance(one, RequestMade)]
+        return [one for one in made if isinstance(one, kind)]
+
+    def close(self) -> None:
+        """Close the loop."""
+        self._runner.close()
 
     def asked(
         self, method: str, target: str, body: Any = None, role: str | None = "admin", tag: str | None = None,
@@ -227,17 +243,21 @@ def routes_of_api() -> Any:
     ).routes  # fmt: skip
 
 
-def make_api() -> tuple[RequestGate, ControlLink]:
+def make_api(state: Path = _STATE) -> tuple[RequestGate, ControlLink]:
     """Return the api's gate and its link to control, which states the tokens."""
     door = TokenAuthenticator(10, lambda _token: None)
     control = ControlLink(door.state, lambda: None)
     journal = Journal(control.tell)
-    app, limits = _application(control, door, journal), ApiLimits(burst=100_000)
+    app, limits = _application(control, door, journal, state), ApiLimits(burst=100_000)
     return RequestGate(app, limits=limits, doorkeeper=door, journal=journal, names=["api"]), control
 
 
-def _application(control: ControlLink, door: TokenAuthenticator, journal: Journal) -> FastAPI:
+def _application(
+    control: ControlLink, door: TokenAuthenticator, journal: Journal, state: Path = _STATE
+) -> FastAPI:
     async def nothing() -> Measures:
         return example(Measures)
 
-    return build_app(Services(Settings(), control, door, journal, asyncio.Event(), SampleHistory(nothing)))
+    return build_app(
+        Services(Settings(state=state), control, door, journal, asyncio.Event(), SampleHistory(nothing))
+    )
