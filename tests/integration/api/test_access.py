@@ -4,15 +4,11 @@ import contextlib
 import http.client
 import json
 import os
-import select
-import socket
 import stat
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from appliance.quotas.table import REST_CONNECTIONS
 from tests.support.appliance import Appliance
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
@@ -108,64 +104,6 @@ def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
         assert said("Console: ") == f"Console: {url}/console/"
         rest = Rest(url, path.read_text().strip())
         assert rest.post("/v1/policy/reload", match="*").status == 200
-
-
-def test_clear_text_stays_on_loopback(tmp_path: Path) -> None:
-    """`--api-tls off` on another address is an error before any process starts."""
-    appliance = Appliance(options=("--api", "0.0.0.0:0", "--api-tls", "off"))
-    try:
-        with pytest.raises(AssertionError, match="clear text"):
-            appliance.start()
-    finally:
-        appliance.close()
-
-
-def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
-    """A host has a quota of silent connections, which time out; other hosts are served, and later this host as well."""
-    assert rest.url.hostname is not None
-    with ExitStack() as stack:
-        idle = [
-            stack.enter_context(socket.create_connection((rest.url.hostname, rest.url.port)))
-            for _ in range(200)
-        ]
-
-        def ended() -> int:
-            return len(select.select(idle, [], [], 0)[0])
-
-        eventually(
-            lambda: ended() >= len(idle) - REST_CONNECTIONS.bounds.host,
-            "all connections beyond a host's quota are closed",
-        )
-        other = rest.connect(source="127.0.0.2")
-        other.request("GET", "/healthz")
-        assert other.getresponse().status == 200
-        other.close()
-        eventually(lambda: ended() == len(idle), "the remaining connections end as well")
-        assert rest.with_token(None).get("/healthz").status == 200
-
-
-def test_a_polling_client_gets_304_without_changes(running: Appliance, rest: Rest) -> None:
-    """If nothing changed, a polling client gets 304; a revision's ETag is only for changes."""
-    for path in ("/v1/inventory", "/v1/policy/revisions", "/v1/tokens", "/v1/openapi.json"):
-        first = rest.get(path)
-        again = rest.get(path, If_None_Match=first.etag)
-        if again.status == 200:  # the last use of a token is reported once a minute
-            first, again = again, rest.get(path, If_None_Match=again.etag)
-        assert (again.status, again.body, again.etag) == (304, b"", first.etag), path
-        other = rest.get(path, If_None_Match='"other"')
-        if other.etag != again.etag:  # as above
-            assert path == "/v1/tokens"
-            first, other = other, rest.get(path, If_None_Match='"other"')
-        assert (other.status, other.body) == (200, first.body), path
-    for path in ("/v1/policy", "/v1/monitors", "/v1/hosts"):
-        first = rest.get(path)
-        assert rest.get(path, If_None_Match=first.etag).json.keys() == first.json.keys(), path
-    assert rest.with_token(None).get("/v1/inventory", If_None_Match="*").status == 401
-    assert rest.get("/healthz", If_None_Match="*").status == 304
-    rest.get("/v1/whoami", If_None_Match="*")  # recorded after the earlier records
-    running.recorded("--event", "rest call", "--topic", "/v1/whoami")
-    probes = running.audit("--event", "rest call", "--topic", "*healthz")  # refused requests are recorded
-    assert [one for one in probes if one["detail"]["status"] in (200, 304)] == []
 
 
 def test_the_first_token_is_shown_once(running: Appliance) -> None:

@@ -10,6 +10,7 @@ from fastapi import FastAPI
 
 from appliance.api.contract import EXAMPLES, WORDS, is_described
 from tests.support.asgi import requested
+from tests.unit.api.test_operation_routes import BY_HAND
 
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
 CONSOLE = Path(__file__).parents[3] / "appliance" / "api" / "console" / "js"
@@ -83,6 +84,24 @@ def test_every_field_is_described(contract: dict[str, Any]) -> None:
     }
     assert [place for place, words in WORDS.items() if (place, words) not in said] == []
     assert len(fields) > 500
+
+
+def test_every_operation_has_a_summary_its_token_and_problems(contract: dict[str, Any]) -> None:
+    operations = {
+        f"{method.upper()} {path}": one
+        for path, row in contract["paths"].items()
+        for method, one in row.items()
+    }
+    assert {name for name, one in operations.items() if "security" not in one} == BY_HAND[None] - {
+        "GET /v1/openapi.json"
+    }
+    assert len({one["operationId"] for one in operations.values()}) == len(operations)
+    for name, one in operations.items():
+        assert one["summary"] and one["description"], name
+        for status, response in one["responses"].items():
+            if status >= "400":  # 400: of the server itself, which has no request yet, and so no application
+                media = "text/plain" if status == "400" else "application/problem+json"
+                assert list(response["content"]) == [media], (name, status)
 
 
 def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:

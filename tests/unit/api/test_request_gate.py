@@ -85,3 +85,9 @@ def test_answers_are_hardened() -> None:
         assert answer.headers["x-content-type-options"] == "nosniff"
         assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
         assert "server" not in answer.headers
+
+
+def test_probes_are_not_recorded() -> None:
+    world().trail.records.clear()
+    assert sent("GET", "/healthz", {}).status_code == 200
+    assert world().trail.records == []
