@@ -4,25 +4,20 @@ The output and the exit status are equal.
 """
 
 import json
-import os
 import re
-import signal
 import subprocess
-import threading
 import xmlrpc.client
 from collections.abc import Iterator
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.command import ROSRV, commands, rosrv
+from tests.support.command import commands, rosrv
 from tests.support.fake_appliance import FakeAppliance
-from tests.support.processes import LIMIT
 from tests.support.transcript import Section, Transcript, sections
 
 SPEED = "speed() { event said() /chatter std_msgs/String '{}' { } }\n"
@@ -109,15 +104,6 @@ def test_every_verb_of_a_running_appliance_is_covered() -> None:
         if ", ".join(f'"{word}"' for word in name.split()) not in here and f"$ rosrv {name}" not in transcript
     }
     assert (missing - ELSEWHERE, ELSEWHERE - both) == (set(), set())
-
-
-@pytest.mark.parametrize("verb", LOOKING, ids=" ".join)
-def test_an_unreachable_appliance_is_reported(verb: tuple[str, ...]) -> None:
-    """An unreachable appliance is reported without a traceback."""
-    token = "rosrv_0123456789ab_" + "A" * 43
-    done = rosrv(*verb, "--api", "https://127.0.0.1:1", ROSRV_TOKEN=token)
-    assert done.returncode == 2 or "cannot be reached" not in done.stderr
-    assert done.returncode in {0, 1, 2}, done.stderr
 
 
 def comparable(done: Done) -> list[object]:
@@ -224,84 +210,3 @@ def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Applian
     unknown = [run(appliance, way, "token", "revoke", "bob") for way in ("state", "api")]
     assert unknown[0].stderr == unknown[1].stderr
     assert [one.returncode for one in unknown] == [1, 1]
-
-
-def test_the_summary_of_denials_is_the_same(appliance: Appliance) -> None:
-    """It has the denied publications of the beginning, by host and caller."""
-
-    def summary(way: str) -> Any:
-        return json.loads(run(appliance, way, "audit", "summary", "--json").stdout)
-
-    before, over_rest, after = (summary(way) for way in ("state", "api", "state"))
-    assert before["denials"] <= over_rest["denials"] <= after["denials"]
-    assert over_rest["hosts"][0]["host"] == "127.0.0.1"
-    assert {"/node/a", "/node/b", "/node/c"} & {one["name"] for one in over_rest["hosts"][0]["callers"]}
-
-
-def test_watching_survives_a_restart_of_the_api(appliance: Appliance) -> None:
-    """After the api was killed, `status --watch --api` goes on with the status of the next one."""
-    certificate = str(appliance.state / "api" / "certificate.pem")
-    place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]
-    with subprocess.Popen(
-        [ROSRV, "status", "--watch", "--every", "1", "--json", *place],
-        env=os.environ | {"ROSRV_TOKEN": appliance.token}, stdout=subprocess.PIPE, text=True,
-    ) as watcher:  # fmt: skip
-        assert watcher.stdout is not None
-
-        def api_seen() -> int:
-            seen = json.loads(watcher.stdout.readline())  # type: ignore[union-attr]  # checked above
-            return next((one["pid"] for one in seen.get("processes", ()) if one["role"] == "api"), 0)
-
-        first = 0
-        while not first:
-            first = api_seen()
-        os.kill(first, signal.SIGKILL)
-        while api_seen() in (0, first):
-            pass
-        watcher.send_signal(signal.SIGINT)
-        assert watcher.wait(LIMIT) in (0, 1)
-
-
-def test_following_survives_a_restart_of_the_api(appliance: Appliance) -> None:
-    """After the api was killed, `audit tail --api` prints each later record once, and ends with its token."""
-    made = json.loads(run(appliance, "state", "token", "add", "tail", "--json").stdout)
-    certificate = str(appliance.state / "api" / "certificate.pem")
-    place = ["--api", str(appliance.ready["api"]), "--api-ca", certificate]
-    env = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
-    follower = subprocess.Popen(
-        [ROSRV, "audit", "tail", "--event", "monitor *abled", "--lines", "0", "--json", *place],
-        env=env | {"ROSRV_TOKEN": made["token"]}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    stop = threading.Event()
-
-    def switch() -> None:
-        words = ("disable", "enable")
-        for number in range(200):
-            run(appliance, "state", "monitor", words[number % 2], "speed")
-            if stop.wait(0.1):
-                return
-
-    switching = threading.Thread(target=switch)
-    try:
-        switching.start()
-        assert follower.stdout is not None
-        first = [json.loads(follower.stdout.readline())["sequence"] for _ in range(3)]
-        appliance.kill("api")
-        then = [json.loads(follower.stdout.readline())["sequence"] for _ in range(3)]
-        stop.set()
-        switching.join()
-        assert [*first, *then] == sorted(set(first + then))
-        wanted = appliance.audit("--event", "monitor *abled", "--oldest-first")
-        known = [one["sequence"] for one in wanted if first[0] <= one["sequence"] <= then[-1]]
-        assert known == [*first, *then]
-        run(appliance, "state", "token", "revoke", "tail")
-        _rest, said = follower.communicate(timeout=LIMIT)
-        assert follower.returncode == 2, said
-        assert "token" in said
-    finally:
-        stop.set()
-        switching.join()
-        if follower.poll() is None:
-            follower.kill()
-            follower.communicate()
-    run(appliance, "state", "monitor", "enable", "speed")
