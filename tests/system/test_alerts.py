@@ -12,7 +12,6 @@ FOLDER = Path(__file__).parents[2] / "examples" / "prometheus"
 
 
 def promtool(*arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProcess[str]:
-    """Run promtool in the folder with the rules."""
     program = shutil.which("promtool")
     assert program is not None, "promtool is missing: apt install prometheus (packages-system.txt)"
     return subprocess.run(
@@ -21,7 +20,6 @@ def promtool(*arguments: str, folder: Path = FOLDER) -> subprocess.CompletedProc
 
 
 def test_the_rules_are_valid() -> None:
-    """Prometheus accepts the rules unchanged."""
     done = promtool("check", "rules", "alerts.yaml")
     assert done.returncode == 0, done.stderr
     assert "SUCCESS" in done.stdout
@@ -29,7 +27,6 @@ def test_the_rules_are_valid() -> None:
 
 @pytest.mark.parametrize("name", ["rosrv", "rosrv-fleet"])
 def test_a_scrape_configuration_needs_its_own_files_only(tmp_path: Path, name: str) -> None:
-    """Prometheus accepts it with one certificate and token, so a robot's does not need those of a collector."""
     file = FOLDER / f"prometheus{name.removeprefix('rosrv')}.yml"
     for path in (file, FOLDER / "alerts.yaml"):
         (tmp_path / path.name).write_text(path.read_text().replace("/etc/prometheus", str(tmp_path)))
@@ -40,7 +37,6 @@ def test_a_scrape_configuration_needs_its_own_files_only(tmp_path: Path, name: s
 
 
 def test_each_alert_fires_when_it_should_and_not_before() -> None:
-    """The cases of alerts.tests.yaml hold."""
     done = promtool("test", "rules", "alerts.tests.yaml")
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -55,7 +51,6 @@ def test_each_alert_fires_when_it_should_and_not_before() -> None:
     ],
 )
 def test_the_cases_find_a_fault(tmp_path: Path, was: str, now: str) -> None:
-    """A rule with a fault fails its cases."""
     rules = (FOLDER / "alerts.yaml").read_text()
     assert was in rules
     (tmp_path / "alerts.yaml").write_text(rules.replace(was, now))
@@ -64,7 +59,6 @@ def test_the_cases_find_a_fault(tmp_path: Path, was: str, now: str) -> None:
 
 
 def test_the_queries_of_the_dashboard_are_valid(tmp_path: Path) -> None:
-    """Prometheus accepts the queries of Grafana's dashboard as rules, with Grafana's variables replaced."""
     dashboard = json.loads((FOLDER.parent / "grafana/rosrv.json").read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", ())]
     queries += [one["expr"] for one in dashboard["annotations"]["list"]]

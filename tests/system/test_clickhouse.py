@@ -16,7 +16,6 @@ UV = Path(sys.executable).with_name("uv")
 
 
 def test_both_indexes_give_the_same_answers(tmp_path: Path) -> None:
-    """Every kind of search has the same rows and pages in both, also after a segment was inserted twice."""
     need_root()  # PostgreSQL runs as another user
     packages = str(tmp_path / "packages")
     install = [

@@ -22,20 +22,17 @@ LIMIT = 280
 
 @pytest.fixture(autouse=True)
 def machine() -> None:
-    """Require root and ROS."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
 
 
 def present() -> set[str]:
-    """Return the namespaces and folders of demonstrations on this machine."""
     folders = {str(path) for path in Path("/tmp").glob("rosrv-demo-*")}
     return {namespace.name for namespace in namespaces("rosrv-demo.")} | folders
 
 
 @pytest.fixture
 def before() -> set[str]:
-    """Return those that existed before this test."""
     return present()
 
 
@@ -73,7 +70,6 @@ def test_demo(tmp_path: Path, before: set[str]) -> None:
 
 
 def test_the_console_of_the_demo_is_reachable_from_this_machine() -> None:
-    """The printed address answers on this machine, over TLS, to the printed token."""
     with Process(ThisMachine(), [ROSRV, "demo"], env=os.environ, label="rosrv demo") as demo:
         demo.wait_for_text("A LandShark of unmodified", timeout=LIMIT)
         said = demo.story()

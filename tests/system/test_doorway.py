@@ -15,7 +15,6 @@ LIMIT = 30.0
 
 @pytest.fixture
 def host() -> Iterator[Host]:
-    """Return a host without a link to this machine."""
     need_root()
     with Lab("rosrv-door") as lab:
         yield lab.host("behind", "10.77.0.2/24")
@@ -23,7 +22,6 @@ def host() -> Iterator[Host]:
 
 @pytest.fixture
 def echo(host: Host) -> Iterator[tuple[str, int]]:
-    """Run an echo server on the host's loopback, until its peer ends."""
     listener = host.run(lambda: socket.create_server(("127.0.0.1", 0)))
 
     def serve() -> None:
@@ -46,7 +44,6 @@ def echo(host: Host) -> Iterator[tuple[str, int]]:
 
 
 def receive_all(connection: socket.socket) -> bytes:
-    """Return all bytes until the other side ends."""
     pieces = []
     while piece := connection.recv(65536):
         pieces.append(piece)
@@ -54,7 +51,6 @@ def receive_all(connection: socket.socket) -> bytes:
 
 
 def test_bytes_pass_both_ways(host: Host, echo: tuple[str, int]) -> None:
-    """A megabyte goes in and comes back; the end of one direction is passed on."""
     sent = bytes(range(256)) * 4096
     with Doorway(host, echo) as door, socket.create_connection(("127.0.0.1", door.port), LIMIT) as client:
 
@@ -80,7 +76,6 @@ def test_no_listener_behind_it(host: Host) -> None:
 
 
 def test_closing_ends_open_connections(host: Host, echo: tuple[str, int]) -> None:
-    """The doorway closes with its connections; afterwards its port is closed."""
     with Doorway(host, echo) as door:
         client = socket.create_connection(("127.0.0.1", door.port), LIMIT)
         client.sendall(b"hello")

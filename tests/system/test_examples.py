@@ -19,7 +19,6 @@ pytestmark = pytest.mark.timeout(1200)  # the Debian is made
 
 @pytest.fixture(scope="module")
 def debian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return a tree with both programs and the examples."""
     tree = make_base(
         tmp_path_factory.mktemp("debian") / "tree", ["ansible-core", "cloud-init", "python3-apt"]
     )
@@ -36,7 +35,6 @@ def run(tree: Path, *command: str) -> str:
 
 
 def tried(tree: Path, *command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program in the tree, with its own /proc, and this checkout mounted read-only."""
     script = """
         tree=$1 root=$2; shift 2
         mount -t proc proc "$tree/proc"
@@ -67,7 +65,6 @@ def tried(tree: Path, *command: str, **environment: str) -> subprocess.Completed
 
 
 def test_ansible_accepts_the_role(debian: Path) -> None:
-    """Every task uses an existing module with valid parameters."""
     said = run(debian, "ansible-playbook", "--syntax-check", "-i", "robots,", "/examples/ansible/site.yml")
     assert "playbook: /examples/ansible/site.yml" in said
     listed = run(debian, "ansible-playbook", "--list-tasks", "-i", "robots,", "/examples/ansible/site.yml")
@@ -135,7 +132,6 @@ class Robot:
 
 
 def test_ansible_makes_a_robot_an_appliance(debian: Path) -> None:
-    """The role installs the appliance; a second run changes nothing; a new policy is loaded, an invalid one is not."""
     robot = Robot(debian)
     policy = debian / "etc/rosrv/policies/default.ini"
 
@@ -173,6 +169,5 @@ def test_ansible_makes_a_robot_an_appliance(debian: Path) -> None:
 
 
 def test_cloud_init_knows_every_key(debian: Path) -> None:
-    """The example is valid by cloud-init's own schema."""
     said = run(debian, "cloud-init", "schema", "--config-file", "/examples/cloud-init/user-data.yaml")
     assert "Valid" in said

@@ -66,11 +66,9 @@ class Checkout:
     path: Path
 
     def command(self, *arguments: str) -> list[str]:
-        """Return a command of its `rosrv`."""
         return [str(self.path / ".venv" / "bin" / "python"), "-m", "appliance.cli.main", *arguments]
 
     def run(self, *arguments: str, seconds: float = 2 * LIMIT) -> "subprocess.CompletedProcess[str]":
-        """Run a command of it to its end, as root."""
         return subprocess.run(
             self.command(*arguments),
             cwd=self.path,
@@ -83,13 +81,11 @@ class Checkout:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Return the environment of its commands, which has nothing of this checkout."""
         return {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": str(self.home), "PYTHONUNBUFFERED": "1"}
 
 
 @pytest.fixture
 def checkout(request: pytest.FixtureRequest) -> Iterator[Checkout]:
-    """Make a checkout as the way of the parameter does."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     way = WAYS[request.param]
@@ -127,7 +123,6 @@ def clone(place: Path, way: Way) -> None:
 
 
 def share_packages(place: Path) -> None:
-    """Make what `scripts/setup --run` makes: the relay's compiled module, and the locked packages."""
     for module in (ROOT / "appliance/relay/transport").glob("pump*.so"):
         shutil.copy(module, place / module.relative_to(ROOT))
     command = ["/usr/bin/python3", "-m", "venv", "--without-pip", str(place / ".venv")]
@@ -142,7 +137,6 @@ def share_packages(place: Path) -> None:
 
 
 def link_or_copy(source: Path, target: Path) -> None:
-    """Make a hard link, or a copy if the folders are on different disks."""
     try:
         target.hardlink_to(source)
     except OSError:
@@ -151,7 +145,6 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 @pytest.mark.parametrize("checkout", WAYS, indirect=True)
 def test_the_appliance_runs_from_a_checkout(checkout: Checkout) -> None:
-    """It runs with a policy, specifications, hosts and a state in the home, and a reload reads the replaced file."""
     files = {
         "robot.ini": OPEN_POLICY,
         "monitors/m.rv": (ROOT / "monitors" / "safe_zone.rv").read_text(),
@@ -205,7 +198,6 @@ def test_the_appliance_runs_from_a_checkout(checkout: Checkout) -> None:
 
 @pytest.mark.parametrize("checkout", ["the home of root"], indirect=True)
 def test_the_default_isolation_runs_from_a_home(checkout: Checkout) -> None:
-    """`rosrv up` with its default isolation, and the probe of the hidden port, run from a closed home."""
     policy = checkout.home / "robot.ini"
     policy.write_text(OPEN_POLICY)
     state = checkout.home / "state"
@@ -222,7 +214,6 @@ def test_the_default_isolation_runs_from_a_home(checkout: Checkout) -> None:
 
 
 def test_a_container_reads_what_only_its_owner_may() -> None:
-    """With the capabilities of compose.yaml, a user's policy, specifications and hosts under umask 077 are read."""
     need_root()
     given = yaml.safe_load((ROOT / "compose.yaml").read_text())["services"]["appliance"]["cap_add"]
     rights = ",".join(f"+{name.lower()}" for name in given)
@@ -259,7 +250,6 @@ def test_a_container_reads_what_only_its_owner_may() -> None:
 
 @pytest.mark.parametrize("checkout", ["the home of root", "all at once"], indirect=True)
 def test_the_demonstration_runs_from_a_checkout(checkout: Checkout) -> None:
-    """All results are as expected from the home of root, and from a sudo user's with everything that is unusual."""
     with Process(
         ThisMachine(),
         checkout.command("demo"),

@@ -18,7 +18,6 @@ from tests.support.requirements import need_root
 
 @pytest.fixture
 def hosts() -> Iterator[dict[str, Host]]:
-    """Return the three machines of the page."""
     need_root()
     with own_namespace(), Lab("rosrv-hour") as lab:
         yield {
@@ -30,7 +29,6 @@ def hosts() -> Iterator[dict[str, Host]]:
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """Return a working directory that the appliance's users may traverse."""
     folder = Path(f"/tmp/rosrv-hour-{os.getpid()}")
     folder.mkdir(mode=0o755)
     yield folder
@@ -38,7 +36,6 @@ def folder() -> Iterator[Path]:
 
 
 def test_the_page_is_true(hosts: dict[str, Host], folder: Path) -> None:
-    """Every block ends and prints as the page says."""
     staying: list[Process] = []
     environment = {
         "PATH": f"{Path(ROSRV).parent}:{os.environ['PATH']}",

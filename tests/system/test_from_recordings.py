@@ -12,7 +12,6 @@ _STEP = re.compile(r"```sh\n(?P<script>.*?)```\n```text\n(?P<shown>.*?)```\n", r
 
 
 def test_the_page_is_true(tmp_path: Path) -> None:
-    """Every block succeeds, and prints as the page says."""
     for name in ("examples", "monitors"):
         (tmp_path / name).symlink_to(ROOT / name)
     environment = {

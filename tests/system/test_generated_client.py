@@ -96,22 +96,18 @@ class Call:
 
 
 def of(**arguments: Any) -> Call:
-    """Return a call with these arguments."""
     return Call(lambda _done: arguments)
 
 
 def refusal(done: Done) -> dict[str, Any]:
-    """Return the record of a denial."""
     return {"record_id": str(done["search_audit"]["records"][0]["sequence"])}
 
 
 def saved(done: Done) -> dict[str, Any]:
-    """Return the recording that was saved from memory."""
     return {"recording_id": done["recording_of_memory"]["id"]}
 
 
 def renewal(done: Done) -> dict[str, Any]:
-    """Return a request for a new key, signed with the present one."""
     asked = signing_request(make_key(), NAME)
     present = load_pem_private_key(done["key"], password=None)
     assert isinstance(present, ec.EllipticCurvePrivateKey)
@@ -120,7 +116,6 @@ def renewal(done: Done) -> dict[str, Any]:
 
 
 def reached(_done: Done) -> dict[str, Any]:
-    """Return the address at which a host finds the appliance."""
     return {"endpoint": MIDDLE}
 
 
@@ -168,7 +163,6 @@ FOR_INVESTIGATORS = {"recording_of_memory", "recording_messages", "recording_bag
 
 @pytest.fixture
 def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of programs of an environment with the generator."""
     place = tmp_path_factory.mktemp("generator") / "venv"
     for command in (["venv", str(place)], ["pip", "sync", "--python", str(place / "bin/python"), str(LOCK)]):
         subprocess.run([UV, "--quiet", *command], check=True, timeout=240)
@@ -177,7 +171,6 @@ def generator(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[TunnelSite]:
-    """Run an appliance with a monitor and a recorder, which hosts may join and a robot's node uses."""
     need_root()
     need_strongswan()
     needs(has_ros(), "ROS 1 (run `make setup`)")
@@ -200,7 +193,6 @@ def site(tmp_path: Path) -> Iterator[TunnelSite]:
 
 
 def register() -> Any:
-    """Return the answer to a node that registers a publication without a rule."""
     with xmlrpc.client.ServerProxy(MASTER) as master:
         return master.registerPublisher("/joy", "/cmd_vel", "geometry_msgs/Twist", f"http://{ROBOT}:1/")
 
@@ -227,12 +219,10 @@ class Client:
         raise AssertionError(f"{call[1]}: {self._process.communicate()[1]}")
 
     def close(self) -> None:
-        """Stop it."""
         self._process.communicate()
 
 
 def generate(generator: Path, contract: Any, folder: Path) -> None:
-    """Generate the client completely, except for bodies that are not JSON."""
     (folder / "openapi.json").write_text(json.dumps(contract))
     made = subprocess.run(
         [generator / "openapi-python-client", "generate", "--path", "openapi.json", "--output-path", "client",
@@ -289,7 +279,6 @@ def test_every_operation_is_called_and_its_answer_parsed(
 
 
 def kit_of(done: Done, folder: Path) -> Path:
-    """Return the newest kit, as a file."""
     kit = folder / "kit.tar.gz"
     kit.write_bytes(base64.b64decode(done["new_host_kit"]))
     return kit

@@ -39,7 +39,6 @@ class Cluster:
     token: str = field(default_factory=lambda: secrets.token_hex(32))
 
     def environment(self, node: int | None = None) -> dict[str, str]:
-        """Return the environment of a node's processes, or of a command."""
         own = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": self.token, "RAY_USAGE_STATS_ENABLED": "0"}
         own["RAY_health_check_period_ms"] = "500"  # a dead node is noticed after five checks
         own["RAY_worker_niceness"] = "0"  # Ray's own is 15, so that other tests would take the processors
@@ -94,12 +93,10 @@ class Cluster:
         return len(found)
 
     def log(self) -> str:
-        """Return the logs of the servers that start a client's work."""
         files = sorted(self.folder.glob("session_2*/logs/ray_client_server*"))
         return "".join(f"\n{file.name}:\n{file.read_text()}" for file in files)
 
     def start_rosrv(self, *words: str, **environment: str) -> "subprocess.Popen[str]":
-        """Start a command on the cluster."""
         return subprocess.Popen(
             [BIN / "rosrv", "monitor", *words], env=self.environment() | environment, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True,
@@ -139,13 +136,11 @@ class Finished:
 
 
 def words_of(command: str, place: str, report: Path) -> list[str]:
-    """Return the words of a command on all recordings, in a place (options of the executor)."""
     return [*command.split(), "--bags", "bags", "--report", str(report), *place.split()]
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Make a folder with recordings the current one."""
     with contextlib.chdir(tmp_path_factory.mktemp("recordings")):
         Path("limit.rv").write_text(SPECIFICATION)
         Path("bags").mkdir()
@@ -157,7 +152,6 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module", params=COMMANDS)
 def expected(request: pytest.FixtureRequest, recordings: None) -> Finished:
-    """Return the results of a command in one process, which are equal to those of two."""
     command, results = str(request.param), []
     for workers in ("1", "2"):
         words = words_of(command, f"--workers {workers}", Path(workers))
@@ -171,14 +165,12 @@ def expected(request: pytest.FixtureRequest, recordings: None) -> Finished:
 
 
 def finished(command: str, process: "subprocess.Popen[str]", report: Path, cluster: Cluster) -> Finished:
-    """Wait for a command of which a recording fails."""
     out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == SOME_FAILED, err + cluster.log()
     return Finished(command, out, report.read_bytes())
 
 
 def test_a_node_gives_the_results_of_a_process(cluster: Cluster, expected: Finished, tmp_path: Path) -> None:
-    """On one node, a client from outside has the output and the report of a process, for each command."""
     report = tmp_path / "report"
     with cluster.start_rosrv(
         *words_of(expected.command, f"--on ray://127.0.0.1:{CLIENTS}", report)
@@ -187,7 +179,6 @@ def test_a_node_gives_the_results_of_a_process(cluster: Cluster, expected: Finis
 
 
 def test_a_node_that_is_killed_changes_nothing(cluster: Cluster, expected: Finished, tmp_path: Path) -> None:
-    """Three nodes, of which one is killed while it works, give the same, for each command."""
     for node in (1, 2):
         if not cluster.processes(str(node)):
             cluster.start(node)
@@ -201,7 +192,6 @@ def test_a_node_that_is_killed_changes_nothing(cluster: Cluster, expected: Finis
 
 
 def test_a_wrong_token_is_refused(cluster: Cluster, recordings: None) -> None:
-    """The cluster executes nothing for a command without its token."""
     words = ("run", "limit.rv", "--bags", "bags", "--on", "auto")
     status, out, err = cluster.rosrv(*words, RAY_AUTH_TOKEN=secrets.token_hex(32))
     assert (status, out) == (2, "")

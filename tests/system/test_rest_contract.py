@@ -24,7 +24,6 @@ api_limits: {requests_per_second: 100000, burst: 1000000, failures_per_minute: 1
 
 @pytest.fixture
 def appliance(tmp_path: Path) -> Iterator[Appliance]:
-    """Run an appliance without rate limits for the fuzzer."""
     config = tmp_path / "appliance.yaml"
     config.write_text(CONFIG)
     with Appliance(options=("--config", str(config))) as running:
@@ -32,7 +31,6 @@ def appliance(tmp_path: Path) -> Iterator[Appliance]:
 
 
 def shown(said: str) -> str:
-    """Return the readable lines of the fuzzer's output, which repeats its arbitrary input."""
     return "\n".join(
         line if len(line) < 300 else f"{line[:280]} ... ({len(line)})" for line in said.splitlines()
     )
@@ -46,7 +44,6 @@ expected-statuses = ["400", "401", "403", "404", "405", "406", "409", "413", "41
 
 
 def fuzz(rest: Rest, directory: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    """Run schemathesis once, in its own folder."""
     (directory / "schemathesis.toml").write_text(REFUSED)
     command = [SCHEMATHESIS, "run", f"{rest.url.geturl()}/v1/openapi.json", "--no-color"]
     command += ["--request-timeout", str(2 * LIMIT), "-H", f"Authorization: Bearer {rest.token}"]
@@ -78,7 +75,6 @@ def test_the_contract_is_true(appliance: Appliance, tmp_path: Path) -> None:
 
 
 def test_the_fuzzer_finds_a_difference(appliance: Appliance, tmp_path: Path) -> None:
-    """The same run against another contract fails: the test above can find a difference."""
     rest = appliance.rest()
     contract = rest.get("/v1/openapi.json").json
     contract["paths"] = {"/v1/status": contract["paths"]["/v1/status"]}

@@ -17,14 +17,12 @@ from tests.support.requirements import need_root
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """Make an Ethernet."""
     need_root()
     with Lab("rosrv-rest") as lab:
         yield lab
 
 
 def status(certificate: str, address: str, port: int, timeout: float = LIMIT) -> str:
-    """Return the status of `GET /healthz` at an address, over TLS with only this certificate trusted."""
     connection = http.client.HTTPSConnection(
         address, port, timeout=timeout, context=ssl.create_default_context(cadata=certificate)
     )
@@ -38,12 +36,10 @@ def status(certificate: str, address: str, port: int, timeout: float = LIMIT) ->
 
 
 def certificate_of(appliance: Appliance, host: Host, port: int) -> str:
-    """Return the served certificate, once it is there."""
     return host.run(partial(ssl.get_server_certificate, ("127.0.0.1", port), timeout=LIMIT))
 
 
 def test_only_configured_networks_reach_it(lab: Lab, tmp_path: Path) -> None:
-    """Isolation container: hosts of `api_networks` and the machine itself are answered, others are refused."""
     machine = lab.host("machine", "10.82.0.2/24")
     manager, unknown = lab.host("manager", "10.82.0.10/24"), lab.host("unknown", "10.82.0.66/24")
     config = tmp_path / "appliance.yaml"
@@ -59,7 +55,6 @@ def test_only_configured_networks_reach_it(lab: Lab, tmp_path: Path) -> None:
 
 
 def test_a_given_address_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None:
-    """`--api ADDRESS:PORT`: a client that trusts the certificate is answered at that address."""
     machine, manager = lab.host("machine", "10.82.0.2/24"), lab.host("manager", "10.82.0.10/24")
     config = tmp_path / "appliance.yaml"
     config.write_text("api_networks: [10.82.0.0/24]\n")
@@ -71,7 +66,6 @@ def test_a_given_address_is_in_the_certificate(lab: Lab, tmp_path: Path) -> None
 
 
 def test_in_a_namespace_of_its_own_the_machine_reaches_it(lab: Lab, tmp_path: Path) -> None:
-    """Isolation netns: REST answers at the printed loopback address; an unknown host is refused."""
     machine, unknown = lab.host("machine", "10.82.0.2/24"), lab.host("unknown", "10.82.0.66/24")
     with Appliance(machine, isolation="netns", options=("--api", "127.0.0.1:8443")) as appliance:
         assert appliance.ready["api"] == "https://127.0.0.1:8443"
@@ -83,7 +77,6 @@ def test_in_a_namespace_of_its_own_the_machine_reaches_it(lab: Lab, tmp_path: Pa
 
 
 def test_a_port_in_use_is_an_error(lab: Lab) -> None:
-    """A port used by another program is an error with that program's name, and no other port is taken."""
     machine = lab.host("machine", "10.82.0.2/24")
     program = (
         "import socket; s = socket.create_server(('127.0.0.1', 8443)); print('here', flush=True); s.accept()"

@@ -13,7 +13,6 @@ from tests.support.requirements import need_root
 
 @pytest.mark.parametrize("isolation", ["container", "netns"])
 def test_a_message_goes_through_behind_the_firewall(isolation: str) -> None:
-    """As root on the machine: kernel, firewall, probe, RVMaster, log and relay are tested, and nothing fails."""
     need_root()
     with Lab("rosrv-self") as lab:
         machine = lab.host("machine", "10.84.0.2/24")

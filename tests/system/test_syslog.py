@@ -56,7 +56,6 @@ class Keeper:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Run it until the end of the block."""
         with Process(self.host, self._command, env={}, label="rsyslogd") as process:
             eventually(
                 lambda: self.host.run(partial(_connects, KEEPER, 6514)) == "connected",
@@ -71,7 +70,6 @@ class Keeper:
         return text.rpartition("\n")[0].splitlines()
 
     def sequences(self) -> set[int]:
-        """Return the sequence numbers of its records."""
         messages = [parse(line.encode()) for line in self.lines()]
         return {int(one.fields["sequence"]) for one in messages if "rosrv@32473" in one.elements}
 
@@ -86,7 +84,6 @@ def _connects(address: str, port: int) -> str:
 
 @pytest.fixture
 def lab() -> Iterator[Lab]:
-    """Make an Ethernet."""
     need_root()
     with Lab("rosrv-slog") as lab:
         yield lab
@@ -94,7 +91,6 @@ def lab() -> Iterator[Lab]:
 
 @pytest.fixture
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return a folder that the appliance's users may traverse."""
     folder = Path(os.path.realpath("/tmp")) / f"rosrv-slog-{os.getpid()}"
     folder.mkdir(mode=0o755)
     yield folder
@@ -119,7 +115,6 @@ def configure(folder: Path, tls: Certificates, to: str, backend: str = "auto") -
 
 
 def set_parameters(uri: str, count: int) -> None:
-    """Make a node's calls, one of them with terminal escapes in its name."""
     with master_at(uri) as master:
         for number in range(count):
             assert master.setParam("/worker", f"/value{number}", number)[0] == 1
@@ -127,18 +122,12 @@ def set_parameters(uri: str, count: int) -> None:
 
 
 def log_of(appliance: Appliance) -> set[int]:
-    """Return all sequence numbers in the log."""
     lines = appliance.rosrv("audit", "export").stdout.splitlines()
     return {json.loads(line)["sequence"] for line in lines}
 
 
 @pytest.mark.parametrize("isolation", ["container", "netns"])
 def test_another_machine_keeps_the_log(lab: Lab, folder: Path, isolation: str) -> None:
-    """Over TLS with certificates on both sides rsyslog gets every record, also those made while it was away.
-
-    Syslog has no confirmations: rsyslog may read a record and end before it writes it. So earlier records are checked
-    while it runs. Its file is a valid proof for `rosrv audit verify --checkpoints`.
-    """
     machine, node = lab.host("machine", "10.83.0.2/24"), lab.host("node", "10.83.0.10/24")
     keeper = Keeper(lab.host("keeper", f"{KEEPER}/24"), folder)
     config = configure(folder, keeper.tls, f"tls://{KEEPER}:6514")
@@ -179,7 +168,6 @@ def test_datagrams_to_rsyslog(lab: Lab, folder: Path) -> None:
 
 @pytest.mark.parametrize("backend", ["nft", "iptables"])
 def test_the_forwarder_reaches_its_receiver_only(lab: Lab, folder: Path, backend: str) -> None:
-    """A compromised forwarder reaches the receiver, and no other host or local port."""
     machine, other = lab.host("machine", "10.83.0.2/24"), lab.host("other", "10.83.0.66/24")
     keeper = Keeper(lab.host("keeper", f"{KEEPER}/24"), folder)
     config = configure(folder, keeper.tls, f"tls://{KEEPER}:6514", backend)
@@ -216,7 +204,6 @@ with socket.create_server(("", 7777)) as listener:
 
 
 def _as_user(account: tuple[int, int], address: str, port: int) -> str:
-    """Return the result of a function that runs as this user, in a child process."""
     here, there = os.pipe()
     child = os.fork()
     if child == 0:

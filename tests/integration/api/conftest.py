@@ -10,12 +10,10 @@ from tests.support.rest import Rest
 
 @pytest.fixture(scope="module")
 def running() -> Iterator[Appliance]:
-    """Run the module's appliance, with REST over TLS on a free port."""
     with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
         yield appliance
 
 
 @pytest.fixture(scope="module")
 def rest(running: Appliance) -> Rest:
-    """Return a REST client with the first token."""
     return running.rest()

@@ -21,14 +21,12 @@ def rest(running: Appliance) -> Rest:
 
 
 def new_token(appliance: Appliance, name: str, role: str, expires: str = "1h") -> str:
-    """Make a token, as an operator does."""
     made = appliance.rosrv("token", "add", name, "--role", role, "--expires", expires, "--json").stdout
     return str(json.loads(made)["token"])
 
 
 @pytest.mark.real
 def test_a_revoked_token_ends_at_once(running: Appliance, rest: Rest) -> None:
-    """The answer after `rosrv token revoke` is 401; an open stream ends with the reason."""
     client = rest.with_token(new_token(running, "leaver", "viewer"))
     events = client.events("/v1/audit/stream")
     next(events)
@@ -43,7 +41,6 @@ def test_a_revoked_token_ends_at_once(running: Appliance, rest: Rest) -> None:
 
 
 def test_a_body_too_large_is_refused_unread(rest: Rest) -> None:
-    """A length beyond the limit is answered before the body is sent; chunked bodies are limited as well."""
     connection = rest.connect()
     connection.putrequest("POST", "/v1/policy")
     for name, value in rest.headers({"Content-Length": "999999999999", "Content-Type": "text/plain"}).items():
@@ -65,7 +62,6 @@ def test_a_body_too_large_is_refused_unread(rest: Rest) -> None:
 
 
 def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
-    """Beyond the burst a host gets 429 with Retry-After; so does one that guesses tokens."""
     config = tmp_path / "appliance.yaml"
     config.write_text("api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 1, burst: 100}\n")
     with Appliance(options=("--config", str(config))) as appliance:
@@ -85,10 +81,6 @@ def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
 
 
 def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
-    """The path is printed besides the line for scripts, and only the owner can read the file.
-
-    The token is an admin's.
-    """
     with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off"), json=False) as appliance:
         process = appliance.process
         assert process is not None
@@ -107,7 +99,6 @@ def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
 
 
 def test_the_first_token_is_shown_once(running: Appliance) -> None:
-    """With --json, only the ready line of the first start has the token; the token still works after a restart."""
     token = running.ready["token"]
     assert list(running.ready) == ["event", "master", "api", "revision", "token"]
     assert running.stop() == 0

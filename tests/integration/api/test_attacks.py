@@ -22,7 +22,6 @@ CONFIG = "api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 1000
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run REST in clear text, without rate limits for this module's attacks."""
     appliance = Appliance()
     config = appliance.directory / "appliance.yaml"
     config.write_text(CONFIG)
@@ -44,14 +43,12 @@ def rest(appliance: Appliance) -> Iterator[Rest]:
 
 
 def api_of(rest: Rest) -> int:
-    """Return the process that serves REST."""
     answer = rest.get("/v1/status")
     assert answer.status == 200
     return next(int(row["pid"]) for row in answer.json["processes"] if row["role"] == "api")
 
 
 def resident(pid: int) -> int:
-    """Return the memory of a process, in bytes."""
     text = Path(f"/proc/{pid}/status").read_text()
     found = re.search(r"VmRSS:\s+(\d+) kB", text)
     assert found is not None
@@ -85,7 +82,6 @@ def statuses(rest: Rest, data: bytes, idle: float = 2) -> list[int]:
     ],
 )  # fmt: skip
 def test_no_spelling_of_a_path_bypasses_the_token(rest: Rest, path: str) -> None:
-    """No spelling of a path bypasses the token: only the probes and the contract answer 200."""
     request = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n".encode()
     found = statuses(rest, request)
     assert found in ([400], [401], [421], [422], [200]), found
@@ -117,7 +113,6 @@ HIDDEN = b"GET /v1/policy HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     ],
 )  # fmt: skip
 def test_a_smuggled_request_is_not_served(rest: Rest, head: bytes, body: bytes) -> None:
-    """With contradictory lengths, a smuggled request is not served with the token of the outer one."""
     token = f"Authorization: Bearer {rest.token}\r\n".encode()
     outer = b"POST /v1/policy/explain HTTP/1.1\r\nHost: 127.0.0.1\r\n" + token + head + b"\r\n"
     data = outer + body.replace(b"TOKEN", (rest.token or "").encode())
@@ -128,7 +123,6 @@ def test_a_smuggled_request_is_not_served(rest: Rest, head: bytes, body: bytes) 
 
 
 def test_each_pipelined_request_needs_its_token(rest: Rest) -> None:
-    """Requests on one connection with, without, and with a token get 200, 401, 200, in order."""
     token = f"Authorization: Bearer {rest.token}\r\n"
     parts = [
         f"GET /v1/whoami HTTP/1.1\r\nHost: 127.0.0.1\r\n{one}\r\n"
@@ -138,7 +132,6 @@ def test_each_pipelined_request_needs_its_token(rest: Rest) -> None:
 
 
 def test_two_tokens_do_not_add_up(rest: Rest) -> None:
-    """With two Authorization headers, one valid, at most one is used, and roles never add up."""
     wrong = "Authorization: Bearer rosrv_000000000000_" + "A" * 43 + "\r\n"
     right = f"Authorization: Bearer {rest.token}\r\n"
     for headers in (wrong + right, right + wrong):
@@ -147,7 +140,6 @@ def test_two_tokens_do_not_add_up(rest: Rest) -> None:
 
 
 def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
-    """A compression bomb of 1 GB is not unpacked: it is invalid JSON."""
     bomb = gzip.compress(b"\0" * (1 << 26), 9) * 16
     headers = {"Content-Type": "application/json", "Content-Encoding": "gzip", "If-Match": "*"}
     began = time.monotonic()
@@ -157,7 +149,6 @@ def test_compressed_bodies_stay_compressed(rest: Rest) -> None:
 
 
 def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> None:
-    """Exploding formulas and endless blocks are answered in time, and so are other clients."""
     events = "\n".join(f"event e{one}() /a std_msgs/Bool '{{}}' {{ }}" for one in range(14))
     sometime = " and ".join(f"<>(e{one} and <>e{one + 1})" for one in range(12))
     bombs = [
@@ -195,7 +186,6 @@ def test_hostile_specifications_are_rejected_or_compiled_in_time(rest: Rest) -> 
 
 
 def test_invalid_names_in_paths_are_rejected(rest: Rest) -> None:
-    """An invalid name of a monitor, token, host or record gets 404 or 422, as text instead of a page."""
     for name in (
         "..%2f..%2fetc%2fpasswd",
         "%00",
@@ -225,7 +215,6 @@ def test_invalid_names_in_paths_are_rejected(rest: Rest) -> None:
 
 
 def test_endless_headers_close_the_connection(rest: Rest) -> None:
-    """With endless headers, or one of 10 MB, the connection is closed quickly."""
     began = time.monotonic()
     many = b"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"".join(
         b"H%d: x\r\n" % one for one in range(100_000)
@@ -237,7 +226,6 @@ def test_endless_headers_close_the_connection(rest: Rest) -> None:
 
 
 def test_unsupported_methods_are_refused(rest: Rest) -> None:
-    """TRACE does not echo, CONNECT opens no connection, and an unknown method is refused."""
     for method in ("TRACE", "CONNECT", "PROPFIND", "OPTIONS", "INVENTED"):
         data = (
             f"{method} /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Secret: echo\r\nConnection: close\r\n\r\n"
@@ -247,7 +235,6 @@ def test_unsupported_methods_are_refused(rest: Rest) -> None:
 
 
 def test_an_upgrade_bypasses_no_check(rest: Rest) -> None:
-    """Requests for WebSocket and h2c are answered as plain HTTP, by the same rules."""
     for kind in ("websocket", "h2c"):
         data = (
             f"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: Upgrade, HTTP2-Settings\r\nUpgrade: {kind}\r\n"
@@ -259,7 +246,6 @@ def test_an_upgrade_bypasses_no_check(rest: Rest) -> None:
 
 
 def test_a_client_that_does_not_read_delays_no_other(rest: Rest) -> None:
-    """While twenty clients request a long answer without reading it, others are served."""
     idle = []
     try:
         for _ in range(20):
@@ -284,6 +270,5 @@ def test_a_client_that_does_not_read_delays_no_other(rest: Rest) -> None:
     ],
 )  # fmt: skip
 def test_malformed_requests_are_not_served(rest: Rest, data: bytes) -> None:
-    """Covers bytes that are not HTTP, endless headers and an interrupted request; the next client is served."""
     assert not {101, 200} & set(statuses(rest, data))
     assert rest.get("/v1/status").status == 200

@@ -24,12 +24,10 @@ def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
 
 @pytest.fixture(scope="module")
 def rest(appliance: Appliance) -> Rest:
-    """Return a REST client of an admin."""
     return appliance.rest()
 
 
 def publish(appliance: Appliance, topic: str) -> Any:
-    """Register a publisher at RVMaster."""
     with xmlrpc.client.ServerProxy(appliance.master_uri) as master:
         return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
 
@@ -48,7 +46,6 @@ def test_followers_get_a_denial_live(appliance: Appliance, rest: Rest) -> None:
 
 
 def test_a_reconnecting_client_misses_no_record(appliance: Appliance, rest: Rest) -> None:
-    """With Last-Event-ID (as a browser sends it) or `after`, the stream continues after that record."""
     publish(appliance, "/first")
     first = rest.get("/v1/audit?resource=/first&event=decision").json["records"][0]
     publish(appliance, "/second")
@@ -63,7 +60,6 @@ def test_a_reconnecting_client_misses_no_record(appliance: Appliance, rest: Rest
 
 @pytest.mark.real
 def test_search_returns_the_same_as_the_command(appliance: Appliance, rest: Rest) -> None:
-    """The same filters return the same records as the command, field by field."""
     publish(appliance, "/sought")
     found = rest.get("/v1/audit?resource=/sou*&decision=deny&since=1h").json["records"]
     assert found == appliance.audit("--topic", "/sou*", "--deny", "--since", "1h")
@@ -73,7 +69,6 @@ def test_search_returns_the_same_as_the_command(appliance: Appliance, rest: Rest
 
 @pytest.mark.real
 def test_the_log_is_proven(rest: Rest) -> None:
-    """Verification reports that the chain is complete, and how many records a signature covers."""
     verified = rest.get("/v1/audit/verify").json
     assert verified["ok"] is True
     assert verified["records"] > 0

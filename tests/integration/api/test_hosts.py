@@ -14,7 +14,6 @@ TOKEN = "rosrv-enrol_" + "0" * 12 + "_" + "x" * 43
 
 @pytest.fixture
 def nobody(rest: Rest) -> Rest:
-    """Return a REST client without a token."""
     return rest.with_token(None)
 
 
@@ -27,7 +26,6 @@ def problem(answer: Answer, status: int, kind: str) -> str:
 
 
 def test_wrong_enrolment_tokens_are_slowed_down(running: Appliance, nobody: Rest) -> None:
-    """Each is recorded; after several of them the host has to wait, before the token is checked."""
     body = {"token": TOKEN, "request": signing_request(make_key(), "laptop").decode()}
     assert "already used" in problem(nobody.post("/v1/enrol", body), 403, "not-recognised")
     assert running.recorded("--event", "enrolment refused")
@@ -42,7 +40,6 @@ def test_wrong_enrolment_tokens_are_slowed_down(running: Appliance, nobody: Rest
 
 
 def test_renewal_outside_a_tunnel_is_refused(running: Appliance, nobody: Rest) -> None:
-    """A renewal outside a tunnel is refused, with any credentials."""
     body = {"request": signing_request(make_key(), "laptop").decode(), "proof": "AAAA"}
     problem(nobody.post("/v1/hosts/laptop/renew", body), 403, "not-recognised")
     problem(nobody.post("/v1/hosts/laptop/renewed"), 403, "not-recognised")
@@ -50,6 +47,5 @@ def test_renewal_outside_a_tunnel_is_refused(running: Appliance, nobody: Rest) -
 
 
 def test_the_authority_and_its_list_are_public(nobody: Rest) -> None:
-    """Every holder of an old list of revocations can get a new one."""
     assert nobody.get("/v1/authority").body.startswith(b"-----BEGIN CERTIFICATE-----")
     assert nobody.get("/v1/revocations").body.startswith(b"-----BEGIN X509 CRL-----")

@@ -22,7 +22,6 @@ DROPPING = "speed() { event said() /chatter std_msgs/String '{}' { return; } }\n
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Run an appliance with an empty folder of specifications."""
     appliance = Appliance()
     folder = appliance.directory / "monitors"
     folder.mkdir()
@@ -33,7 +32,6 @@ def common_appliance() -> Iterator[Appliance]:
 
 @pytest.fixture
 def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
-    """Provide the appliance without specifications, and with only this test's log."""
     common_appliance.ignore_earlier_records()
     yield common_appliance
     common_appliance.rosrv("monitor", "reload", "--prune")
@@ -44,7 +42,6 @@ def load(rest: Rest, files: dict[str, str], match: str = "*") -> Answer:
 
 
 def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_path: Path) -> None:
-    """A monitor drops every message of a real talker: its counters rise, and its history has the drops."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rest = appliance.rest()
     load(rest, {"speed.rv": DROPPING, "tally.rv": OTHER.replace("count", "tally")})
@@ -71,7 +68,6 @@ def test_effects_of_a_monitor_are_counted_and_kept(appliance: Appliance, tmp_pat
 
 
 def nested_repetitions() -> str:
-    """Return specifications whose automata take the compiler about a second each."""
     formula = "(a | b)* a"
     for _ in range(12):
         formula = f"({formula} (a|b))"
@@ -99,7 +95,6 @@ def _compiling(appliance: Appliance, before: tuple[int, float]) -> bool:
 def test_the_load_of_a_tool_that_was_killed_never_comes_into_force(
     appliance: Appliance, tmp_path: Path, way: str
 ) -> None:
-    """A load whose client is killed during the compilation is withdrawn, and the next one does not wait for it."""
     (tmp_path / "nested.rv").write_text(nested_repetitions())
     before = appliance.rest().get("/v1/monitors").json["tag"]
     place = ["--state", str(appliance.state)] if way == "state" else ["--api", str(appliance.ready["api"])]

@@ -22,7 +22,6 @@ TRANSPORT = ("--api", "127.0.0.1:0", "--api-tls", "off")
 
 @pytest.fixture(scope="module")
 def common_appliance() -> Iterator[Appliance]:
-    """Run an appliance with REST in clear text."""
     with Appliance(options=TRANSPORT) as running:
         yield running
 
@@ -38,30 +37,25 @@ def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
 
 
 def in_force(rest: Rest) -> int:
-    """Return the revision of the policy."""
     return int(rest.get("/v1/policy").json["revision"])
 
 
 def tag(revision: int) -> str:
-    """Return the ETag for If-Match."""
     return f'"{revision}"'
 
 
 def register(uri: str, topic: str) -> Any:
-    """Register a publisher at RVMaster, and return the answer."""
     with xmlrpc.client.ServerProxy(uri) as master:
         return master.registerPublisher("/tester", topic, "std_msgs/String", API)
 
 
 def loaded_last_by(appliance: Appliance) -> list[str]:
-    """Return the user who loaded the latest policy in the log."""
     newest = appliance.audit("--event", "policy loaded", "--limit", "1")
     return [record["detail"]["who"] for record in newest]
 
 
 @pytest.mark.real
 def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
-    """The policy denies from the answer on; its revision has the author; a restart keeps it."""
     rest = appliance.rest()
     first = in_force(rest)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
@@ -86,7 +80,6 @@ def test_a_valid_policy_is_in_force_at_once_and_survives(appliance: Appliance) -
 
 @pytest.mark.real
 def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> None:
-    """A search right after a change finds its record."""
     newest = ("--event", "policy loaded", "--limit", "1")
     for _ in range(20):
         loaded = json.loads(appliance.rosrv("policy", "reload", "--json").stdout)
@@ -95,7 +88,6 @@ def test_a_change_is_recorded_before_it_is_answered(appliance: Appliance) -> Non
 
 @pytest.mark.real
 def test_reload_replaces_the_policy_by_the_file(appliance: Appliance) -> None:
-    """The file replaces the policy loaded over REST, as the answer reports; the file's revision is in force again."""
     rest = appliance.rest()
     first = in_force(rest)
     rest.post("/v1/policy", WITHOUT_PUBLISHERS, match=tag(first))
@@ -119,14 +111,12 @@ def reported(rest: Rest) -> dict[str, Any] | None:
 
 
 def measured(rest: Rest) -> str | None:
-    """Return the metrics after they include the delay of a message on /chatter."""
     metrics = rest.get("/metrics").body.decode()
     counted = re.search(r'rosrv_relay_delay_seconds_count\{resource="/chatter"\} [1-9]', metrics)
     return metrics if counted else None
 
 
 def test_the_graph_shows_nodes_topics_and_connections(appliance: Appliance, tmp_path: Path) -> None:
-    """With two real nodes the graph has both, the mediated topic, the connection and the rate."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rest = appliance.rest()
     with RosSession(appliance.master_uri, tmp_path) as ros:

@@ -38,24 +38,20 @@ def seconds_of_a_call(appliance: Appliance) -> float:
 
 
 def process_row(appliance: Appliance, role: str) -> dict[str, Any]:
-    """Return the row of a process in `rosrv status`."""
     rows: list[dict[str, Any]] = appliance.status()["processes"]
     return next(one for one in rows if one["role"] == role)
 
 
 def unchanged(appliance: Appliance, row: dict[str, Any]) -> bool:
-    """Whether the process of this row still runs, and was not replaced."""
     now = process_row(appliance, row["role"])
     return (now["pid"], now["restarts"]) == (row["pid"], row["restarts"])
 
 
 def until_another(appliance: Appliance, role: str, pid: int) -> None:
-    """Wait until another process of the role runs."""
     eventually(lambda: appliance.pids(role) not in ([], [pid]), appliance.story)
 
 
 def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
-    """RVMaster answers all the time and is not restarted. The port stays open, so a request waits for the next api."""
     rest = appliance.rest()
     assert rest.get("/v1/status").status == 200
     control, api = process_row(appliance, "control"), process_row(appliance, "api")
@@ -74,7 +70,6 @@ def test_a_killed_api_is_replaced(appliance: Appliance) -> None:
 
 
 def test_a_hanging_api_is_replaced(appliance: Appliance) -> None:
-    """An api that does not answer its supervisor is replaced, while RVMaster answers."""
     assert appliance.rest().get("/healthz").status == 200
     pid = appliance.pids("api")[0]
     os.kill(pid, signal.SIGSTOP)
@@ -84,7 +79,6 @@ def test_a_hanging_api_is_replaced(appliance: Appliance) -> None:
 
 
 def test_rest_outlives_control(appliance: Appliance) -> None:
-    """During a restart of control REST answers 503 with a problem; afterwards the same tokens work."""
     rest = appliance.rest()
     assert rest.get("/v1/status").status == 200
     api = appliance.pids("api")[0]
@@ -98,7 +92,6 @@ def test_rest_outlives_control(appliance: Appliance) -> None:
 
 
 def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
-    """During a flood of connections and requests on REST, RVMaster answers as before."""
     rest, control = appliance.rest(), process_row(appliance, "control")
     program = (
         "import socket, sys, time\n"
@@ -128,7 +121,6 @@ def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
 
 
 def answers(rest: Rest) -> bool:
-    """Whether REST accepts a connection and answers."""
     try:
         return rest.get("/healthz").status == 200
     except OSError:
@@ -136,7 +128,6 @@ def answers(rest: Rest) -> bool:
 
 
 def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
-    """As root: the api's user may read the log, but may not write it, nor read tokens, keys or the state."""
     need_root()
     assert appliance.rest().get("/v1/audit").status == 200
     lines = Path(f"/proc/{appliance.pids('api')[0]}/status").read_text().splitlines()
@@ -164,7 +155,6 @@ def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
 
 
 def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:
-    """With a damaged certificate, the log names the problem and nodes are served; once it is fixed, REST returns."""
     with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
         appliance.rest()
         appliance.stop()

@@ -29,7 +29,6 @@ Done = subprocess.CompletedProcess[str]
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with TLS and a monitor, and cause a denial."""
     appliance = Appliance(policy=WITHOUT_PUBLISHERS)
     folder = appliance.directory / "monitors"
     folder.mkdir()
@@ -47,7 +46,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def run(appliance: Appliance, way: str, *arguments: str, env: dict[str, str] | None = None) -> Done:
-    """Run a verb over REST or over the state directory."""
     if way == "state":
         return rosrv(*arguments, "--state", str(appliance.state))
     certificate = appliance.state / "api" / "certificate.pem"
@@ -92,7 +90,6 @@ ELSEWHERE = {
 
 
 def test_every_verb_of_a_running_appliance_is_covered() -> None:
-    """Every verb with --state and --api is tested here, or listed as tested elsewhere."""
     options = {
         name: {one for parameter in verb.params for one in parameter.opts} for name, verb in commands()
     }
@@ -122,14 +119,12 @@ def comparable(done: Done) -> list[object]:
 
 @pytest.mark.parametrize("verb", LOOKING, ids=" ".join)
 def test_reading_verbs_print_the_same(appliance: Appliance, verb: tuple[str, ...]) -> None:
-    """Output, errors and exit status of reading verbs are equal."""
     over_socket, over_rest = (comparable(run(appliance, way, *verb)) for way in ("state", "api"))
     assert over_socket == over_rest
     assert over_socket[1] or over_socket[2] or "/nowhere" in verb
 
 
 def test_checkpoints_are_the_same(appliance: Appliance) -> None:
-    """Checkpoints written over REST extend the earlier file and are a prefix of the later one."""
     before, over_rest, after = (
         run(appliance, way, "audit", "checkpoints").stdout for way in ("state", "api", "state")
     )
@@ -138,7 +133,6 @@ def test_checkpoints_are_the_same(appliance: Appliance) -> None:
 
 
 def test_status_has_the_same_fields(appliance: Appliance) -> None:
-    """`status --json` has the same fields, and constant fields have the same values."""
     over_socket, over_rest = (
         json.loads(run(appliance, way, "status", "--json").stdout) for way in ("state", "api")
     )
@@ -148,10 +142,6 @@ def test_status_has_the_same_fields(appliance: Appliance) -> None:
 
 
 def test_the_log_is_proven_both_ways(appliance: Appliance, tmp_path: Path) -> None:
-    """`audit verify` reports a complete log.
-
-    A local key or copies can be compared only with the file, and the output says so.
-    """
     for way in ("state", "api"):
         done = run(appliance, way, "audit", "verify", "--json")
         assert (done.returncode, done.stderr) == (0, ""), done.stdout
@@ -170,7 +160,6 @@ def test_the_log_is_proven_both_ways(appliance: Appliance, tmp_path: Path) -> No
 def test_changing_verbs_print_the_same(
     appliance: Appliance, way: str, section: Section, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Policy and monitors: effects, refusals with their places, and exit statuses are the same."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("POLICY", str(appliance.policy_file))
     transcript = Transcript(FakeAppliance(), lambda *arguments, **_: run(appliance, way, *arguments))
@@ -178,7 +167,6 @@ def test_changing_verbs_print_the_same(
 
 
 def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_path: Path) -> None:
-    """`policy diff` and `policy learn` read the audit log (and the registrations) from either source."""
     open_policy = tmp_path / "open.ini"
     open_policy.write_text(OPEN_POLICY)
     for verb in (
@@ -192,7 +180,6 @@ def test_a_policy_is_compared_and_learnt_both_ways(appliance: Appliance, tmp_pat
 
 
 def test_tokens_are_revoked_over_rest_and_made_on_the_machine(appliance: Appliance) -> None:
-    """`token revoke` works both ways, at once; `token add` and `rotate` over REST say where to run them."""
     for verb in ("add", "rotate"):
         refused = run(appliance, "api", "token", verb, "bob")
         assert refused.returncode == 2

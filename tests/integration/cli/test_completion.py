@@ -17,7 +17,6 @@ WORDS = "words() {\n    event said() /chatter std_msgs/String '{}' { }\n}\n"
 
 @pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """Run an appliance with a monitor and two tokens."""
     with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
         folder = Path(name)
         folder.chmod(0o755)  # the appliance's users may read it
@@ -28,7 +27,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def completed(words: str, state: str, shell: str = "bash") -> list[str]:
-    """Return the shell's completions of the last of these words."""
     place = len(words.split(" ")) - 1
     environment = {
         **os.environ, "_ROSRV_COMPLETE": f"complete_{shell}", "ROSRV_STATE": state,

@@ -26,7 +26,6 @@ def appliance() -> Iterator[Appliance]:
 
 
 def selftest(appliance: Appliance, way: str = "state") -> tuple[int, Rows]:
-    """Return the exit status and the findings by check, over the state directory or over REST."""
     env = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
     command = [ROSRV, "selftest", "--json", "--state", str(appliance.state)]
     if way == "api":
@@ -39,12 +38,10 @@ def selftest(appliance: Appliance, way: str = "state") -> tuple[int, Rows]:
 
 
 def failures(found: Rows) -> list[dict[str, str]]:
-    """Return the failed checks."""
     return [row for row in found.values() if row["outcome"] == "fail"]
 
 
 def test_a_message_really_goes_through(appliance: Appliance) -> None:
-    """Over REST and locally, a call is answered and recorded, a message passes the relay, and nothing remains."""
     for way in ("state", "api"):
         status, found = selftest(appliance, way)
         assert status == 0, failures(found)
@@ -60,7 +57,6 @@ def test_a_message_really_goes_through(appliance: Appliance) -> None:
 
 
 def test_a_strict_policy_is_not_a_failure(appliance: Appliance) -> None:
-    """A denial with its record shows that RVMaster works; the relay check is skipped, with the policy that it needs."""
     appliance.reload(STRICT)
     status, found = selftest(appliance)
     assert status == 0, failures(found)
@@ -71,7 +67,6 @@ def test_a_strict_policy_is_not_a_failure(appliance: Appliance) -> None:
 
 
 def test_a_hanging_relay_is_found(appliance: Appliance) -> None:
-    """Before the supervisor notices a hanging relay, the missing message is a failure."""
     pids = appliance.pids("relay")
     supervisor = appliance.pids("supervisor")[0]
     for pid in (supervisor, *pids):
@@ -87,7 +82,6 @@ def test_a_hanging_relay_is_found(appliance: Appliance) -> None:
 
 
 def test_a_missing_appliance_is_a_failure(appliance: Appliance) -> None:
-    """If a named appliance does not run, the machine is still checked, and the missing appliance is a failure."""
     appliance.stop()
     status, found = selftest(appliance)
     assert status == 1

@@ -18,8 +18,6 @@ from tests.support.answers import example
 
 @pytest.fixture(scope="module")
 def app() -> FastAPI:
-    """Return the REST application of an idle appliance."""
-
     async def nothing() -> Measures:
         return example(Measures)
 

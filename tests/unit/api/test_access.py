@@ -16,12 +16,10 @@ from tests.support.virtual_clock import VirtualClock
 
 
 def kept(row: TokenRow) -> TokenKept:
-    """Return a token's record as control sends it."""
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
 
 
 def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.1") -> Any:
-    """Return the bearer of a token, or the HTTP status of the refusal."""
     try:
         return run(door.recognise(header, host))
     except ProblemError as problem:
@@ -29,7 +27,6 @@ def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.
 
 
 def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
-    """Name, role and expiry come back; the case of the scheme is ignored."""
     row, text = make_token("alice", "operator", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])
@@ -43,7 +40,6 @@ def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
 
 
 def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> None:
-    """A client tries again, instead of ending its session; a request without a token is rejected at once."""
     row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     assert recognise(door, f"Bearer {text}") == 503
@@ -55,7 +51,6 @@ def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> No
 
 
 def test_a_step_back_of_the_clock_revives_no_token() -> None:
-    """A token that has ended stays ended, and one that was known lasts no longer."""
     with using(machine := VirtualClock()):
         row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
         door = TokenAuthenticator(10, lambda _token: None)
@@ -78,7 +73,6 @@ def test_an_expired_token_is_refused() -> None:
 
 
 def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second request with the same token skips scrypt."""
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     checks: list[str] = []
 
@@ -96,7 +90,6 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
 
 def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After too many wrong secrets from one host, no more hashes are computed for it. Other hosts are unaffected."""
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     checks: list[str] = []
 
@@ -116,7 +109,6 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
-    """A host that tries random tokens is slowed down; a valid token from the same address still works."""
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(5, lambda _token: None)
     door.state([kept(row)])
@@ -126,7 +118,6 @@ def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
 
 
 def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wrong, unknown and expired tokens are not reported; a new list of tokens is followed by a new report."""
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=600)
     ended, late = make_token("b", "viewer", now=clock.wall() - 100, seconds=50)
     used: list[str] = []
@@ -152,7 +143,6 @@ def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.Mo
 
 
 def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
-    """A rotation brings the end of a token forward; a bearer that was recognised before does not outlive it."""
     row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row)])

@@ -15,7 +15,6 @@ __all__ = ["key", "make_log", "notary", "path"]
 
 
 def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> None:
-    """Neither the records nor the cursor reveal whether a withheld message contains a text."""
     log = make_log()
     said = {"monitor": "m", "before_fields": {"data": "password"}}
     for number in range(40):
@@ -43,7 +42,6 @@ def test_a_viewers_page_reveals_nothing_that_is_withheld(make_log: MakeLog) -> N
 
 
 def test_equality_is_of_the_parts_that_the_client_may_read(make_log: MakeLog) -> None:
-    """It comes only on request, one for each record, and reveals nothing about withheld contents."""
     log = make_log()
     for text in ("the password is 1", "the password is 2"):
         detail = {"monitor": "m", "before_fields": {"data": text}, "why": text}
@@ -82,7 +80,6 @@ def test_a_search_for_messages_says_that_they_are_never_recorded(make_log: MakeL
 
 
 def test_a_viewer_learns_nothing_of_monitor_names_inside_messages(make_log: MakeLog) -> None:
-    """A search for a name that occurs only in a message gets the same answer as an unknown monitor's name."""
     log = make_log()
     for number in range(600):
         detail = {"monitor": "m" if number % 300 else "gun", "before_fields": {"data": "gun password"}}

@@ -16,7 +16,6 @@ pytestmark = pytest.mark.nightly  # FastAPI computes the filter in a thread
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RestWorld]:
-    """Yield the api of an appliance with seven denials of topics /page/0 to /page/6 in its log."""
     state = tmp_path_factory.mktemp("state")
     (state / "control").mkdir()
     with using(VirtualClock(wall=1_700_000_000.0)):

@@ -35,13 +35,11 @@ class _Log:
 
 
 def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
-    """Return the route's function."""
     [one] = audit_summary.routes(cast(Services, _Log(log))).routes
     return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
 
 
 def asked(log: Path, since: str | None = None) -> DenialSummary | int:
-    """Return the summary, or the status of the problem."""
     try:
         body = asyncio.run(route(log)(_VIEWER, since, None, 20)).body
         return msgspec.json.decode(bytes(body), type=DenialSummary)
@@ -50,7 +48,6 @@ def asked(log: Path, since: str | None = None) -> DenialSummary | int:
 
 
 def test_the_summary_is_made_from_the_log(make_log: MakeLog) -> None:
-    """A time that makes no sense, and a missing log, are problems."""
     log = make_log()
     log.record(decision(log, decision="deny", host="10.0.0.9"))
     settle(log)
@@ -62,7 +59,6 @@ def test_the_summary_is_made_from_the_log(make_log: MakeLog) -> None:
 
 
 def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each may read a million records; the others wait for it."""
     running, most, lock = 0, 0, threading.Lock()
     second = threading.Event()
 

@@ -42,21 +42,18 @@ def shake_hands(context: ssl.SSLContext, certificate: Path, name: str) -> str | 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["10.1.2.3", "127.0.0.1", "::1", "localhost", "robot.example"])
 def test_it_is_trusted_for_its_names(tmp_path: Path, name: str) -> None:
-    """A client that has the certificate connects by each of its names, with TLS 1.2 or newer."""
     context = tls_context(tmp_path, ["10.1.2.3", "robot.example"], NOW)
     assert shake_hands(context, tmp_path / CERTIFICATE, name) in ("TLSv1.2", "TLSv1.3")
 
 
 @pytest.mark.nightly
 def test_it_is_not_for_other_names(tmp_path: Path) -> None:
-    """A client rejects the certificate for any other address."""
     said = shake_hands(tls_context(tmp_path, [], NOW), tmp_path / CERTIFICATE, "10.9.9.9")
     assert said is not None
     assert "mismatch" in said
 
 
 def test_it_is_reused_and_only_its_owner_reads_the_key(tmp_path: Path) -> None:
-    """The next start uses the same certificate; only the owner may read the key."""
     tls_context(tmp_path, ["10.1.2.3"], NOW)
     first = (tmp_path / CERTIFICATE).read_bytes()
     tls_context(tmp_path, ["10.1.2.3"], NOW + datetime.timedelta(days=100))
@@ -65,7 +62,6 @@ def test_it_is_reused_and_only_its_owner_reads_the_key(tmp_path: Path) -> None:
 
 
 def test_a_recreated_container_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The id of a container is not in it, and another name of the machine does not replace it."""
     made = []
     for name in ("0a1b2c3d4e5f", "f5e4d3c2b1a0", "rosrv", "robot-7"):
         monkeypatch.setattr(socket, "gethostname", lambda name=name: name)
@@ -92,7 +88,6 @@ def test_it_is_renewed_for_a_new_name_or_before_it_expires(
 @pytest.mark.nightly
 @pytest.mark.parametrize("wrong", [datetime.timedelta(days=-20_000), datetime.timedelta(days=3650)])
 def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta) -> None:
-    """A certificate made in 1970 or dated ten years ahead is replaced once the clock is correct; the key stays."""
     context = tls_context(tmp_path, ["10.1.2.3"], NOW + wrong)
     pin = pin_of(tmp_path)
     assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") not in ("TLSv1.2", "TLSv1.3")
@@ -108,7 +103,6 @@ def test_it_follows_a_corrected_clock(tmp_path: Path, wrong: datetime.timedelta)
 
 @pytest.mark.nightly
 def test_a_pin_is_the_hash_of_the_key(tmp_path: Path) -> None:
-    """The pin has curl's format and equals openssl's output for the certificate; another key has another pin."""
     tls_context(tmp_path, [], NOW)
     pipe = "openssl x509 -pubkey -noout | openssl pkey -pubin -outform der"
     pipe += " | openssl dgst -sha256 -binary | openssl base64"

@@ -41,7 +41,6 @@ class Client:
         self._app = app
 
     def get(self, path: str, headers: dict[str, str] | None = None) -> httpx.Response:
-        """Send one GET request."""
         return requested(self._app, "GET", path, headers=headers)
 
 
@@ -51,7 +50,6 @@ def client() -> Client:
 
 
 def test_the_page_is_served_at_every_view(client: Client) -> None:
-    """`/`, `/console` and each view, also with deeper addresses, serve the page; an unknown view is 404."""
     paths = ["/", "/console", "/console/", *(f"/console/{view}" for view in VIEWS), "/console/audit/813"]
     [page] = {client.get(path).text for path in paths}
     assert '<meta name="rosrv:lock-seconds" content="900">' in page
@@ -59,7 +57,6 @@ def test_the_page_is_served_at_every_view(client: Client) -> None:
 
 
 def test_the_page_shows_the_configured_notice() -> None:
-    """The notice is escaped; a changed notice changes the ETag."""
     told = Client(Settings(api_notice='<b>"Staff" only</b>\n&', api_lock_seconds=60)).get("/console")
     assert 'name="rosrv:lock-seconds" content="60"' in told.text
     assert 'name="rosrv:notice" content="&lt;b&gt;&quot;Staff&quot; only&lt;/b&gt;\n&amp;"' in told.text
@@ -91,7 +88,6 @@ def test_the_headers_close_the_page(client: Client) -> None:
 
 
 def test_a_cached_file_is_not_sent_again(client: Client) -> None:
-    """A file has an ETag of its content; the browser revalidates it and gets 304 without a body."""
     first = client.get("/console/static/js/main.js")
     assert first.headers["content-type"].startswith("text/javascript")
     assert first.headers["cache-control"] == "no-cache"
@@ -101,7 +97,6 @@ def test_a_cached_file_is_not_sent_again(client: Client) -> None:
 
 
 def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client) -> None:
-    """The page's files, and those that they name, have addresses by content: kept without asking, sent as gzip."""
     seen = {"/console"}
     todo = ["/console"]
     while todo:
@@ -137,18 +132,15 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
     ],
 )
 def test_only_the_consoles_files_are_served(client: Client, path: str) -> None:
-    """Only exact names of the console's files are served."""
     assert client.get(f"/console/static/{path}").status_code == 404
 
 
 @pytest.mark.parametrize("path", ["/consolex", "/v1/console", "/console.py", "//console/now"])
 def test_only_the_console_needs_no_token(path: str) -> None:
-    """Every address served without a token is below the console's own."""
     assert not is_console(path)
 
 
 def test_the_manifest_lists_all_vendored_files() -> None:
-    """Every third-party file is listed with its hash, packages, versions and licences."""
     manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
     assert set(manifest) == {path.name for path in VENDOR.iterdir()} - {"manifest.json"}
     licences = (VENDOR / "LICENCES.txt").read_text()
@@ -160,7 +152,6 @@ def test_the_manifest_lists_all_vendored_files() -> None:
 
 
 def test_vendored_versions_match_the_lock_file() -> None:
-    """The vendored packages are those of `console/package-lock.json`; none was added manually."""
     lock = json.loads((FILES.parents[2] / "console" / "package-lock.json").read_text())["packages"]
     manifest = json.loads((VENDOR / "manifest.json").read_text())["files"]
     for entry in manifest.values():
@@ -179,7 +170,6 @@ def test_no_file_names_another_host(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(FILES)))
 def test_sources_import_served_files_and_make_no_markup(path: Path) -> None:
-    """Every import is a served file; no source writes markup from text, evaluates text, or sets a cookie."""
     text = path.read_text()
     for relative, dynamic in IMPORT.findall(text):
         name = relative or dynamic
@@ -199,7 +189,6 @@ def test_sources_import_served_files_and_make_no_markup(path: Path) -> None:
 
 
 def test_the_page_has_nothing_inline() -> None:
-    """The page has no inline script, style or handler, and every file it names exists."""
     page = (FILES / "index.html").read_text()
     assert re.findall(r"<script(?![^>]*\bsrc=)|<style|\son\w+=|\sstyle=", page) == []
     for name in re.findall(r'(?:src|href)="/console/static/([^"]+)"', page):
@@ -208,7 +197,6 @@ def test_the_page_has_nothing_inline() -> None:
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_text_has_enough_contrast(theme: str) -> None:
-    """Every text colour has a contrast of at least 4.5:1 on every surface, in both themes."""
     css = (FILES / "css" / "tokens.css").read_text()
     blocks = css.split(':root[data-theme="dark"]')
     tokens = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", blocks[0]))
@@ -253,13 +241,11 @@ def _luminance(colour: str) -> float:
 
 
 def test_the_editor_completes_every_section() -> None:
-    """The editor of the policy proposes the sections that a policy can have, and no other."""
     text = (FILES / "js" / "policy" / "complete.js").read_text()
     table = text.partition("SECTIONS = ")[2].partition("});")[0]
     assert set(re.findall(r"^  (\w+): {", table, re.MULTILINE)) == {*sections.NAMES}
 
 
 def test_the_console_explains_every_category_of_decision() -> None:
-    """Every category can be explained, and its records have the button for the explanation."""
     text = (FILES / "js" / "categories.js").read_text()
     assert set(re.findall(r'\["(\w+)", "', text)) == {*Category}

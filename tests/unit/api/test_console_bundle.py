@@ -11,7 +11,6 @@ FILES = Path(appliance.api.__file__).parent / "console"
 
 
 def test_every_module_of_the_console_is_included_once() -> None:
-    """The script contains every module once, and no comment and no import of a module is left."""
     sources = {str(path.relative_to(FILES)): path.read_text() for path in FILES.rglob("*.js")}
     joined = join_modules(sources, "js/main.js")
     modules = [name for name in sources if name.startswith("js/") and name != "js/early.js"]
@@ -24,7 +23,6 @@ def test_every_module_of_the_console_is_included_once() -> None:
 
 
 def test_only_comments_and_indentation_are_removed() -> None:
-    """Strings, templates and regular expressions keep what looks like a comment, a bracket or indentation."""
     kept = "[\"// {\",'/* ( */',/[/`]\\/\\/{/g,`//\n   ${`}${1 / 2} /* b */`} `]"
     text = f"const a = {kept};  // c\n  let b  /* d */ = 1\n  /* e\n */ a / a / 2 + +b;\n\n"
     assert join_modules({"a.js": text}, "a.js") == (
@@ -40,13 +38,11 @@ def test_only_comments_and_indentation_are_removed() -> None:
     ],
 )  # fmt: skip
 def test_a_slash_is_read_as_its_place_demands(kept: str) -> None:
-    """Regular expressions keep spaces and quotes, divisions and imports of separate files are left alone."""
     assert join_modules({"a.js": kept}, "a.js") == f"const $m0=(()=>{{{kept}\nreturn {{}};}})();\n"
 
 
 @pytest.mark.parametrize("end", ["\n", "\r", "\u2028", "\u2029"])
 def test_a_comment_ends_with_its_line(end: str) -> None:
-    """Code after each line break of JavaScript is kept."""
     assert "{a\nb;" in join_modules({"a.js": f"a // c{end}b;"}, "a.js")
 
 
@@ -85,14 +81,12 @@ def test_a_comment_ends_with_its_line(end: str) -> None:
     ],
 )
 def test_unsupported_modules_are_an_error(sources: dict[str, str], error: str) -> None:
-    """Unsupported syntax, missing files and names, and cycles raise an error with the file and line."""
     with pytest.raises(ModuleError) as raised:
         join_modules(sources, "a.js")
     assert str(raised.value).startswith(error)
 
 
 def test_styles_are_joined_in_the_order_of_their_imports() -> None:
-    """An import is replaced by the file; a missing file and an import of another form are errors."""
     sources = {"c/a.css": '/* a */\n@import "./b.css";\na {\n  top: 0;\n}\n', "c/b.css": "b { top: 1px; }\n"}
     assert join_styles(sources, "c/a.css") == "b { top: 1px; }\na {\ntop: 0;\n}\n"
     with pytest.raises(ModuleError, match=r"there is no file c/b\.css"):

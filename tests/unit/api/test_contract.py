@@ -29,24 +29,20 @@ _IN_WORDS = (
 
 @pytest.fixture(scope="module")
 def contract(app: FastAPI) -> dict[str, Any]:
-    """Return the document."""
     return app.openapi()
 
 
 def _kinds(schema: dict[str, Any]) -> set[str]:
-    """Return the types that a property can have."""
     kind = schema.get("type", [])
     kinds = {kind} if isinstance(kind, str) else set(kind)
     return kinds.union(*map(_kinds, schema.get("anyOf", ())))
 
 
 def _words(schema: dict[str, Any]) -> str:
-    """Return all descriptions of a property."""
     return " ".join([schema.get("description", ""), *map(_words, schema.get("anyOf", ()))])
 
 
 def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, Any]) -> None:
-    """A wrong method gets 405 with the valid methods, for every path of the contract."""
     paths = [*(path for path in contract["paths"] if "{" not in path), "/v1/tokens/{name}"]
     answers = [requested(app, "TRACE", path.format(name="mallory")) for path in paths]
     told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
@@ -70,7 +66,6 @@ def test_times_have_units(contract: dict[str, Any]) -> None:
 
 
 def test_every_field_is_described(contract: dict[str, Any]) -> None:
-    """Each field or its type has a description; no description is unused."""
     fields = {
         (kind, name): field
         for kind, schema in contract["components"]["schemas"].items()
@@ -105,7 +100,6 @@ def test_every_operation_has_a_summary_its_token_and_problems(contract: dict[str
 
 
 def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:
-    """Each GET that answers with JSON has an ETag; if its ETag guards changes, the answer is always sent whole."""
     for path, operations in contract["paths"].items():
         if "get" not in operations:
             continue
@@ -120,8 +114,6 @@ def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:
 
 
 def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) -> list[str]:
-    """Return the parts of an operation without an example: path, body and text answer."""
-
     def without(content: dict[str, Any]) -> list[str]:
         return [
             media
@@ -144,7 +136,6 @@ def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) 
 
 
 def test_every_operation_has_examples(contract: dict[str, Any]) -> None:
-    """Path, body and answer have examples; no example is unused."""
     kinds = contract["components"]["schemas"]
     operations = {
         f"{method} {path}": one for path, row in contract["paths"].items() for method, one in row.items()
@@ -155,7 +146,6 @@ def test_every_operation_has_examples(contract: dict[str, Any]) -> None:
 
 
 def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
-    """Each example is valid and has every field, except fields omitted at their default."""
     kinds = contract["components"]["schemas"]
     told = [
         ({"$ref": f"#/components/schemas/{kind}"}, one)
@@ -177,7 +167,6 @@ def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
 
 
 def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> None:
-    """A field that the console reads from a row of an answer exists: no view waits for one that was removed."""
     schemas = contract["components"]["schemas"].values()
     fields = {name for schema in schemas for name in schema.get("properties", {})}
     texts = [path.read_text() for path in CONSOLE.rglob("*.js")]
@@ -194,5 +183,4 @@ def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> N
 
 
 def _unread(text: str) -> str:
-    """Return a text without the members that it reads."""
     return re.sub(r"\??\.[a-z]\w*", "", text)

@@ -41,19 +41,16 @@ class Control:
         self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
-        """Wait until this number of messages was received, and return all of them."""
         return await self._ear.until(count)
 
 
 @pytest.fixture
 def tokens() -> list[TokenKept]:
-    """Return the tokens that the api received."""
     return []
 
 
 @pytest.fixture
 def link(tokens: list[TokenKept]) -> ControlLink:
-    """Return the api's end."""
     return ControlLink(tokens.extend, lambda: None)
 
 
@@ -68,22 +65,18 @@ def control(link: ControlLink) -> Iterator[Callable[[], Control]]:
 
 @pytest.fixture
 async def there(control: Callable[[], Control]) -> Control:
-    """Return the first control."""
     return control()
 
 
 def bearer(shown: str) -> Bearer:
-    """Return a bearer with this token."""
     return Bearer("0", "alice", "admin", 1e12, shown)
 
 
 def call(number: int) -> RestCalled:
-    """Return a call to record."""
     return RestCalled("h", "w", "GET", f"/{number}", 200, "", 1)
 
 
 async def test_each_question_gets_its_own_answer(link: ControlLink, there: Control) -> None:
-    """Answers in another order are paired by number."""
     asked = [asyncio.create_task(link.ask(StatusWanted(), bearer(f"who{one}"))) for one in range(3)]
     for made in reversed(await there.until(3)):
         there.channel.send(
@@ -95,7 +88,6 @@ async def test_each_question_gets_its_own_answer(link: ControlLink, there: Contr
 async def test_a_question_ends_with_the_link_or_the_timeout(
     link: ControlLink, control: Callable[[], Control]
 ) -> None:
-    """Without a control, or with a control that dies, is replaced or stays silent, the question ends with an error."""
     with pytest.raises(ControlAwayError, match="restarted"):
         await link.ask(StatusWanted(), bearer("w"))
     there = control()
@@ -117,7 +109,6 @@ async def test_a_question_ends_with_the_link_or_the_timeout(
 async def test_an_order_without_an_answer_says_how_to_find_out(
     monkeypatch: pytest.MonkeyPatch, link: ControlLink, there: Control
 ) -> None:
-    """A silent or dying control may have carried out an order: the answer says so and names the command that checks."""
     monkeypatch.setattr(module, "_GRACE_SECONDS", 0.0)
     with pytest.raises(ControlAwayError, match=r"may have taken effect; .* audit search --since 5m"):
         await link.ask(PolicyConfirm(), bearer("w"), seconds=0.01)
@@ -129,7 +120,6 @@ async def test_an_order_without_an_answer_says_how_to_find_out(
 
 
 async def test_an_order_is_withdrawn_when_its_client_disconnects(link: ControlLink, there: Control) -> None:
-    """Control is notified at once that a client disconnected, and knows the deadline of its order."""
     gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
     began = clock.now()
     asking = asyncio.create_task(link.ask(PolicyConfirm(), replace(bearer("w"), gone=gone), seconds=7.0))
@@ -144,7 +134,6 @@ async def test_an_order_is_withdrawn_when_its_client_disconnects(link: ControlLi
 
 
 async def test_open_questions_are_bounded(link: ControlLink, there: Control) -> None:
-    """A flood of questions to a silent control stays within the limit."""
     asked = [asyncio.create_task(link.ask(StatusWanted(), bearer("w"), seconds=1)) for _ in range(200)]
     answers = await asyncio.gather(*asked, return_exceptions=True)
     assert all(isinstance(one, ControlAwayError) for one in answers)
@@ -154,7 +143,6 @@ async def test_open_questions_are_bounded(link: ControlLink, there: Control) -> 
 async def test_calls_without_a_control_are_recorded_by_the_next(
     link: ControlLink, control: Callable[[], Control], tokens: list[TokenKept]
 ) -> None:
-    """Calls answered while control was down are recorded in order later; beyond the limit the oldest are dropped."""
     for number in range(1100):
         link.tell(call(number))
     there = control()
@@ -170,7 +158,6 @@ async def test_calls_without_a_control_are_recorded_by_the_next(
 async def test_a_call_that_cannot_be_encoded_does_not_block_others(
     link: ControlLink, control: Callable[[], Control], tokens: list[TokenKept]
 ) -> None:
-    """Such a call is left out; token updates and later calls are delivered."""
     link.tell(call(1))
     link.tell(RestCalled("h", "w", "GET", "/\ud800", 200, "", 1))
     link.tell(call(2))
@@ -184,7 +171,6 @@ async def test_a_call_that_cannot_be_encoded_does_not_block_others(
 
 
 async def test_a_use_of_a_token_reaches_control(link: ControlLink, control: Callable[[], Control]) -> None:
-    """Without control, the use is not reported, and the request goes on."""
     link.token_used("0123456789ab")
     there = control()
     link.token_used("ba9876543210")

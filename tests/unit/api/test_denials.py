@@ -26,7 +26,6 @@ CLOSED = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\n/x = 10.0.0.1\n[Parameters]
 
 
 def known(text: str = CLOSED) -> PolicyKnown:
-    """Return the policy in force."""
     unknown = dict.fromkeys(get_type_hints(PolicyKnown))
     given = {
         "text": text,
@@ -41,13 +40,11 @@ def known(text: str = CLOSED) -> PolicyKnown:
 
 
 def denied(event: str, reason: str = "because", **fields: object) -> AuditRecord:
-    """Return a denial for a host that asked for the topic /x."""
     about = {"host": HOST, "caller_id": "/it", "category": "publish", "resource": "/x", "decision": "deny"}
     return AuditRecord(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
 
 
 def why(record: AuditRecord, text: str = CLOSED) -> Why:
-    """Return the reason as the command line and REST print it."""
     return explained(record, known(text) if asks_policy(record) else None)
 
 
@@ -58,7 +55,6 @@ def allowing(found: Why) -> list[str]:
 
 
 def test_every_event_of_a_denial_has_its_row() -> None:
-    """The table covers events recorded with a denial, and events that refuse without a denial."""
     refusing = {use.event for use in uses() if use.denies} | {*get_args(Violation)} - {""}
     refusing |= {"decision", "denials folded"}  # their decision is computed
     refusing |= {"specifications refused", "policy refused", "rate limited", "message dropped"}
@@ -68,7 +64,6 @@ def test_every_event_of_a_denial_has_its_row() -> None:
 
 @pytest.mark.parametrize("event", EVENTS)
 def test_every_denial_names_the_change_that_allows_it(event: str) -> None:
-    """A denial names the change or says that no change helps; other records say neither."""
     found = why(denied(event))
     assert (bool(allowing(found)) != bool(found.refusal)) is (event in DENIALS)
     assert not is_denial(denied(event, decision="allow"))
@@ -87,7 +82,6 @@ def test_every_denial_names_the_change_that_allows_it(event: str) -> None:
 )
 @pytest.mark.parametrize("namespace", [False, True])
 def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, namespace: bool) -> None:
-    """Covers everything that a call grants: registrations, connections, parameters that contain others."""
     live = LiveRight(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     made = revocation(decision, HOST, "/it", category, "/x", call=call)
@@ -108,7 +102,6 @@ def test_the_change_lets_a_revoked_grant_be_kept(call: str, category: str, *, na
 
 
 def test_denials_without_a_policy_are_not_blamed_on_it() -> None:
-    """Covers an expelled host and the appliance's own calls."""
     live = LiveRight(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
     decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
     assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
@@ -169,7 +162,6 @@ def test_repetitions_and_limits() -> None:
 @pytest.mark.parametrize("lifted", [False, True])
 @pytest.mark.parametrize("event", ["decision", "revoked", "denials folded"])
 def test_a_block_is_lifted_and_no_policy_is_changed(event: str, *, lifted: bool) -> None:
-    """The denial of a blocked host names the command that lifts the block, also after the block was lifted."""
     host = ipaddress.ip_address(HOST)
     blocks = {host: "blocked by ann until noon: odd; lift it with `rosrv host unblock 10.0.0.9`"}
     live = LiveRight(host, "/it", "registerPublisher", "/x")
@@ -186,7 +178,6 @@ def test_a_block_is_lifted_and_no_policy_is_changed(event: str, *, lifted: bool)
 
 
 def test_a_name_like_a_block_is_not_a_block() -> None:
-    """Only a denial without a rule, for the record's own host, is a block."""
     for reason, rule in (
         ("10.0.0.1 is blocked by ann", None),
         (f"{HOST} is blocked by ann", RuleReference("Publishers", "/x", "p.ini", 4)),

@@ -7,7 +7,6 @@ from appliance.api.problems import ProblemError
 
 
 def test_hosts_that_send_wrong_tokens_have_to_wait() -> None:
-    """One host waits after its limit. Beyond the common limit, every host that sent a wrong token waits."""
     patience = _Patience(per_minute=10)
     for _ in range(10):
         patience.require("10.0.0.1")
@@ -22,7 +21,6 @@ def test_hosts_that_send_wrong_tokens_have_to_wait() -> None:
 
 
 def test_wrong_tokens_from_many_addresses_lock_nothing_out() -> None:
-    """However many wrong tokens others sent, a host that sent none is served."""
     patience = _Patience(per_minute=10)
     for number in range(1000):
         patience.failed(f"10.0.{number // 250}.{number % 250}")

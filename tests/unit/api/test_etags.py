@@ -13,7 +13,6 @@ from tests.support.asgi import requested
 
 
 def _app() -> ConditionalGet:
-    """Routes with JSON that the test changes, and routes without an ETag of the body."""
     count = 0
 
     async def counted(request: object) -> Response:
@@ -46,19 +45,16 @@ def _app() -> ConditionalGet:
 
 
 def asked(app: ConditionalGet, path: str, method: str = "GET", **headers: str) -> httpx.Response:
-    """Return the answer to a request."""
     given = {name.replace("_", "-"): value for name, value in headers.items()}
     return requested(app, method, path, headers=given)
 
 
 @pytest.fixture
 def app() -> ConditionalGet:
-    """Return the application."""
     return _app()
 
 
 def test_an_unchanged_body_is_not_sent_again(app: ConditionalGet) -> None:
-    """The same body has the same ETag; a client that sends it, alone or in a list, gets 304 without a body."""
     first = asked(app, "/counted")
     tag = first.headers["etag"]
     assert (first.status_code, first.json()) == (200, {"count": 0})
@@ -72,7 +68,6 @@ def test_an_unchanged_body_is_not_sent_again(app: ConditionalGet) -> None:
 
 
 def test_a_changed_body_is_sent(app: ConditionalGet) -> None:
-    """Any other ETag gets the body."""
     tag = asked(app, "/counted").headers["etag"]
     assert "etag" not in asked(app, "/counted", "POST").headers
     again = asked(app, "/counted", if_none_match=tag)
@@ -87,7 +82,6 @@ def test_a_changed_body_is_sent(app: ConditionalGet) -> None:
 def test_these_answers_get_no_etag_of_the_body(
     app: ConditionalGet, path: str, status: int, tag: str | None
 ) -> None:
-    """A revision keeps its own ETag. Errors, text and streams get no ETag, and streams are not buffered."""
     answer = asked(app, path, if_none_match=f"{tag or '*'}")
     assert (answer.status_code, answer.headers.get("etag")) == (status, tag)
     assert answer.content

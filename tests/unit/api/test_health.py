@@ -43,7 +43,6 @@ class Probed:
         return example(Measures, status=status, nodes={"live": 0})
 
     async def ready(self) -> str:
-        """Return what the probe reports: `ready`, or the kind of the problem."""
         try:
             answer = await self._ready()
         except ProblemError as problem:
@@ -70,7 +69,6 @@ async def sampled(probed: Probed) -> AsyncIterator[None]:
     ],
 )  # fmt: skip
 async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] | None) -> None:
-    """Each reason answers 503; as soon as the reason is gone, the answer is 200."""
     unready = None if wrong is None else SERVING | wrong
     probed = Probed(unready, unready, SERVING)
     async with sampled(probed):
@@ -79,7 +77,6 @@ async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] 
 
 
 async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
-    """With `on_audit_failure: allow`, nodes are served without a working log."""
     probed = Probed(SERVING | {"audit": {"failed": "disk full", "on_failure": "allow"}})
     async with sampled(probed):
         assert await probed.ready() == "ready"
@@ -87,7 +84,6 @@ async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
 
 
 async def test_many_probes_ask_control_once() -> None:
-    """Many probes of an appliance that is not ready cause one query to control."""
     probed = Probed(SERVING | {"relay": "away"})
     async with sampled(probed):
         assert set(await asyncio.gather(*(probed.ready() for _ in range(200)))) == {"not-served"}

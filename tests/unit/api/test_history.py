@@ -17,7 +17,6 @@ pytestmark = pytest.mark.anyio
 
 
 def body(allowed: int = 0) -> Measures:
-    """Return the fields of control's measurements that are used."""
     return example(
         Measures,
         status={"version": "1"},
@@ -29,7 +28,6 @@ def body(allowed: int = 0) -> Measures:
 
 
 def test_a_sample_adds_up() -> None:
-    """A sample counts decisions and messages in total, and monitor actions by name; output is not counted."""
     sample = sample_of(body(11), 100.0)
     assert (sample.time, sample.allowed, sample.denied) == (100.0, 11, 5)
     assert (sample.messages, sample.bytes, sample.dropped, sample.nodes) == (12, 120, 1, 3)
@@ -38,7 +36,6 @@ def test_a_sample_adds_up() -> None:
 
 @contextlib.asynccontextmanager
 async def sampling(measures: Callable[[], Awaitable[Measures]]) -> AsyncIterator[SampleHistory]:
-    """Take samples during the block."""
     samples = SampleHistory(measures)
     task = asyncio.create_task(samples.run())
     yield samples
@@ -48,19 +45,16 @@ async def sampling(measures: Callable[[], Awaitable[Measures]]) -> AsyncIterator
 
 
 async def until(samples: SampleHistory, number: int) -> None:
-    """Follow until this sample."""
     with samples.following():
         while samples.seen.number < number:
             await samples.after(samples.seen.number)
 
 
 async def unchanging() -> Measures:
-    """Return the same measurements each time."""
     return body()
 
 
 async def test_followers_get_each_sample_and_an_hour_is_stored() -> None:
-    """Samples arrive in order; `samples` returns at most the limit, always with the newest."""
     count = 0
 
     async def measures() -> Measures:
@@ -92,7 +86,6 @@ async def test_samples_stay_in_order_when_the_clock_is_set_back() -> None:
 
 
 async def test_without_control_followers_get_the_reason() -> None:
-    """Without control there is no sample and no status, only the reason; later the samples continue."""
     answers: list[ControlAwayError | Measures] = [ControlAwayError("being restarted"), body(1)]
 
     async def measures() -> Measures:
@@ -112,7 +105,6 @@ async def test_without_control_followers_get_the_reason() -> None:
 
 
 async def test_a_new_follower_does_not_wait() -> None:
-    """A sleep that began without followers ends when one arrives."""
     async with sampling(unchanging) as samples:
         seen = await samples.after(0)
         with samples.following():

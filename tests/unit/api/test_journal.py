@@ -9,7 +9,6 @@ from appliance.channel.messages.api import RestCalled
 
 
 def answered(journal: Journal, **changes: Any) -> None:
-    """Report one answer to the journal."""
     fields: dict[str, Any] = {
         "host": "h",
         "who": "w",
@@ -23,7 +22,6 @@ def answered(journal: Journal, **changes: Any) -> None:
 
 
 def test_equal_reads_are_reported_once_and_counted() -> None:
-    """The first read is reported at once, later equal reads as a number; a flush starts over."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(4):
@@ -37,7 +35,6 @@ def test_equal_reads_are_reported_once_and_counted() -> None:
 
 
 def test_changes_are_never_folded() -> None:
-    """Calls with a valid token that change something are each reported; attempts without a valid token are folded."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     for _ in range(3):
@@ -49,7 +46,6 @@ def test_changes_are_never_folded() -> None:
 
 
 def test_a_flood_of_kinds_is_bounded() -> None:
-    """Beyond the limit of kinds, further calls are counted by status; the total is complete."""
     told: list[RestCalled] = []
     journal = Journal(told.append, kinds=10)
     for number in range(1000):
@@ -61,7 +57,6 @@ def test_a_flood_of_kinds_is_bounded() -> None:
 
 
 def test_unknown_methods_share_one_label() -> None:
-    """The metric has few labels whatever methods a client makes up."""
     journal = Journal(lambda call: None)
     for number in range(50):
         answered(journal, method=f"M{number}", status=405)
@@ -70,7 +65,6 @@ def test_unknown_methods_share_one_label() -> None:
 
 
 def test_invalid_text_is_escaped() -> None:
-    """Characters that no message can hold are reported by their code points."""
     told: list[RestCalled] = []
     journal = Journal(told.append)
     answered(journal, reason="names: \ud800 é", path="/\udcff", method="POST")

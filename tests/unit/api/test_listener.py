@@ -26,12 +26,10 @@ Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWrite
 
 @pytest.fixture
 def anyio_backend() -> tuple[str, dict[str, Any]]:
-    """Return the loop that the api runs on."""
     return "asyncio", {"use_uvloop": True}
 
 
 async def application(scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer with what was requested."""
     await PlainTextResponse(scope["path"])(scope, receive, send)
 
 
@@ -71,7 +69,6 @@ async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> 
 
 
 async def cut_off(reader: asyncio.StreamReader) -> bool:
-    """Whether the server closes without an answer."""
     try:
         return await reader.read(1) == b""
     except ConnectionError:
@@ -79,7 +76,6 @@ async def cut_off(reader: asyncio.StreamReader) -> bool:
 
 
 async def test_connections_of_one_host_are_limited() -> None:
-    """One connection more is closed at once; when a connection ends, the next is accepted."""
     async with listening(ApiLimits(connections_per_host=3)) as connect:
         first = [await connect() for _ in range(3)]
         assert all([await served(*one) for one in first])
@@ -90,14 +86,12 @@ async def test_connections_of_one_host_are_limited() -> None:
 
 
 async def test_connections_of_all_hosts_are_limited() -> None:
-    """The total limit applies even where each host is below its own."""
     async with listening(ApiLimits(connections=2, connections_per_host=50)) as connect:
         assert all([await served(*await connect()) for _ in range(2)])
         assert not await served(*await connect())
 
 
 async def test_unfinished_headers_are_cut_off() -> None:
-    """The first and later requests of a connection are cut off; new connections are still served."""
     async with listening(ApiLimits(header_seconds=2)) as connect:
         later = await connect()
         assert await served(*later)
@@ -112,7 +106,6 @@ async def test_unfinished_headers_are_cut_off() -> None:
 
 
 async def test_endless_headers_are_cut_off() -> None:
-    """Headers may have 64 KiB, however fast they arrive; the answer gives the reason."""
     async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         writer.write(REQUEST[:16])
@@ -135,7 +128,6 @@ async def test_endless_headers_are_cut_off() -> None:
 
 
 async def test_many_requests_on_one_connection_are_served() -> None:
-    """Limits apply per request: earlier requests never close a connection."""
     async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         for _ in range(200):
@@ -146,7 +138,6 @@ async def test_many_requests_on_one_connection_are_served() -> None:
 
 
 async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Return a connection whose first request was answered."""
     reader, writer = await connect()
     writer.write(request)
     await reader.readuntil(b"\r\n\r\n")
@@ -155,7 +146,6 @@ async def answered(connect: Connect, request: bytes) -> tuple[asyncio.StreamRead
 
 
 async def test_data_after_an_answer_keeps_no_connection_open() -> None:
-    """Neither an empty line nor a slow body keeps a connection open; a complete request is served."""
     async with listening(ApiLimits(header_seconds=1.0)) as connect:
         empty = await answered(connect, REQUEST)
         body = await answered(connect, REQUEST[:-2] + b"Content-Length: 1000000\r\n\r\n")
@@ -170,7 +160,6 @@ async def test_data_after_an_answer_keeps_no_connection_open() -> None:
 
 
 async def test_the_rest_of_a_body_does_not_close_the_connection() -> None:
-    """A body that continues after its answer is skipped, however long, and the next request is served."""
     async with listening(ApiLimits()) as connect:
         reader, writer = await answered(connect, REQUEST[:-2] + b"Content-Length: 300000\r\n\r\n")
         for _ in range(3):
@@ -180,7 +169,6 @@ async def test_the_rest_of_a_body_does_not_close_the_connection() -> None:
 
 
 async def test_pipelined_requests_are_limited() -> None:
-    """A few requests sent together are answered in order; thousands are refused."""
     async with listening(ApiLimits()) as connect:
         reader, writer = await connect()
         writer.write(REQUEST * 10)
@@ -195,7 +183,6 @@ async def test_pipelined_requests_are_limited() -> None:
 
 @pytest.mark.timeout(30)
 async def test_unknown_hosts_in_the_handshake_make_room(tmp_path: Path) -> None:
-    """Silent connections count once accepted; a known peer is served at once and keeps its connections."""
     context = tls_context(tmp_path, [], datetime.datetime.now(datetime.UTC))
     known = {"127.0.0.1"}
     listener = Listener(
@@ -223,8 +210,6 @@ async def test_unknown_hosts_in_the_handshake_make_room(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(30)
 async def test_a_failed_handshake_frees_its_slot(tmp_path: Path) -> None:
-    """Garbage, an early end, and a timeout each free the slot."""
-
     async def at_end(peer: socket.socket) -> bool:
         peer.setblocking(False)
         try:
@@ -250,7 +235,6 @@ async def test_a_failed_handshake_frees_its_slot(tmp_path: Path) -> None:
 
 
 async def test_a_known_peer_is_opened_before_waiting_unknown_hosts() -> None:
-    """After 50 unknown hosts a peer with a valid token connects: at most two of the 50 are opened before it."""
     opened: list[str] = []
 
     class Noting(Listener):

@@ -27,7 +27,6 @@ def body(
     processes: Sequence[dict[str, Any]] = ({"role": "control", "pid": 1, "restarts": 4},),
     forwarding: dict[str, Any] | None = FORWARDING,
 ) -> Measures:
-    """Return a small answer of control."""
     meter = Meter()
     meter.decided("publish", "deny", 0.0003, "10.0.0.1")
     meter.decided("publish", "deny", 99.0, "10.0.0.1")
@@ -65,12 +64,10 @@ def body(
 
 
 def host(name: str, state: str, **more: Any) -> dict[str, Any]:
-    """Return a row of the hosts."""
     return {"name": name, "state": state, "serial": "1f", "expires": 9.0, "ports": {"state": "closed"}} | more
 
 
 def test_every_metric_is_exported_as_listed() -> None:
-    """Names, kinds, labels and helps are those of the list, and a Prometheus parser reads the page."""
     families = {one.name: one for one in text_string_to_metric_families(rendered(body(), CALLS).decode())}
     for metric in METRICS:
         family = families[metric.name.removesuffix("_total")]
@@ -117,7 +114,6 @@ def test_values_are_exported() -> None:
 
 
 def test_tunnels_are_measured() -> None:
-    """An enrolled host has state, age, bytes, certificate expiry and ports; a revoked host is only counted."""
     samples = {
         (one.name, tuple(sorted(one.labels.items()))): one.value
         for family in text_string_to_metric_families(rendered(body(), CALLS).decode())
@@ -135,8 +131,6 @@ def test_tunnels_are_measured() -> None:
 
 
 def test_recordings_are_measured_only_with_a_recorder() -> None:
-    """With a recorder its state and contents are exported; without one nothing is."""
-
     def samples(recorder: RecorderState | None) -> dict[str, float]:
         given = body()
         given = msgspec.structs.replace(
@@ -172,7 +166,6 @@ def test_the_page_matches_the_code() -> None:
 
 
 def test_processes_of_one_role_have_separate_series() -> None:
-    """Each relay process has its own restarts and memory; no series appears twice."""
     answer = body(
         [
             {"role": "relay", "pid": os.getpid(), "restarts": 1},
@@ -185,7 +178,6 @@ def test_processes_of_one_role_have_separate_series() -> None:
 
 
 def standby_samples(page: bytes) -> dict[str, float]:
-    """Return the samples about two appliances, without the prefix of their names."""
     return {
         line.rsplit(" ", 1)[0].removeprefix("rosrv_standby_"): float(line.rsplit(" ", 1)[1])
         for line in page.decode().splitlines()
@@ -222,7 +214,6 @@ def test_two_appliances_are_measured() -> None:
 
 
 def test_a_standby_has_its_own_metrics() -> None:
-    """A standby exports its role and links and the REST calls; the age of a witness without an answer is infinite."""
     state = example(StandbyState, name="b", role="standby", epoch=4, other={"name": "a"})
     page = rendered_standby(state, CALLS)
     assert standby_samples(page) == {

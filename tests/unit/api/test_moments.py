@@ -36,7 +36,6 @@ def _outer() -> _Outer:
 
 
 def test_each_time_has_its_text_beside_it() -> None:
-    """Each time in a list or table has a text with no more digits than the number; a missing time has none."""
     assert in_full(_outer()) == {
         "since": 1_795_155_646.1,
         "since_utc": "2026-11-20T06:20:46.100000000Z",
@@ -48,7 +47,6 @@ def test_each_time_has_its_text_beside_it() -> None:
 
 
 def test_the_schema_describes_the_texts() -> None:
-    """The texts are required fields, and an answer matches the schema."""
     (root,), kinds = msgspec.json.schema_components([_Outer], ref_template="#/components/schemas/{name}")
     for schema in kinds.values():
         describe(schema)
@@ -67,7 +65,6 @@ def _bare(value: Any) -> Any:
 
 @pytest.mark.usefixtures("app")  # tells the contract the type
 def test_other_fields_are_unchanged() -> None:
-    """Names, defaults and values equal msgspec's own output."""
     kinds = [kind for kind in CONTRACT.kinds if UNIT in str(msgspec.json.schema(kind))]
     assert len(kinds) > 15
     for kind in kinds:
@@ -77,13 +74,11 @@ def test_other_fields_are_unchanged() -> None:
 
 
 def test_an_answer_without_times_is_not_walked() -> None:
-    """The graph of a robot, which has no times, is encoded directly."""
     graph = example(Graph)
     assert in_full(graph) is graph
 
 
 def test_an_invalid_time_is_a_problem_with_a_hint() -> None:
-    """A time in RFC 3339 is accepted; any other text gets a problem that shows a valid time."""
     assert given("2026-11-20T06:20:46.123456789Z") == 1_795_155_646_123_456_789
     with pytest.raises(ProblemError, match="2026-03-01T12:00:00Z"):
         given("tomorrow")

@@ -11,7 +11,6 @@ TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_sr
 
 
 def test_findings_without_a_position_stay_in_the_detail() -> None:
-    """A finding without a position appears in the detail only."""
     problem = refusal(
         "refused", ["a would also be removed: it is in the same file", "a.rv:1:2: error: odd: 1:2"]
     )
@@ -22,7 +21,6 @@ def test_findings_without_a_position_stay_in_the_detail() -> None:
 
 
 def test_a_monitor_is_described() -> None:
-    """The description has events of topics, services and clocks, properties with handlers, and a picture if finite."""
     compiler = Compiler()
     a = compiler.described(
         example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a"

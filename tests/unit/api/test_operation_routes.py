@@ -135,7 +135,6 @@ TAGS = (None, "*", '"7"', "", "7", 'W/"7"', '"7", "8"')  # missing, valid, valid
 
 @functools.cache
 def world() -> RestWorld:
-    """Return the api and control, which the tests share: each request begins with empty records."""
     return RestWorld()
 
 
@@ -162,7 +161,6 @@ def fields_of(operation: Operation) -> set[str]:
 
 
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
-    """Return the order that control carries out for a request by a role that may make it."""
     role = "investigator" if target == "/v1/recordings/memory" else "admin"
     answer = world().asked(method, target, body, role, tag)
     assert answer.status_code in (200, 201), answer.text
@@ -174,7 +172,6 @@ def ordered(method: str, target: str, body: Any, tag: str = "*") -> RequestMade:
 @pytest.mark.parametrize("tag", ["*", '"7"'])
 @pytest.mark.parametrize(("method", "target", "body"), REQUESTS, ids=IDS)
 def test_the_api_and_control_understand_the_same(method: str, target: str, body: Any, tag: str) -> None:
-    """For every way to give an order, control derives the order that the api made, and carries out this one."""
     made = ordered(method, target, body, tag)
     assert made.asked is not None
     assert (made.asked.method, made.asked.target) == (method, target)
@@ -190,11 +187,6 @@ MATRIX = [
     ("operation", "dry"), MATRIX, ids=[f"{one.name}{' dry' * dry}" for one, dry in MATRIX]
 )
 def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operation, dry: bool) -> None:
-    """A role that is too low gets 401 or 403 whatever its ETag; then a missing ETag gets 428, an invalid one 412.
-
-    A dry run is for operators, needs no ETag and changes nothing. Every other change takes effect once. Each request of
-    a token for a change leaves one record with its author, and each rejection is a problem document.
-    """
     method, target, body = sample(operation)
     target += ("&" if "?" in target else "?") + "dry_run=1" if dry else ""
     allowed = BY_ROLE["operator" if dry else LEAST[operation.name]]
@@ -233,7 +225,6 @@ def test_role_dry_run_and_etag_decide_what_an_operation_does(operation: Operatio
 
 @pytest.mark.parametrize("request_type", sorted(CHANGES, key=str), ids=lambda one: one.__name__)
 def test_control_itself_denies_what_the_api_should_have_denied(request_type: type[AdminRequest[Any]]) -> None:
-    """An order without its request, or with a request for another order, is refused and recorded for any role."""
     made = next(
         made.request
         for made in (ordered(method, target, body) for method, target, body in REQUESTS)
@@ -275,7 +266,6 @@ REJECTIONS = (
 def test_a_rejection_by_control_is_a_problem(
     error: Exception, status: int, kind: str, request_: tuple[str, str, Any]
 ) -> None:
-    """The status and the kind follow from the error; a defect reveals nothing of itself."""
     method, target, body = request_
     if kind == "refused" and target.startswith("/v1/monitors"):
         kind = "specifications-refused"
@@ -298,7 +288,6 @@ BODIES = [one for one in REQUESTS if one[2] is not None]
 
 @pytest.mark.parametrize("sent", BODIES, ids=[f"{one[0]} {one[1]} {n}" for n, one in enumerate(BODIES)])
 def test_an_invalid_body_changes_nothing(sent: tuple[str, str, Any]) -> None:
-    """A wrong type of content, broken JSON, text that is not UTF-8 and an unknown field have an explanation each."""
     method, target, body = sent
     role = "investigator" if target == "/v1/recordings/memory" else "admin"
     text = target.partition("?")[0] == "/v1/policy" or (method, target[:13]) == ("PUT", "/v1/monitors/")
@@ -352,7 +341,6 @@ WRONG: dict[str, list[Any]] = {
     ("method", "target", "body"), [(*call.split(), body) for call, bodies in WRONG.items() for body in bodies]
 )
 def test_a_field_out_of_bounds_changes_nothing(method: str, target: str, body: Any) -> None:
-    """Control does not get the order."""
     answer = world().asked(method, target, body, tag="*")
     assert answer.status_code in (404, 422), answer.text
     assert answer.json()["detail"]
@@ -374,7 +362,6 @@ def test_a_field_out_of_bounds_changes_nothing(method: str, target: str, body: A
     ],
 )  # fmt: skip
 def test_hostile_json_is_rejected(path: str, body: bytes) -> None:
-    """Deep, long, endless and invalid JSON is a problem, and no order."""
     answer = world().asked("POST", path, body, "admin", "*", kind="application/json")
     assert answer.status_code in (413, 415, 422), answer.text[:300]
     assert answer.headers["content-type"] == "application/problem+json"
@@ -407,7 +394,6 @@ def test_rows_name_fields_of_their_requests() -> None:
 
 
 def test_pruning_is_for_admins() -> None:
-    """Operators load the folder's files; only admins remove monitors whose files the folder does not have."""
     target = "/v1/monitors/reload?prune=1"
     assert world().asked("POST", target, None, "admin", "*").status_code == 200
     answer = world().asked("POST", target, None, "operator", "*")
@@ -440,7 +426,6 @@ BY_HAND = {
 
 
 def routes() -> dict[str, set[str]]:
-    """Return the least roles of each method and path, without the console's."""
     return {
         f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
             role for role in roles_of(route.dependant) if role
@@ -452,7 +437,6 @@ def routes() -> dict[str, set[str]]:
 
 
 def test_routes_written_by_hand_are_for_these_roles() -> None:
-    """Every route has a row in the tables and requires exactly the role of its row."""
     named = {f"{one.method} {one.path}": one.name for one in NAMED}
     of_table = {
         path: {"operator" if any(one.dry_run and one.name == name for one in NAMED) else LEAST[name]}
@@ -466,7 +450,6 @@ def test_routes_written_by_hand_are_for_these_roles() -> None:
 
 
 def roles_of(dependant: Any) -> Iterator[str | None]:
-    """Yield the least roles that a route requires."""
     if dependant is not None:
         yield getattr(dependant.call, "least", None)
         for one in dependant.dependencies:
@@ -474,7 +457,6 @@ def roles_of(dependant: Any) -> Iterator[str | None]:
 
 
 def test_every_order_has_its_way() -> None:
-    """`REQUESTS` has a request for every kind of order that the api may send."""
     assert {type(ordered(method, target, body).request) for method, target, body in REQUESTS} == CHANGES
 
 
@@ -510,7 +492,6 @@ def _other(value: Any) -> Any:
 
 
 def test_control_hears_of_a_client_that_disconnects() -> None:
-    """When the client of an order disconnects, its bearer ends, and control withdraws the order."""
     gate, control, tokens = world().gate, world().control, world().tokens.texts
     seen: list[Any] = []
 

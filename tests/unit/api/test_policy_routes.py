@@ -30,7 +30,6 @@ count() { event said() /chatter std_msgs/String '{}' { } }
 
 @pytest.fixture(scope="module")
 def api() -> Iterator[RestWorld]:
-    """Yield the api and control, which the tests share."""
     api = RestWorld()
     yield api
     api.close()
@@ -38,7 +37,6 @@ def api() -> Iterator[RestWorld]:
 
 @pytest.fixture
 def world(api: RestWorld) -> RestWorld:
-    """Return the api before an open policy and two monitors."""
     api.carried.error = None
     api.carried.answers |= {
         admin.PolicyWanted: example(
@@ -75,7 +73,6 @@ def test_a_dry_run_lists_everything_that_a_load_would_end(world: RestWorld) -> N
 
 @pytest.mark.parametrize("target", ["/v1/policy?dry_run=1", "/v1/policy", "/v1/policy/test"])
 def test_a_rejected_policy_has_every_finding(world: RestWorld, target: str) -> None:
-    """After a load that control rejects and records, the api adds the places."""
     world.carried.error = PolicyRefusedError(["revision 8:3:1: error: bogus"])
     sent: Any = {"text": WRONG} if target.endswith("test") else WRONG
     problem = world.asked("POST", target, sent, tag='"7"').json()
@@ -144,7 +141,6 @@ def test_a_rejected_specification_has_its_place(world: RestWorld, method: str, t
 
 
 def test_a_dry_run_of_one_monitor_sends_its_whole_file(world: RestWorld) -> None:
-    """Control may answer a dry run of a file, and knows the file of a monitor."""
     answer = world.asked("PUT", "/v1/monitors/count?dry_run=1", "text")
     assert answer.json()["loaded"] is False
     assert [one.files for one in world.sent(admin.MonitorTry)] == [{"speed.rv": "text"}]

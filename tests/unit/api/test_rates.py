@@ -8,7 +8,6 @@ from appliance.api.rates import Buckets, peer_key
 
 
 def test_a_burst_is_followed_by_the_rate() -> None:
-    """A burst passes at once, then one per interval; `wait` predicts `take`."""
     buckets = Buckets(2.0, 3)
     assert [buckets.take("a", 0.0) for _ in range(4)] == [0, 0, 0, 0.5]
     assert buckets.wait("a", 0.25) == pytest.approx(0.25)
@@ -18,7 +17,6 @@ def test_a_burst_is_followed_by_the_rate() -> None:
 
 
 def test_a_stopped_clock_adds_nothing() -> None:
-    """Without elapsed time nothing is added; a clock set back removes nothing."""
     buckets = Buckets(1.0, 1)
     assert buckets.take("a", 10.0) == 0
     assert buckets.take("a", 5.0) > 0
@@ -27,7 +25,6 @@ def test_a_stopped_clock_adds_nothing() -> None:
 
 @given(st.lists(st.integers(0, 10_000), max_size=300))
 def test_memory_is_bounded(peers: list[int]) -> None:
-    """The number of buckets stays within the limit for any number of addresses."""
     buckets = Buckets(1e-6, 5, peers=16)
     hosts = [f"10.0.{peer // 256}.{peer % 256}" for peer in peers]
     for second, host in enumerate(hosts):

@@ -25,7 +25,6 @@ _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
 @pytest.mark.parametrize("mcap", [False, True])
 def test_a_started_download_is_completed(tmp_path: Path, *, mcap: bool) -> None:
-    """A file removed after the answer began is sent whole; one removed before gives an error, not 200."""
     kept = tmp_path / "recordings" / ("a" * 20)
     kept.mkdir(parents=True)
     bag = BagWriter(kept / "recording.bag", {})

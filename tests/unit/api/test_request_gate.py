@@ -10,17 +10,14 @@ from tests.unit.api.test_operation_routes import BY_HAND, routes, world
 
 
 def sent(method: str, path: str, headers: dict[str, str], host: str = "10.0.0.1") -> httpx.Response:
-    """Return the answer to a request."""
     return world().play(lambda: sent_to(world().gate, method, path, host, headers=headers))
 
 
 def get(path: str, **headers: str) -> httpx.Response:
-    """Return the answer to a viewer's request."""
     return sent("GET", path, {"Authorization": f"Bearer {world().tokens.texts['viewer']}"} | headers)
 
 
 def test_every_route_but_the_public_ones_needs_a_token() -> None:
-    """Without a token every other path is 401, known or not; health and the contract are public."""
     without_roles = BY_HAND[None]
     for route in [*routes(), "GET /v1/nothing/here", "POST /v1/tokens"]:
         method, path = re.sub(r"{\w+}", "laptop", route).split()
@@ -36,7 +33,6 @@ def test_every_route_but_the_public_ones_needs_a_token() -> None:
 
 
 def test_an_invalid_token_is_refused() -> None:
-    """Wrong schemes, empty, malformed and unknown tokens, and a valid id with another secret get 401."""
     right = f"Bearer {world().tokens.texts['viewer']}"
     secret = right[:-4] + ("AAAA" if not right.endswith("AAAA") else "BBBB")
     unknown = "bearer rosrv_0123456789ab_" + "A" * 43
@@ -56,7 +52,6 @@ def test_an_invalid_token_is_refused() -> None:
     ],
 )
 def test_only_its_own_names_are_accepted(name: str, status: int) -> None:
-    """A page whose own host name resolves to the appliance (DNS rebinding) is refused; each address is accepted."""
     for path in ("/v1/status", "/healthz"):
         assert get(path, Host=name).status_code == status
 
@@ -66,7 +61,6 @@ def test_only_its_own_names_are_accepted(name: str, status: int) -> None:
     [("https://evil.example", 403), ("null", 403), ("https://api", 403), ("http://api", 200)],
 )
 def test_other_origins_are_refused(origin: str, status: int) -> None:
-    """Every request from a page of another origin gets 403, and no answer has a CORS header."""
     for method in ("GET", "OPTIONS", "POST"):
         answer = sent(
             method,
@@ -79,7 +73,6 @@ def test_other_origins_are_refused(origin: str, status: int) -> None:
 
 
 def test_answers_are_hardened() -> None:
-    """No answer can be cached, sniffed or framed, and none names the server software."""
     for answer in (get("/v1/status"), get("/nowhere"), sent("GET", "/metrics", {})):
         assert answer.headers["cache-control"] == "no-store"
         assert answer.headers["x-content-type-options"] == "nosniff"

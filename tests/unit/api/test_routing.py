@@ -31,7 +31,6 @@ class Wanted(msgspec.Struct, forbid_unknown_fields=True):
 
 @pytest.fixture
 def app(monkeypatch: pytest.MonkeyPatch) -> FastAPI:
-    """Return an application with a route for such a body, outside the REST contract."""
     monkeypatch.setattr(routing, "CONTRACT", routing.Contract())
     app, routes = FastAPI(), Routes()
 
@@ -65,7 +64,6 @@ def posted(app: FastAPI, sent: Any) -> httpx.Response:
     ],
 )
 def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) -> None:
-    """The answer lists the path of each wrong, missing or unknown field."""
     answer = posted(app, sent)
     assert answer.status_code == 422
     assert [one["where"] for one in answer.json()["errors"]] == places
@@ -76,6 +74,5 @@ def test_every_wrong_field_is_named(app: FastAPI, sent: Any, places: list[str]) 
     "rest", ["", "[" * 100_000, "1e" + "9" * 1000, '"\\ud800"', '{"a":' * 50_000, "9" * 300_000]
 )
 def test_invalid_json_after_a_wrong_field_is_reported(app: FastAPI, rest: str) -> None:
-    """The parser stops at the first wrong field, but invalid JSON after that field is still reported."""
     answer = posted(app, f'{{"name": 1, "count": {rest}')
     assert (answer.status_code, answer.json()["type"]) == (422, "urn:rosrv:problem:not-json")

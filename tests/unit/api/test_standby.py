@@ -42,7 +42,6 @@ class Standby(ControlLink):
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float | None = None
     ) -> AdminAnswer[A]:  # fmt: skip
-        """Return what control answers."""
         if isinstance(request, admin.StandbyWanted):
             return AdminAnswer(True, STATE)  # type: ignore[arg-type]  # the answer to this request
         return on_standby(STATE)
@@ -50,7 +49,6 @@ class Standby(ControlLink):
 
 @pytest.fixture
 def gate() -> RequestGate:
-    """Return the api of a standby, which has sampled it once."""
     door, control, journal = (
         TokenAuthenticator(10, lambda _token: None),
         Standby(),
@@ -64,7 +62,6 @@ def gate() -> RequestGate:
 
 
 def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Response:
-    """Return the answer to a request of an admin."""
     headers = {"Authorization": f"Bearer {TOKEN}", "If-Match": "*"}
     return requested(gate, method, target, headers=headers, **more)
 
@@ -78,7 +75,6 @@ def asked(gate: RequestGate, method: str, target: str, **more: Any) -> httpx.Res
     ],
 )  # fmt: skip
 def test_the_problem_names_the_active_appliance(gate: RequestGate, method: str, target: str) -> None:
-    """Queries and orders get status 503, the problem `standby`, the address, and the time of the next attempt."""
     answer = asked(gate, method, target)
     problem = answer.json()
     assert (answer.status_code, problem["type"], problem["active"], problem["detail"]) == (
@@ -97,7 +93,6 @@ def test_a_host_that_enrols_gets_the_same_problem(gate: RequestGate) -> None:
 
 
 def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
-    """A standby is not `down` for Prometheus, and answers questions about itself."""
     assert asked(gate, "GET", "/v1/standby").json()["other"]["name"] == "a"
     page = asked(gate, "GET", "/metrics")
     assert page.status_code == 200
@@ -105,7 +100,6 @@ def test_its_state_and_metrics_are_served(gate: RequestGate) -> None:
 
 
 def test_no_other_problem_has_the_address(gate: RequestGate) -> None:
-    """The address is part of this problem only, and only for valid tokens."""
     answer = requested(gate, "GET", "/v1/status", headers={"Authorization": "Bearer wrong"})
     assert (answer.status_code, "active" in answer.json()) == (401, False)
     assert "active" not in asked(gate, "GET", "/v1/nothing").json()

@@ -15,7 +15,6 @@ from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 
 def bearer(name: str, role: TokenRole = "viewer") -> Bearer:
-    """Return the holder of a token."""
     return Bearer(name, name, role, 1e12, "shown")
 
 
@@ -39,7 +38,6 @@ def test_two_hundred_viewers_leave_slots_to_operators() -> None:
 
 
 def test_one_token_and_one_host_have_a_quota() -> None:
-    """A token gets six streams from any number of hosts, a host eight with any number of tokens."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
     assert len(taken(streams, bearer("a"), "10.0.0.1", 3) + taken(streams, bearer("a"), "10.0.0.2")) == 6
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 16)
@@ -48,7 +46,6 @@ def test_one_token_and_one_host_have_a_quota() -> None:
 
 @pytest.mark.parametrize(("whole", "first"), [(1, 1), (2, 1), (64, 24)])
 def test_quotas_scale_with_the_total(whole: int, first: int) -> None:
-    """For any configured total a token gets its fraction; an operator gets a stream if the total is at least two."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, whole)
     assert len(taken(streams, bearer("a"), "10.0.0.1")) == first
     assert bool(taken(streams, bearer("op", "admin"), "10.0.0.2", 1)) is (whole > 1)
@@ -56,7 +53,6 @@ def test_quotas_scale_with_the_total(whole: int, first: int) -> None:
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_slot_is_released_when_the_response_ends(*, fails: bool) -> None:
-    """After a completed or aborted response the token may follow again, and nothing is stored about the response."""
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, 1)
 
     async def send(_message: Any) -> None:
@@ -77,7 +73,6 @@ def test_a_slot_is_released_when_the_response_ends(*, fails: bool) -> None:
 
 @pytest.mark.anyio
 async def test_a_viewer_with_many_requests_leaves_turns_to_an_admin() -> None:
-    """Sixty requests of a viewer's token: an admin begins at once, and another viewer waits for one."""
     work, order, ends = Work("dry runs", 2), list[str](), [asyncio.Event() for _ in range(3)]
 
     async def ask(who: Bearer) -> None:
@@ -103,7 +98,6 @@ async def test_a_viewer_with_many_requests_leaves_turns_to_an_admin() -> None:
 @pytest.mark.anyio
 @pytest.mark.parametrize("whole", [1, 2, 4])
 async def test_every_token_gets_a_turn(whole: int) -> None:
-    """Also if only one of these answers is made at once."""
     work = Work("summaries", whole)
     for who in (bearer("v"), bearer("root", "admin")):
         async with work.turn(who):

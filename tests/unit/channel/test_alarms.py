@@ -25,14 +25,12 @@ PAIR: dict[str, Any] = {
 
 
 def changed(path: str, value: object, **more: object) -> Status:
-    """Return the healthy status with one field replaced."""
     section, _dot, field = path.partition(".")
     said = {section: GOOD.get(section, {}) | {field: value}} if field else {section: value}
     return example(Status, **{**GOOD, **said, **more})
 
 
 def test_a_healthy_appliance_has_none() -> None:
-    """A healthy appliance has no alarms, and neither has an appliance before its first probe."""
     assert open_alarms(example(Status, **GOOD)) == []
     assert open_alarms(changed("probe", "")) == []
 
@@ -101,14 +99,12 @@ def test_a_healthy_appliance_has_none() -> None:
     ],
 )
 def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severity: str, about: str) -> None:
-    """Each condition raises one alarm with its severity, subject and a readable text."""
     (alarm,) = open_alarms(changed(path, value))
     assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
     assert len(alarm.text) > 5
 
 
 def test_one_missing_relay_is_not_reported_as_all() -> None:
-    """With several relay processes, the alarm names how many are down and says that the others work."""
     (alarm,) = open_alarms(changed("relay", "1 of 2 are away"))
     assert "1 of 2 are away: their topics" in alarm.text
     assert open_alarms(changed("audit.forwarding", FORWARDING)) == []
@@ -123,19 +119,16 @@ def test_one_missing_relay_is_not_reported_as_all() -> None:
     ],
 )
 def test_blocks_are_one_line_with_count_and_earliest_end(hosts: int, end: float | None, text: str) -> None:
-    """A thousand blocks do not fill the status."""
     [alarm] = open_alarms(example(Status, **GOOD, blocks={"hosts": hosts, "first_end": end}))
     assert alarm.text == text
 
 
 def test_the_gravest_come_first() -> None:
-    """Alarms come before warnings, and warnings before notices."""
     status = changed("policy.differs_from_file", True, relay="away", rosmaster="being rebuilt")
     assert [one.severity for one in open_alarms(status)] == ["alarm", "warning", "notice"]
 
 
 def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:
-    """Each monitor that dropped messages gives a warning, and so do enough denials; neither is a fault."""
     recent = {"denials": 9, "drops": {"zone": 2, "limit": 1}, "attention_at": 10}
     status = example(Status, **GOOD, last_minute=recent)
     drops = [
@@ -163,5 +156,4 @@ def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:
     ],
 )
 def test_two_appliances_that_work_have_no_alarm(state: dict[str, Any]) -> None:
-    """An update of the standby within a minute, and a witness that answers late, raise no alarm."""
     assert open_alarms(changed("standby", state)) == []

@@ -11,7 +11,6 @@ from tests.support.command import rosrv
 
 
 def test_the_schema_accepts_only_known_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the schema, an editor accepts the files that the appliance accepts, and rejects an unknown key."""
     monkeypatch.chdir(tmp_path)
     schema = jsonschema_rs.validator_for(json.loads(rosrv("config", "show", "--schema").stdout))
     assert schema.is_valid(yaml.safe_load(rosrv("config", "show").stdout))

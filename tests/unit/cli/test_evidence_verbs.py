@@ -17,7 +17,6 @@ from tests.support.command import rosrv
 def test_a_bundle_gets_its_name_when_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, breaks: bool
 ) -> None:
-    """A killed or failed export leaves no file that looks like a bundle."""
     place = tmp_path / "incident.zip"
 
     def export(*_asked: Any) -> Iterator[bytes]:

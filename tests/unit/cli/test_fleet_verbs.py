@@ -21,7 +21,6 @@ _INVITATION = {
 def test_a_join_needs_no_checkpoint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pinned: str | None, sent: str
 ) -> None:
-    """Until the log's key is pinned with the first signed checkpoint, the signer's own file has it."""
     state, posted = tmp_path / "state", list[JoinRequest]()
     for folder, text in (("signer", "of the signer"), ("control", pinned)):
         (state / folder).mkdir(parents=True)
@@ -37,7 +36,6 @@ def test_a_join_needs_no_checkpoint(
             pass
 
         def post(self, _path: str, body: bytes) -> None:
-            """Keep the request."""
             posted.append(msgspec.json.decode(body, type=JoinRequest))
 
         def close(self) -> None:

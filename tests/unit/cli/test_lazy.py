@@ -19,7 +19,6 @@ ROSRV = str(Path(sys.executable).parent / "rosrv")
 
 
 def test_the_table_matches_the_verbs() -> None:
-    """The help in the table is the first sentence of the verb's own help."""
     for name, verb in table():
         own = str(loaded(verb, name.split()[-1]).help)
         assert " ".join(own.split("\n\n", maxsplit=1)[0].split()) == verb.help, name
@@ -27,7 +26,6 @@ def test_the_table_matches_the_verbs() -> None:
 
 @pytest.mark.nightly
 def test_a_verb_imports_only_what_it_needs() -> None:
-    """`rosrv` alone, and a query to a running appliance, import no network library, REST server, bags or compiler."""
     program = (
         "import sys, appliance.cli.main, appliance.cli.status_verb, appliance.cli.monitor.in_force\n"
         "heavy = ('pyroute2', 'fastapi', 'uvicorn', 'rosbags', 'lark', 'numpy', 'httpx', 'cryptography', 'pydantic')\n"
@@ -39,7 +37,6 @@ def test_a_verb_imports_only_what_it_needs() -> None:
 
 @pytest.mark.parametrize(("name", "command"), [pytest.param(*one, id=one[0]) for one in commands()])
 def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
-    """Help has a first sentence, an example of this verb, `--json`, and every option; some page names the verb."""
     if command.hidden or name.rsplit(maxsplit=1)[-1] == "rvstate":
         pytest.skip("kept for ROSRV's own flag")
     assert any(f"rosrv {name}" in page.read_text() for page in PAGES), f"no page names rosrv {name}"
@@ -57,7 +54,6 @@ def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
 
 @pytest.mark.nightly
 def test_the_completion_script_is_valid_bash(tmp_path: Path) -> None:
-    """Bash runs the output of `--show-completion bash`, and the function offers verbs."""
     env = {
         key: value
         for key, value in os.environ.items()

@@ -19,7 +19,6 @@ from appliance.supervisor.errors import StartError
 def test_a_users_error_is_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: Exception
 ) -> None:
-    """Exit status 1 and the message; no traceback."""
     assert outcome(monkeypatch, error) == 1
     said = capsys.readouterr().err
     assert said.startswith("rosrv: ")
@@ -30,7 +29,6 @@ def test_a_users_error_is_one_line(
 def test_a_defect_is_reported_with_its_position(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another exit status, the position, and a request to report it."""
     assert outcome(monkeypatch, ZeroDivisionError("odd")) == 70
     said = capsys.readouterr().err
     assert "please report it: ZeroDivisionError: odd (" in said
@@ -39,8 +37,6 @@ def test_a_defect_is_reported_with_its_position(
 
 
 def outcome(monkeypatch: pytest.MonkeyPatch, error: Exception) -> object:
-    """Return the exit status of a command that raises `error`."""
-
     def fail() -> None:
         raise error
 

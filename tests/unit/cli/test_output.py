@@ -16,28 +16,23 @@ def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixtu
 
 
 def test_an_error_escapes_what_it_repeats(capsys: pytest.CaptureFixture[str]) -> None:
-    """Arguments and answers of an appliance are printed escaped."""
     assert usage_error("no topic /\x1b[2J\u202e", "rosrv topic").exit_code == 2
     assert capsys.readouterr().err == "rosrv topic: no topic /\\x1b[2J\\u202e\n"
 
 
 def test_printable_text_is_unchanged() -> None:
-    """Letters of all languages are printed as they are."""
     assert printable("größer als 3 µs …") == "größer als 3 µs …"
 
 
 def test_nouns_agree_with_their_numbers() -> None:
-    """One host, two hosts."""
     assert [counted(number, "error") for number in (0, 1, 2)] == ["0 errors", "1 error", "2 errors"]
 
 
 def test_times_are_in_utc() -> None:
-    """A time is shown to the minute, with its zone."""
     assert moment(1_795_164_925.9) == "2026-11-20 08:55Z"
 
 
 def test_an_object_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    """A program reads one object from each line, whatever strings it contains."""
     say_json({"name": "a\nb\x1b"})
     out = capsys.readouterr().out
     assert out.count("\n") == 1
@@ -53,7 +48,6 @@ def test_an_object_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     ],
 )
 def test_a_revision_names_its_loader(who: str, shown: str) -> None:
-    """The rollback of an unconfirmed revision is called automatic."""
     assert loaded_by(who, 0.0) == shown
 
 

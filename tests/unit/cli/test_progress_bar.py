@@ -45,7 +45,6 @@ def said(shares: bool, *, screen: bool) -> tuple[str, str]:
 
 
 def test_a_terminal_has_a_bar() -> None:
-    """The bar shows the finished fraction."""
     output, shown = said(shares=False, screen=False)
     assert output == "end\n"
     assert "working" in shown
@@ -59,7 +58,6 @@ def test_output_on_the_same_terminal_has_no_bar() -> None:
 
 
 def test_a_pipe_has_no_bar() -> None:
-    """Programs read only the output."""
     command = [sys.executable, "-c", PROGRAM.format(shares=False)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("end\n", "")

@@ -24,21 +24,18 @@ PLAIN = NoEncryption()
 def written(
     folder: Path, form: PrivateFormat = PrivateFormat.OpenSSH, encryption: KeySerializationEncryption = PLAIN
 ) -> Path:
-    """Write the site's private key."""
     file = folder / "site"
     file.write_bytes(KEY.private_bytes(Encoding.PEM, form, encryption))
     return file
 
 
 def sign(*arguments: object) -> tuple[int, str]:
-    """Return the exit status and output."""
     done = CliRunner().invoke(app, ["sign", *map(str, arguments)])
     return done.exit_code, done.output
 
 
 @pytest.mark.parametrize("form", [PrivateFormat.OpenSSH, PrivateFormat.PKCS8])
 def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateFormat) -> None:
-    """Keys from ssh-keygen and from openssl work; the output has the key's line for appliance.yaml."""
     files = [tmp_path / "p.ini", tmp_path / "a.rv"]
     for file in files:
         file.write_text(f"{file.name} ä\n", encoding="utf-8")
@@ -57,7 +54,6 @@ def test_each_file_gets_a_signature_beside_it(tmp_path: Path, form: PrivateForma
     [(b"a\r\n", "CR LF"), (b"\xef\xbb\xbfa\n", "byte order mark"), (b"\xff\n", "not UTF-8")],
 )
 def test_ambiguous_text_is_not_signed(tmp_path: Path, content: bytes, why: str) -> None:
-    """No signature is written then, not even for the other files."""
     good, bad = tmp_path / "a.rv", tmp_path / "b.rv"
     good.write_text("a\n")
     bad.write_bytes(content)
@@ -67,7 +63,6 @@ def test_ambiguous_text_is_not_signed(tmp_path: Path, content: bytes, why: str) 
 
 
 def test_a_key_that_cannot_sign_is_an_error_with_advice(tmp_path: Path) -> None:
-    """Covers a key with a passphrase (ssh-keygen asks for it), another kind of key, and a missing one."""
     file = tmp_path / "p.ini"
     file.write_text("[Nodes]\n")
     locked = written(tmp_path, PrivateFormat.PKCS8, BestAvailableEncryption(b"secret"))

@@ -36,7 +36,6 @@ _SERVED = {
 
 
 def watch(*options: str, terminal: int | None = None) -> subprocess.Popen[bytes]:
-    """Start `rosrv status --watch` in a terminal, or with pipes."""
     command = [sys.executable, "-m", "appliance.cli.main", "status", "--watch", *options]
     ours = ("ROS", "COLUMNS", "LINES")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
@@ -47,7 +46,6 @@ def watch(*options: str, terminal: int | None = None) -> subprocess.Popen[bytes]
 
 @pytest.fixture
 def serving(tmp_path: Path) -> Iterator[Callable[..., FakeAppliance]]:
-    """Return a function that starts a fake appliance with this status in the state directory."""
     with contextlib.ExitStack() as ends:
 
         def serve(**status: Any) -> FakeAppliance:
@@ -82,7 +80,6 @@ class Terminal:
                 self.shown += decoder.decode(part)
 
     def resize(self, columns: int, lines: int) -> None:
-        """Change the size, as a window manager does."""
         self._size(columns, lines)
         self.process.send_signal(signal.SIGWINCH)
 
@@ -92,11 +89,9 @@ class Terminal:
         return self.shown.index(text, after) + len(text)
 
     def interrupted(self) -> int:
-        """Press Ctrl-C, and return the exit status."""
         return self.ended_by(signal.SIGINT)
 
     def ended_by(self, number: signal.Signals) -> int:
-        """End the command by a signal, and return its exit status."""
         self.process.send_signal(number)
         status = self.process.wait(_LIMIT_SECONDS)
         self._reader.join(_LIMIT_SECONDS)
@@ -106,7 +101,6 @@ class Terminal:
 
 @pytest.fixture
 def terminal(tmp_path: Path) -> Iterator[Callable[..., Terminal]]:
-    """Return a function that starts the command in a terminal."""
     opened: list[Terminal] = []
 
     def start(columns: int, lines: int, seconds: str = "1") -> Terminal:
@@ -123,7 +117,6 @@ def terminal(tmp_path: Path) -> Iterator[Callable[..., Terminal]]:
 def test_a_terminal_is_redrawn_in_place(
     serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
 ) -> None:
-    """It is never cleared, nothing scrolls, and the last status stays after Ctrl-C with its exit status."""
     fake = serving()
     shown = terminal(80, 30)
     shown.until("1.2.3")
@@ -141,7 +134,6 @@ def test_a_terminal_is_redrawn_in_place(
 def test_a_terminated_watch_restores_the_terminal(
     serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
 ) -> None:
-    """`timeout 60 rosrv status --watch` leaves the normal screen and its cursor."""
     serving()
     shown = terminal(80, 30)
     shown.until("1.2.3")
@@ -153,7 +145,6 @@ def test_a_terminated_watch_restores_the_terminal(
 def test_a_narrower_terminal_is_redrawn_at_once(
     serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
 ) -> None:
-    """No line is longer than the terminal, and the rest of the status is cut off."""
     serving()
     shown = terminal(100, 30, "3600")
     before = shown.until("audit log")
@@ -168,7 +159,6 @@ def test_a_narrower_terminal_is_redrawn_at_once(
 def test_an_appliance_that_is_away_is_awaited(
     serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
 ) -> None:
-    """The terminal shows since when it is away; when it answers again, its status."""
     shown = terminal(100, 30)
     shown.until("not running since ")
     since = re.search(r"since (\d\d:\d\d:\d\dZ): ", shown.shown)
@@ -183,7 +173,6 @@ def test_an_appliance_that_is_away_is_awaited(
 def test_a_pipe_gets_one_status_after_the_other(
     serving: Callable[..., FakeAppliance], tmp_path: Path
 ) -> None:
-    """A blank line separates them; when the reader ends, nothing is printed, and the status is that of the last one."""
     serving()
     with watch("--every", "1", "--state", str(tmp_path)) as process:
         assert process.stdout is not None
@@ -200,7 +189,6 @@ def test_a_pipe_gets_one_status_after_the_other(
 
 
 def test_with_json_each_line_is_an_object(serving: Callable[..., FakeAppliance], tmp_path: Path) -> None:
-    """While the appliance is away, the object has the time since when, and the reason."""
     with watch("--every", "1", "--json", "--state", str(tmp_path)) as process:
         assert process.stdout is not None
         away = json.loads(process.stdout.readline())
@@ -228,7 +216,6 @@ def test_a_rejected_token_ends_the_watch() -> None:
 
 
 def test_a_restarted_api_may_reject_a_token_for_a_moment() -> None:
-    """The third rejection in a row ends the watch."""
     good = msgspec.json.encode(example(Status, **_SERVED))
     with FakeAppliance() as fake:
         fake.body = good

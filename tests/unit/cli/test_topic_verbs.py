@@ -21,7 +21,6 @@ def scan(length: int) -> dict[str, object]:
 
 
 def test_omitted_parts_are_marked() -> None:
-    """Covers an element that is not shown, a byte of a picture, and a field after the end of the bytes."""
     whole, cut = scan(1_000_000), scan(3000)
     assert part_of(whole, "ranges.3") == 0
     assert part_of(whole, "ranges.300") == f"{CUT} 704 more"
@@ -33,6 +32,5 @@ def test_omitted_parts_are_marked() -> None:
 
 @pytest.mark.parametrize("path", ["nothing", "ranges.x", "pose.y", "last.x", "data.x"])
 def test_a_missing_field_is_an_error(path: str) -> None:
-    """The message has no such field."""
     with pytest.raises(typer.Exit):
         part_of(scan(1_000_000), path)

@@ -30,7 +30,6 @@ BASE = 1_767_225_600
 
 
 def write_bag(name: str, md5sum: str | None = None, *, below: list[str]) -> None:
-    """`bag NAME [MD5SUM]`: a recording of these messages, each `SECONDS TOPIC TYPE {FIELD: VALUE}`."""
     rows = [line.split(maxsplit=3) for line in below]
     messages = [
         (topic, kind, float(seconds), message(kind, **yaml.safe_load(fields)))
@@ -61,7 +60,6 @@ def write_log(signed: str | None = None, *, below: list[str]) -> None:
 
 
 def write_pair(*, below: list[str]) -> None:
-    """`pair`: the state of two appliances after four takeovers, in `state` and `other`."""
     assert not below
     for member, folder in zip(play(Path("pair"), four_takeovers), ("state", "other"), strict=True):
         shutil.copytree(member.state, folder, dirs_exist_ok=True)
@@ -100,7 +98,6 @@ def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: l
 
 
 def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
-    """`scan`: the result of a port scan from outside, as the fields of a `ScanResult`."""
     found = yaml.safe_load("\n".join(below))
     result = ScanResult(**found | {"open": tuple(found.get("open", ()))})
     monkeypatch.setattr("appliance.cli.protect_verb.scan", lambda *_: result)
@@ -108,7 +105,6 @@ def set_scan(monkeypatch: pytest.MonkeyPatch, *, below: list[str]) -> None:
 
 @pytest.fixture
 def transcript(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Transcript]:
-    """Return a transcript in an empty folder."""
     monkeypatch.chdir(tmp_path)
     with FakeAppliance() as fake:
         more: dict[str, Callable[..., None]] = {

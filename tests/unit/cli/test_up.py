@@ -23,14 +23,12 @@ class Full(io.StringIO):
     """Standard output on a full disk."""
 
     def flush(self) -> None:
-        """Fail as on a full disk."""
         raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """When the ready line appears, the token's file exists and only its owner can read it."""
     _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
@@ -42,7 +40,6 @@ def test_the_first_token_is_in_its_file_before_the_line_is_printed(
 def test_the_policys_warnings_are_printed_at_start(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Standard error has at most ten warnings; the object of `--json`, on one line, has all."""
     said = msgspec.structs.replace(
         READY, token=None, warnings=tuple(f"p.ini:{n}:1: warning" for n in range(12))
     )
@@ -57,15 +54,12 @@ def test_the_policys_warnings_are_printed_at_start(
 
 
 def test_an_unwritable_first_token_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The ready line is not printed; the error names the file and gives advice."""
     with pytest.raises(StartError, match=r"gone/first-token: No such file.*next start creates another"):
         _announce(READY, Settings(state=tmp_path / "gone", api="off"), as_json=False)
     assert capsys.readouterr().out == ""
 
 
 def test_a_partial_token_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a full disk the error leaves nothing that looks like a token."""
-
     def full(_descriptor: int, _data: bytes) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
 

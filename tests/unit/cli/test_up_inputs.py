@@ -19,14 +19,12 @@ DENIED = "cases:\n  - {host: 10.0.0.5, node: /n, publish: /t, expect: deny}\n"
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Settings:
-    """Return settings with a policy file, without a state."""
     (tmp_path / "control").mkdir()
     (tmp_path / "policy.ini").write_text(NEW)
     return Settings(state=tmp_path, policy=tmp_path / "policy.ini", isolation="none", api="off")
 
 
 def store_revision(settings: Settings, who: str) -> None:
-    """Write the state of an earlier run."""
     store = StateStore(settings.state / "control", failed=pytest.fail, kind=InlineDatabase)
     store.save_revision(RevisionRow(1, KEPT, str(settings.policy), 0.0, who, ""))
     store.close()
@@ -45,7 +43,6 @@ def store_revision(settings: Settings, who: str) -> None:
 def test_the_ports_are_those_of_the_policy_that_comes_into_force(
     settings: Settings, who: str, witness: str | None, files: tuple[str, str], first: int
 ) -> None:
-    """The firewall opens the ports of the revision that stays in force, not those of a file that is refused."""
     store_revision(settings, who)
     policy, cases = files
     settings.policy.write_text(policy)
@@ -55,7 +52,6 @@ def test_the_ports_are_those_of_the_policy_that_comes_into_force(
 
 
 def test_a_first_start_needs_a_valid_policy(settings: Settings) -> None:
-    """Without a stored revision, a policy with errors or failing tests starts nothing."""
     settings.policy.with_name("policy.ini.tests.yaml").write_text(DENIED)
     with pytest.raises(StartError, match=r"policy\.ini\.tests\.yaml:2:"):
         read_node_ports(settings)
@@ -65,7 +61,6 @@ def test_a_first_start_needs_a_valid_policy(settings: Settings) -> None:
 
 
 def test_an_unknown_state_is_left_to_rvmaster(settings: Settings) -> None:
-    """After a power cut the last revision may be only in the file of changes, which RVMaster alone reads."""
     (settings.state / "control" / "state.db").write_bytes(b"damaged, or not readable")
     settings.policy.write_text("[Nonsense]\n")
     assert read_node_ports(settings) == DEFAULT_PORTS

@@ -30,7 +30,6 @@ class Slow:
         self.done = 0
 
     async def confirm(self, _request: PolicyConfirm, who: str) -> PolicyConfirmed:
-        """Wait, then change something."""
         self.begun.set()
         try:
             await self.goes_on.wait()
@@ -43,8 +42,6 @@ class Slow:
 
 @contextlib.asynccontextmanager
 async def served(state: Path) -> AsyncIterator[Slow]:
-    """Serve the socket in a state directory."""
-
     async def durable() -> None:
         """Do nothing: the test's state needs no disk."""
 
@@ -66,7 +63,6 @@ async def served(state: Path) -> AsyncIterator[Slow]:
 async def test_an_order_past_its_timeout_is_withdrawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A tool withdraws its order after the timeout and reports that nothing was changed."""
     async with served(tmp_path) as slow:
         monkeypatch.setattr(socket.socket, "shutdown", _then(socket.socket.shutdown, slow.goes_on.set))
         answer = await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
@@ -76,7 +72,6 @@ async def test_an_order_past_its_timeout_is_withdrawn(
 
 @pytest.mark.nightly
 async def test_a_late_order_that_took_effect_is_answered(tmp_path: Path) -> None:
-    """An order that takes effect before the tool gives up is answered as done."""
     async with served(tmp_path) as slow:
         slow.goes_on.set()
         answer = await asyncio.to_thread(AdminSocket(tmp_path, 20.0).ask, PolicyConfirm())
@@ -87,7 +82,6 @@ async def test_a_late_order_that_took_effect_is_answered(tmp_path: Path) -> None
 async def test_a_tool_without_an_answer_says_how_to_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If control does not report the outcome, the tool names the command that does."""
     monkeypatch.setattr(admin_client, "_GRACE_SECONDS", 0.05)
     wanted = pytest.raises(NotRunningError, match=r"may have taken effect; .* rosrv audit search --since 5m")
     async with served(tmp_path) as slow:
@@ -99,7 +93,6 @@ async def test_a_tool_without_an_answer_says_how_to_check(
 
 @pytest.mark.nightly
 async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
-    """The order of a killed tool changes nothing; the next tool is served."""
     async with served(tmp_path) as slow:
         _reader, writer = await asyncio.open_unix_connection(tmp_path / ADMIN_SOCKET)
         writer.write(encode(PolicyConfirm()) + b"\n")

@@ -61,18 +61,15 @@ OPEN = {
 
 
 def kinds(base: type[Any]) -> set[type[Any]]:
-    """Return every request: a struct with its own tag and no subclass."""
     below = [kinds(one) for one in base.__subclasses__()]
     return set().union(*below) if below else {base}
 
 
 def test_every_request_is_in_a_union() -> None:
-    """The unions of the admin socket and of the link to the api are complete."""
     assert kinds(admin.AdminRequest) - set(REQUESTS) == set()
 
 
 def parts(kind: Any, seen: set[Any]) -> typing.Iterator[tuple[Any, str, Any]]:
-    """Yield every field of a struct and its nested structs: struct, name, annotation."""
     if isinstance(kind, type) and hasattr(kind, "__struct_fields__"):
         if kind not in seen:
             seen.add(kind)
@@ -90,7 +87,6 @@ ANSWERED = [one for one in REQUESTS if one is not admin.ChallengeWanted]
 
 
 def test_one_method_answers_each_request() -> None:
-    """Each request has exactly one method, which takes the request as its argument; mypy compares the answers."""
     assert Counter(method.request for method in METHODS) == Counter(ANSWERED)
     for method in METHODS:
         hints = typing.get_type_hints(method.answer)
@@ -99,7 +95,6 @@ def test_one_method_answers_each_request() -> None:
 
 
 def test_every_field_between_processes_has_a_type() -> None:
-    """No message, request or answer has a field of type `Any`, `object` or `dict[str, Any]`."""
     kinds = [
         *(one for file in (messages, api) for _name, one in inspect.getmembers(file, inspect.isclass)),
         *REQUESTS,

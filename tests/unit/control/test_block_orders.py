@@ -35,7 +35,6 @@ SECOND = 1_000_000_000
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Wait until a condition holds."""
     async with asyncio.timeout(10):
         while not condition():
             await asyncio.sleep(0.005)
@@ -53,7 +52,6 @@ class Clock:
         self.reads = 0
 
     def __call__(self) -> int:
-        """Return the time, as the age clock does."""
         self.reads += 1
         return self.now
 
@@ -63,7 +61,6 @@ class Clock:
         return lambda: self.reads >= reads + 2
 
     def advance(self, seconds: float) -> None:
-        """Let time pass."""
         self.now += int(seconds * SECOND)
 
 
@@ -104,22 +101,18 @@ class Control(ControlParts):
         )
 
     def keep(self, task: asyncio.Task[None]) -> None:
-        """Let a task of the test go on while control settles."""
         self._not_ours.add(task)
 
     def enrolled(self) -> Mapping[str, str]:
-        """Return the addresses of enrolled hosts."""
         return {"ocu-1": "10.99.0.2"}
 
     def changed(self, before: Policy, policy: Policy) -> int:
-        """Decide again, as control does."""
         self.current = policy
         effects = self.revocation.policy_changed(before, policy)
         self.enactor.carry_out(effects)
         return revoked(effects)
 
     async def block(self, address: str, seconds: float | None = None, **more: Any) -> HostBlocked:
-        """Block a host as the operator ann."""
         return await self.orders.block(HostBlock(address, seconds, **more), "ann")
 
     async def unblock(self, address: str) -> int:
@@ -127,7 +120,6 @@ class Control(ControlParts):
         return (await self.orders.unblock(HostUnblock(address), "ann")).restored
 
     async def blocked(self) -> list[str]:
-        """Return the addresses of the blocked hosts."""
         return [row.address for row in (await self.orders.listed(HostBlocks())).blocks]
 
     def denial(self, host: str, text: str = "") -> str | None:
@@ -140,7 +132,6 @@ class Control(ControlParts):
 async def control(
     tmp_path: Path, clock: Clock, connected: list[set[str]] | None = None, text: str = OPEN
 ) -> AsyncIterator[Control]:
-    """Run control, with the timer of blocks, until the block ends."""
     made = Control(tmp_path / "state", clock, connected or [], text)
     timer = asyncio.create_task(made.orders.watch())
     made.keep(timer)
@@ -155,7 +146,6 @@ async def control(
 
 
 async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path) -> None:
-    """The answer has the numbers; the withdrawn registrations return without a call of the node."""
     async with control(tmp_path, Clock(), [{NODE, ROBOT}, {ROBOT, OTHER}]) as made:
         node = made.node("/talker")
         await made.register(node, Kind.PUBLICATION, "/scan")
@@ -177,7 +167,6 @@ async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path
 
 
 async def test_the_reason_names_who_until_note_and_remedy(tmp_path: Path) -> None:
-    """The reason is for operators; it stays below the bound of a decision's reason."""
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE, 3600, note="strange traffic")
         reason = made.denial(NODE)
@@ -191,7 +180,6 @@ async def test_the_reason_names_who_until_note_and_remedy(tmp_path: Path) -> Non
 
 
 async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
-    """A section in audit-only mode lets every other denied request pass."""
     text = "[Options]\naudit-only=all\n" + OPEN.replace("default=*", "default=10.0.0.9")
     async with control(tmp_path, Clock(), text=text) as made:
         assert made.denial(NODE) is None
@@ -200,7 +188,6 @@ async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
 
 
 async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: Path) -> None:
-    """The call was decided before the block, and waits for the ROS master until after it."""
     async with control(tmp_path, Clock()) as made:
         made.fill_queue()
         call = asyncio.create_task(
@@ -216,7 +203,6 @@ async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: 
 
 
 async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> None:
-    """An operator who interrupted the command may rely on that."""
     async with control(tmp_path, Clock()) as made:
         await made.block(OTHER)
         with awaited(lambda: True):
@@ -230,7 +216,6 @@ async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> 
 async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The host may register again without a restart; a system clock that is set forward ends no block."""
     monkeypatch.setattr(block_orders, "_LOOK_SECONDS", 0.01)
     clock, machine = Clock(), VirtualClock()
     with using(machine):
@@ -259,7 +244,6 @@ async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
 
 
 async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:
-    """After the restart one block is still in force, and the other is over at once."""
     clock = Clock()
     async with control(tmp_path, clock) as made:
         await made.block(NODE, 3600, note="a")
@@ -277,7 +261,6 @@ async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path
 
 
 async def test_a_second_block_replaces_the_first(tmp_path: Path) -> None:
-    """The answer has the earlier block; nothing more ends, and the number of blocks is the same."""
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE, 60, note="first")
         answer = await made.block(f"::ffff:{NODE}", note="second")
@@ -288,7 +271,6 @@ async def test_a_second_block_replaces_the_first(tmp_path: Path) -> None:
 
 
 async def test_spellings_and_names_of_a_host_are_one_block(tmp_path: Path) -> None:
-    """An IPv4-mapped address is the IPv4 address; an enrolled host is blocked by its name."""
     async with control(tmp_path, Clock()) as made:
         for text in (f"::ffff:{NODE}", "::FFFF:a00:5", "fd00::0:1", "fe80::1%eth0", "ocu-1", "host:ocu-1"):
             await made.block(text)
@@ -302,7 +284,6 @@ async def test_spellings_and_names_of_a_host_are_one_block(tmp_path: Path) -> No
 
 
 async def test_the_answer_names_other_addresses_of_the_machine(tmp_path: Path) -> None:
-    """A host in a tunnel has two addresses; blocking one leaves the other."""
     async with control(tmp_path, Clock()) as made:
         made.remotes = {"ocu-1": "192.0.2.20"}
         assert (await made.block("192.0.2.20")).other_addresses == ["10.99.0.2"]
@@ -315,7 +296,6 @@ async def test_the_answer_names_other_addresses_of_the_machine(tmp_path: Path) -
     "text", ["10.0.0.300", "10.0.0.0/24", "", "ocu-2", "10.0.0.5%eth0", "010.0.0.5", "x" * 500, "10.0.0.5\n"]
 )
 async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> None:
-    """The message quotes the text, and says what is valid."""
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(SenselessError, match="is neither an IPv4 or IPv6 address nor the name"):
             await made.block(text)
@@ -337,7 +317,6 @@ async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> Non
     ],
 )
 async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str, reason: str) -> None:
-    """The appliance's own calls come from loopback; others are not addresses of hosts. `--force` changes nothing."""
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(HostRefusedError, match=reason):
             await made.block(text, force=True)
@@ -345,7 +324,6 @@ async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str,
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, 0.5, 365 * 86_400 + 1, float("nan"), float("inf")])
 async def test_a_duration_out_of_bounds_is_rejected(tmp_path: Path, seconds: float) -> None:
-    """The message has the bounds."""
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(SenselessError, match="1 second to 365 days"):
             await made.block(NODE, seconds)
@@ -353,7 +331,6 @@ async def test_a_duration_out_of_bounds_is_rejected(tmp_path: Path, seconds: flo
 
 @pytest.mark.parametrize("note", ["n" * 201, "a\nb", "\x1b[31m"])
 async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
-    """A note is shown in terminals and in reasons."""
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(SenselessError, match="at most 200 characters"):
             await made.block(NODE, note=note)
@@ -386,7 +363,6 @@ async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path:
 
 
 async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A blocked host may be blocked again at the limit, another may not."""
     monkeypatch.setattr(block_orders, "MOST", 2)
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE)
@@ -399,14 +375,12 @@ async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pyte
 
 
 async def test_only_a_blocked_host_can_be_unblocked(tmp_path: Path) -> None:
-    """The message names the command that lists the blocks."""
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(UnknownThingError, match=f"{NODE} is not blocked: `rosrv host blocks`"):
             await made.unblock(NODE)
 
 
 async def test_an_order_at_the_moment_of_the_end_finds_one_state(tmp_path: Path) -> None:
-    """Either the order or the timer ends the block, never both."""
     clock = Clock()
     async with control(tmp_path, clock) as made:
         await made.block(NODE, 60)
@@ -438,7 +412,6 @@ async def test_a_block_that_is_not_stored_is_in_force_and_says_so(
 
 
 async def test_a_policy_that_is_loaded_keeps_the_blocks(tmp_path: Path) -> None:
-    """Every way to bring a policy into force goes through the same place."""
     async with control(tmp_path, Clock()) as made:
         await made.block(NODE)
         made.policies.file.write_text(OPEN + "# changed\n")

@@ -44,21 +44,18 @@ _NONE = RobotHealth(0, frozenset(), frozenset())
     ],
 )
 def test_only_the_robot_or_several_hosts_spoil_a_trial(denied: dict[str, int], why: str) -> None:
-    """Denials of one host, of one network or of unknown hosts do not count as illness, however many there are."""
     health = _NONE._replace(denials=counted_denials(denied, _POLICY))
     assert health.worse_than(_NONE).startswith(why)
     assert bool(health.worse_than(_NONE)) == bool(why)
 
 
 def test_other_hosts_hide_no_illness_of_the_robot() -> None:
-    """However many denials all other hosts make before a trial, 37 denials of the robot's nodes end it."""
     noise = {"": 10**6} | {f"10.1.0.{number}": 10**6 for number in range(1, 6)}
     before = _NONE._replace(denials=counted_denials(noise, _POLICY))
     assert _NONE._replace(denials=counted_denials({ROBOT: 37}, _POLICY)).worse_than(before)
 
 
 def test_denials_are_counted_by_host() -> None:
-    """The trail counts each denial for its host, all unknown hosts together, and no granted call."""
     log = Log()
     log.budget = Budget(lambda host: QuotaClass.UNKNOWN if host.startswith("203.") else QuotaClass.NAMED)
     trail = AuditTrail(log, strict=True, deny_when_failed=False, recordings=lambda *_: {})  # type: ignore[arg-type]  # stands for the log

@@ -15,7 +15,6 @@ def refusal(challenges: Challenges, challenge: str, now: float) -> str:
 
 
 def test_each_is_valid_once_and_until_its_end() -> None:
-    """A challenge is accepted once, and not after its expiry."""
     challenges = Challenges()
     first, second = challenges.give(100.0), challenges.give(100.0)
     assert refusal(challenges, first, 100.0 + SECONDS - 0.01) == ""
@@ -26,7 +25,6 @@ def test_each_is_valid_once_and_until_its_end() -> None:
 
 @pytest.mark.parametrize("text", ["", ".", "..", "9e9.x.y", "nan.x.y", "é", "99999999.000.x." + "0" * 64])
 def test_only_this_process_makes_valid_ones(text: str) -> None:
-    """Invented challenges, challenges with a changed expiry, and challenges of an earlier process are rejected."""
     challenges = Challenges()
     given = challenges.give(1.0)
     assert "has not issued this challenge" in refusal(challenges, text, 1.0)
@@ -36,7 +34,6 @@ def test_only_this_process_makes_valid_ones(text: str) -> None:
 
 
 def test_used_challenges_are_bounded() -> None:
-    """A limited number of used challenges is remembered until their expiry; requesting one uses no memory."""
     challenges = Challenges()
     refused = [refusal(challenges, challenges.give(5.0), 5.0) for _ in range(5000)]
     assert refused[:4096] == [""] * 4096

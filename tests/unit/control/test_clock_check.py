@@ -21,7 +21,6 @@ class Trail:
         self.events: list[str] = []
 
     def happened(self, event: str, _text: str, **_more: Any) -> None:
-        """Add a record."""
         self.events.append(event)
 
 
@@ -31,7 +30,6 @@ def trail() -> Trail:
 
 
 def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
-    """The period without synchronisation has a record at its beginning and its end; an unknown state has no record."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     for synchronised in (None, False, False, True, True, None, False):
         clock.synchronisation_reported(synchronised)
@@ -40,7 +38,6 @@ def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
 
 
 def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
-    """A start with a correct clock makes no record."""
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     clock.synchronisation_reported(True)
     clock.look()
@@ -48,7 +45,6 @@ def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
 
 
 def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
-    """Each step back has one record however often the clock is checked; a step of one second is ignored."""
     behind = [1.5]
     clock = ClockCheck(cast(AuditTrail, trail), lambda: behind[0])
     clock.look()
@@ -72,7 +68,6 @@ def test_each_step_forward_is_recorded(trail: Trail) -> None:
     ("days", "said"), [(0.5, None), (2000.0, "wrong: 2000 days before this program was built")]
 )
 def test_a_clock_before_the_build_date_is_reported(trail: Trail, days: float, said: str | None) -> None:
-    """The machine does not know the time yet, and no earlier record reveals the error."""
     made = Path(shipped.__file__).stat().st_mtime
     clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
     clock.synchronisation_reported(True)

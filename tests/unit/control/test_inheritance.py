@@ -16,7 +16,6 @@ from tests.support.standby_site import memberships
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[StateStore]:
-    """Yield a state file, which both appliances share here, as the replication makes both equal."""
     made = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield made
     made.close()
@@ -24,7 +23,6 @@ def store(tmp_path: Path) -> Iterator[StateStore]:
 
 @pytest.fixture(scope="module")
 def members(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Pair]]:
-    """Yield both appliances, without an epoch."""
     made, *_settings = memberships(tmp_path_factory.mktemp("members"))
     yield {
         name: Pair(one, LeaseClient(), 0, None, taken_over=True, tunnels=StandbyTunnels())
@@ -48,24 +46,20 @@ class Pairs:
         return state.lost, state.left
 
     def hand_over(self, content: bytes) -> None:
-        """Leave the state of one relay in a planned switchover."""
         self.store.save_monitor_state(0, self.epoch, content)
 
 
 @pytest.fixture
 def pairs(members: dict[str, Pair], store: StateStore) -> Pairs:
-    """Return both appliances with a common state."""
     return Pairs(members, store)
 
 
 def test_the_first_active_appliance_keeps_its_own_state(pairs: Pairs) -> None:
-    """No other appliance was active, so its relays use their own memory, also after it lost the lease for a while."""
     assert pairs.active("a") == ("", ())
     assert pairs.active("a") == ("", ())
 
 
 def test_after_a_failure_the_state_is_lost(pairs: Pairs) -> None:
-    """The other appliance's monitors may have changed it until the last moment."""
     pairs.active("a")
     lost, left = pairs.active("b")
     assert "appliance a was active" in lost
@@ -75,7 +69,6 @@ def test_after_a_failure_the_state_is_lost(pairs: Pairs) -> None:
 
 
 def test_a_planned_switchover_passes_the_state_on_once(pairs: Pairs) -> None:
-    """It is used by the next active appliance, and not by a later one."""
     pairs.active("a")
     pairs.hand_over(b"left by a")
     assert pairs.active("b") == ("", (b"left by a",))
@@ -83,7 +76,6 @@ def test_a_planned_switchover_passes_the_state_on_once(pairs: Pairs) -> None:
 
 
 def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs) -> None:
-    """The switchover failed, the appliance passed messages again, and died later."""
     pairs.active("a")
     pairs.hand_over(b"left by a")
     pairs.active("a")

@@ -33,7 +33,6 @@ CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
 @pytest.mark.nightly
 @pytest.mark.parametrize("guarded", [True, False])
 async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
-    """Idle connections are closed even by the ROS master, which keeps a connection to each node that ever existed."""
     given = Settings()
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
@@ -59,10 +58,6 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
 
 
 def test_hosts_of_a_wildcard_share_processor_time() -> None:
-    """All hosts that only `*` names count as one host.
-
-    Named hosts, registered hosts and named networks count as one each.
-    """
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1 10.1.0.0/16\n/guest/** = *\n", file="a.ini")
     registered = address_of("10.9.0.7")
     quota_class = {registered: QuotaClass.REGISTERED}
@@ -93,7 +88,6 @@ def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
 
 
 def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLimits) -> None:
-    """While two hundred hosts of `*` keep connecting, a named host and a registered host of `*` can still connect."""
     arriving = everybodys.connection_table.arriving
     for number in range(200):
         for _ in range(20):
@@ -105,7 +99,6 @@ def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLim
 
 
 def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
-    """Two hundred hosts of `*` register a node each and keep connecting: the slots reserved for the robot stay free."""
     policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
     log = open_log(tmp_path / "audit.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
@@ -138,13 +131,11 @@ class Opened:
         """Do nothing: no connection expires in this test."""
 
     def abort(self) -> None:
-        """Free the slot."""
         self.cut = True
         self._visitors.leave(self)
 
 
 def test_connections_of_a_wildcard_displace_no_named_host(everybodys: ListenerLimits) -> None:
-    """Hosts of `*` keep thousands of requests unfinished: a named host connects and is never displaced."""
     connection_table = everybodys.connection_table
     robots = [Opened(connection_table, ROBOT, Stage.IDLE) for _ in range(100)]
     crowd = [
@@ -162,7 +153,6 @@ ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")
     ("tell", "told"), [("rule", "10.0.0.1 is blocked by an operator ["), ("id", "denied [")]
 )
 def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, tell: str, told: str) -> None:
-    """The record has the whole reason, and the answer what `tell` allows; the appliance's own calls are served."""
     policy = compile_policy(
         f"[Options]\ntell = {tell}\naudit-only = all\n[Nodes]\ndefault = *\n", file="a.ini"
     )
@@ -197,7 +187,6 @@ def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, te
     ],
 )
 def test_a_request_that_is_not_http_exceeds_no_limit(status: str, event: str) -> None:
-    """A TCPROS header or a TLS handshake at RVMaster's port is recorded as malformed, whatever its size."""
     records: list[tuple[str, str]] = []
     trail = SimpleNamespace(
         happened=lambda event, reason, **_more: records.append((event, reason)), pause=None, still_owing=None

@@ -31,7 +31,6 @@ def test_counters_begin_at_zero() -> None:
 
 
 def test_names_are_bounded() -> None:
-    """Past the limit, further names share one series; the total stays complete."""
     sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
     assert len(sums) == MOST_RESOURCES + 1
     assert sums[OTHERS] == [500]
@@ -39,13 +38,11 @@ def test_names_are_bounded() -> None:
 
 
 def test_few_topics_have_their_own_histogram() -> None:
-    """Histograms have many series each, so their limit is lower."""
     sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
     assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}
 
 
 def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A restarted node is a new incarnation: the counters of its topic continue, and the number of names is bounded."""
     monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
     registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
     for number in range(4):
@@ -70,7 +67,6 @@ def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
-    """The registration gives the type and a header the md5sum; a later report without an md5sum changes nothing."""
     registry = Registry()
     node = Incarnation("k", "/node", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2)
     registry.add(node)

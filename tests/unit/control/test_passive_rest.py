@@ -34,24 +34,20 @@ class Standby:
         return example(StandbyState, role="standby", other={"name": "a", "address": "10.0.0.1"})
 
     async def hand_over(self) -> None:
-        """Raise `HandOverError`."""
         raise HandOverError("not now")
 
 
 def made(name: str) -> tuple[TokenRow, str]:
-    """Return a token, and its text."""
     return make_token(name, "viewer", now=wall(), seconds=60)
 
 
 def save(folder: Path, *rows: TokenRow) -> None:
-    """Store tokens, as replication does."""
     store = StateStore(folder, failed=pytest.fail, kind=InlineDatabase)
     store.save_tokens(*rows)
     store.close()
 
 
 def rest_of(folder: Path) -> PassiveRest:
-    """Return the link to the api of a standby whose state is in this folder."""
     tokens = ReplicatedTokens(folder / "state.db")
     return PassiveRest(StandbyAdministration(Standby(), orders=False), tokens)
 
@@ -94,9 +90,6 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
 async def test_no_tokens_are_stated_before_they_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    """Without a state file the api receives no list, so it answers 503; once there is a list, also an empty one, it
-    receives it.
-    """
     monkeypatch.setattr("appliance.control.passive_rest._READ_SECONDS", 0.01)
     rest = rest_of(tmp_path)
     api, heard = attached(rest)
@@ -114,7 +107,6 @@ async def test_no_tokens_are_stated_before_they_are_read(
 
 
 def test_keys_and_tokens_are_of_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A token that is made while the tokens are read is in the next list, with its keys."""
     first, second = made("alice")[0], made("bob")[0]
     save(tmp_path, first)
     tokens = ReplicatedTokens(tmp_path / "state.db")

@@ -90,7 +90,6 @@ class Appliance:
 
 
 async def until(policies: Policies, revision: int) -> None:
-    """Wait until this revision is in force."""
     async with asyncio.timeout(10):
         while policies.revision != revision:
             await asyncio.sleep(0.01)
@@ -98,7 +97,6 @@ async def until(policies: Policies, revision: int) -> None:
 
 @pytest.mark.nightly
 async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Path) -> None:
-    """Engineers who locked themselves out may restart the appliance: the timeout still applies."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -118,7 +116,6 @@ async def test_an_unconfirmed_change_is_rolled_back_after_a_restart(tmp_path: Pa
 
 @pytest.mark.nightly
 async def test_a_reload_warns_of_hosts_that_lose_everything(tmp_path: Path) -> None:
-    """A host whose nodes keep none of their rights is named, with some nodes; one that keeps a right is not."""
     appliance = Appliance(tmp_path)
     robot, other = ipaddress.ip_address("192.168.1.10"), ipaddress.ip_address("10.0.0.2")
     live = [LiveRight(robot, f"/n{number}", "registerPublisher", "/scan") for number in range(5)]
@@ -134,7 +131,6 @@ async def test_a_reload_warns_of_hosts_that_lose_everything(tmp_path: Path) -> N
 
 
 async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The note and the record have the author, but a reload by a signal has none; the text is the disk's."""
     with Appliance(tmp_path).started() as policies:
         recorded: list[object] = []
         monkeypatch.setattr(Records, "happened", lambda *_texts, **detail: recorded.append(detail["who"]))
@@ -150,7 +146,6 @@ async def test_a_reload_names_its_author(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.nightly
 async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> None:
-    """After a power cut the clock may be years back; the rollback comes no later than requested."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -162,7 +157,6 @@ async def test_a_clock_set_back_does_not_extend_the_timeout(tmp_path: Path) -> N
 
 @pytest.mark.nightly
 async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
-    """If the file was changed, the start loads a new policy, and the old timeout never fires, even after a crash."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -176,7 +170,6 @@ async def test_an_edited_file_ends_the_timeout(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
-    """After a crash of control a confirmed change stays confirmed, and an unconfirmed change stays unconfirmed."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -210,7 +203,6 @@ class Slow:
 
 @pytest.mark.nightly
 async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A long policy with many tests is read, compiled and tested outside the loop."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         slow = Slow(monkeypatch, appliance)
@@ -227,7 +219,6 @@ async def test_a_reload_does_not_block_nodes(tmp_path: Path, monkeypatch: pytest
 async def test_a_reload_overtaken_by_another_change_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A policy that came into force during the tests is not silently replaced."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         slow = Slow(monkeypatch, appliance)
@@ -245,7 +236,6 @@ async def test_a_reload_overtaken_by_another_change_is_refused(
 async def test_hosts_changed_during_the_tests_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A host whose certificate is revoked during the load has no rights by its old address."""
     appliance = Appliance(tmp_path)
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
     with appliance.started(hosts=lambda: hosts) as policies:
@@ -280,7 +270,6 @@ REFUSED: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("reason", REFUSED)
 async def test_a_file_that_a_reload_refuses_is_refused_at_a_start(tmp_path: Path, reason: str) -> None:
-    """Each check of a load also holds at a start: the revision in force stays, and the alarm has the reason."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     beside.write_text(signed(OPEN))
@@ -306,7 +295,6 @@ async def test_a_file_that_a_reload_refuses_is_refused_at_a_start(tmp_path: Path
 
 
 async def test_a_refused_file_does_not_end_the_timeout(tmp_path: Path) -> None:
-    """An unconfirmed change still goes back if the file is broken at the start in between."""
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
@@ -318,7 +306,6 @@ async def test_a_refused_file_does_not_end_the_timeout(tmp_path: Path) -> None:
 
 
 async def test_the_first_start_has_nothing_to_keep(tmp_path: Path) -> None:
-    """Without a revision that was in force, a policy that fails its tests ends the start, with all findings."""
     appliance = Appliance(tmp_path)
     REFUSED["its tests fail"](appliance.file)
     with pytest.raises(PolicyRefusedError, match=r"policy.ini.tests.yaml:2:"):
@@ -349,7 +336,6 @@ async def test_a_crash_during_an_unconfirmed_change_rolls_it_back(tmp_path: Path
 
 @pytest.mark.nightly
 async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The store is read in a thread while nodes are served, so a slow disk delays no node."""
     with Appliance(tmp_path).started() as policies:
         read, loop_thread, asked = policies.store.database.query, threading.get_ident(), []
 
@@ -385,7 +371,6 @@ async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) 
 
 @pytest.mark.nightly
 async def test_a_site_that_signs_accepts_only_signed_policies(tmp_path: Path) -> None:
-    """Start, reload, posted text, rollback, and the start after a crash each check the site's signature."""
     appliance = Appliance(tmp_path)
     beside = tmp_path / "policy.ini.sig"
     with pytest.raises(PolicyRefusedError, match="it has no signature of the site"):
@@ -414,7 +399,6 @@ async def test_a_site_that_signs_accepts_only_signed_policies(tmp_path: Path) ->
 
 @pytest.mark.nightly
 async def test_a_rollback_restores_a_signed_revision(tmp_path: Path) -> None:
-    """The revision before an unconfirmed change still has its signature."""
     appliance = Appliance(tmp_path)
     (tmp_path / "policy.ini.sig").write_text(signed(OPEN))
     with appliance.started(site_keys=[LINE]) as policies:
@@ -441,7 +425,6 @@ async def test_keys_are_replaced_while_both_are_valid(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
-    """Posting the same text again changes nothing, and a running timeout continues; another text is a new revision."""
     with Appliance(tmp_path).started() as policies:
         first = await policies.load(PolicyLoad(OTHER, confirm_within=100.0), "adam")
         again = await policies.load(PolicyLoad(OTHER, "once more"), "eve")
@@ -468,7 +451,6 @@ async def test_a_change_for_an_earlier_revision_is_refused(tmp_path: Path) -> No
 
 
 async def test_revisions_have_their_authors_and_notes(tmp_path: Path) -> None:
-    """A rollback makes a new revision of an old text; a revision that is not kept is an error."""
     with Appliance(tmp_path).started() as policies:
         await policies.load(PolicyLoad(OTHER, note="trial"), "alice")
         await policies.roll_back(PolicyRollback(1), "bob")

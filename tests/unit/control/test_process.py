@@ -32,12 +32,10 @@ class Ports(idle_class(ProxyEndpoints)):  # type: ignore[misc]  # it is made
     """Ports that can all be bound again after a restart."""
 
     async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
-        """Reopen the ports, as `ProxyEndpoints` does."""
         return []
 
 
 async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None:
-    """The policy may have changed while control was stopped: the new one applies once all nodes are restored."""
     store = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
     before = Registry()
     host = ipaddress.ip_address("10.0.0.5")
@@ -70,7 +68,6 @@ async def test_restored_nodes_follow_the_policy_in_force(tmp_path: Path) -> None
 
 
 def test_requests_in_progress_are_stored_before_the_end(tmp_path: Path) -> None:
-    """A request that changes state during the shutdown is written before the store is closed."""
     store = StateStore(tmp_path, failed=fail, kind=InlineDatabase)
 
     async def scenario() -> bool:

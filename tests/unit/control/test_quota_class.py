@@ -13,7 +13,6 @@ NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2"
 
 
 def test_the_class_follows_reloads_and_registrations() -> None:
-    """A rule that names the host, and then a registration, raise its class; without the rule it is unknown again."""
     policies = [
         compile_policy("[Nodes]\n/a = 10.0.0.1\n", file="a.ini"),
         compile_policy("[Nodes]\n/a = 10.0.0.2\n", file="b.ini"),
@@ -31,7 +30,6 @@ def test_the_class_follows_reloads_and_registrations() -> None:
 
 
 def test_recordings_are_charged_by_the_policys_names() -> None:
-    """Named hosts are charged separately, the hosts of a named network as one, and all unknown hosts as one."""
     policy = compile_policy(
         "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n", file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")]
     )
@@ -47,7 +45,6 @@ def test_recordings_are_charged_by_the_policys_names() -> None:
 
 
 def test_a_blocked_host_is_unknown() -> None:
-    """Its quota is shared with all unknown hosts, and so is the charge for recordings about it."""
     policy = replace(
         compile_policy("[Nodes]\n/a = 10.0.0.1 10.0.0.2\n", file="a.ini"), blocks={NAMED: "blocked"}
     )
@@ -57,7 +54,6 @@ def test_a_blocked_host_is_unknown() -> None:
 
 
 def test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart() -> None:
-    """On a nearly full disk the robot and named hosts are served without a registration, and no guest with one is."""
     rules = "[Groups]\nocus = 10.2.0.0/24\n[Nodes]\n/a = 10.0.0.1 ocus\ndefault = *\n"
     policy = compile_policy(rules, file="a.ini", robot=[ipaddress.ip_address("172.17.0.1")])
     registered: dict[object, int] = {ipaddress.ip_address("10.0.0.66"): 1}

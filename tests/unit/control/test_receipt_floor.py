@@ -11,7 +11,6 @@ _FILES: dict[str, Any] = {name: Path(name) for name in ("ca", "certificate", "ke
 
 
 def floor(folder: Path, *, waits: bool, reserve: int = 1 << 20) -> ReceiptFloor:
-    """Return the floor of an appliance with its state in `folder`."""
     (folder / "control").mkdir()
     fleet = Fleet(collector="https://10.0.0.9:8444", retention_waits=waits, **_FILES)
     audit = Audit(retention_days=30.0, reserve_bytes=reserve)
@@ -19,7 +18,6 @@ def floor(folder: Path, *, waits: bool, reserve: int = 1 << 20) -> ReceiptFloor:
 
 
 def test_it_follows_the_receipts(tmp_path: Path) -> None:
-    """At first no record may be removed, then those with a receipt."""
     waiting = floor(tmp_path, waits=True)
     assert waiting.through() == 0
     waiting.received(812)
@@ -34,7 +32,6 @@ def test_without_the_setting_it_allows_any_record(tmp_path: Path) -> None:
 
 
 def test_on_a_nearly_full_disk_it_allows_any_record(tmp_path: Path) -> None:
-    """The disk wins: while only the reserve is free, retention does not wait."""
     waiting = floor(tmp_path, waits=True, reserve=1 << 60)
     waiting.received(812)
     assert waiting.through() == _ANY

@@ -35,12 +35,10 @@ class Trail:
         self.failure: str | None = None
 
     def happened(self, event: str, _reason: str, **detail: Any) -> str:
-        """Record, as `AuditTrail` does."""
         self.events.append((event, detail))
         return "record"
 
     async def durable(self) -> str | None:
-        """Wait, as `AuditTrail` does."""
         return self.failure
 
 
@@ -57,7 +55,6 @@ class Scene:
         )
 
     def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
-        """Attach a recorder with these answers."""
         ours, theirs = socket.socketpair()
         self.orders.link.attach(Channel(ours, messages.RecorderLink))
         recorder = Channel(theirs, messages.RecorderLink)
@@ -72,19 +69,16 @@ class Scene:
 
 @pytest.fixture
 def scene() -> Scene:
-    """Return control without a recorder."""
     return Scene()
 
 
 async def told(scene: Scene, done: Callable[[], bool]) -> None:
-    """Wait until control has received this message."""
     async with asyncio.timeout(10):
         while not done():
             await asyncio.sleep(0)
 
 
 async def test_a_missing_recorder_is_reported() -> None:
-    """The message gives advice; the status shows it as well."""
     off = Scene(enabled=False)
     assert off.orders.state() is None
     with pytest.raises(UnknownThingError, match="enabled: true"):
@@ -99,7 +93,6 @@ async def test_a_missing_recorder_is_reported() -> None:
 
 @pytest.mark.nightly
 async def test_a_call_of_the_service_is_an_order() -> None:
-    """The order has the node's name and host; the node gets the recording's id, or the reason for the refusal."""
     heard: list[Any] = []
     call = messages.OwnServiceCalled(7, "/rosrv/record_now", "10.0.0.5", "/arm")
 
@@ -128,7 +121,6 @@ async def test_a_call_of_the_service_is_an_order() -> None:
 
 @pytest.mark.nightly
 async def test_a_closed_recording_is_recorded_and_listed() -> None:
-    """A removed recording leaves the list for any cause of the removal; reading an unknown recording is an error."""
     heard: list[Any] = []
     scene = Scene()
 
@@ -165,8 +157,6 @@ async def test_a_closed_recording_is_recorded_and_listed() -> None:
 
 @pytest.mark.nightly
 async def test_orders_have_the_name_of_their_operator() -> None:
-    """The trigger has the id of the audit record with the operator's name; an invalid order is never recorded."""
-
     def answer(message: Any) -> list[messages.Message]:
         match message:
             case messages.RecordingRequested(number, trigger, before, after):
@@ -228,7 +218,6 @@ async def test_a_fetch_needs_a_record(scene: Scene) -> None:
 
 @pytest.mark.nightly
 async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
-    """The waiting operator gets the reason without a timeout."""
     recorder = scene.attach(lambda _message: [])
     asked = asyncio.ensure_future(scene.orders.now(admin.RecordNow(), "eve"))
     await told(scene, lambda: bool(scene.trail.events))
@@ -239,7 +228,6 @@ async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
 
 @pytest.mark.nightly
 async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
-    """Both the order and the fetch are recorded; the fetched memory stays available for later orders for a while."""
     lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
 
     def answer(message: Any) -> list[messages.Message]:

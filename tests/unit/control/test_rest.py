@@ -39,13 +39,11 @@ ADMIN, TOKEN = make_token("w", "admin", now=0.0, seconds=1e10)
 
 
 def kept(row: TokenRow) -> TokenKept:
-    """Return a token's record as the api gets it."""
     assert row.keys is not None
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, row.keys.reading)
 
 
 def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
-    """Return an order to load a policy, as an honest api passes it on."""
     asked = ClientRequest("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
     return RequestMade(number, PolicyLoad(text), shown, asked)
 
@@ -64,7 +62,6 @@ class Everything:
         self.go.set()
 
     async def carry_out(self, request: AnyRequest, *, who: str) -> AdminAnswer[Any]:
-        """Answer when the test says so."""
         if not isinstance(request, StatusWanted) or not self.only_slow:
             await self.go.wait()
         try:
@@ -77,18 +74,15 @@ class Everything:
         return AdminAnswer(True, example(Status, nodes=len(self.asked)))
 
     def usable(self) -> list[TokenKept]:
-        """Return two tokens."""
         return [kept(VIEWER), kept(ADMIN)]
 
     def usable_row(self, token_id: str) -> TokenRow | None:
         return {VIEWER.id: VIEWER, ADMIN.id: ADMIN}.get(token_id)
 
     def used(self, token_id: str) -> None:
-        """Add a use of a token."""
         self.uses.append(token_id)
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Add a record."""
         self.recorded.append({"event": event, "reason": reason, **fields})
         return "id"
 
@@ -104,19 +98,16 @@ class Api:
         self.heard = self._ear.messages
 
     async def until(self, count: int) -> list[Any]:
-        """Wait until this number of messages was received, and return all of them."""
         return await self._ear.until(count)
 
 
 @pytest.fixture
 def pins() -> list[str]:
-    """Return the list of pins that control received from the api."""
     return []
 
 
 @pytest.fixture
 def world() -> Iterator[Everything]:
-    """Return the parts around the link, whose channels are closed at the end."""
     world = Everything()
     yield world
     for end in world.ends:
@@ -125,7 +116,6 @@ def world() -> Iterator[Everything]:
 
 @pytest.fixture
 def link(world: Everything, pins: list[str]) -> RestLink:
-    """Return control's end."""
     parts: Any = world  # `Everything` is all three
     return RestLink(
         parts, parts, parts, served=pins.append, certified=lambda _sha256: None, require_proof=False
@@ -134,24 +124,20 @@ def link(world: Everything, pins: list[str]) -> RestLink:
 
 @pytest.fixture
 async def api(world: Everything, link: RestLink) -> Api:
-    """Return the first api of the link."""
     return Api(world, link)
 
 
 def answer_of(message: RequestAnswered) -> AdminAnswer[Status]:
-    """Return the decoded answer to a status request."""
     return decode(message.answer, StatusWanted())
 
 
 async def test_tokens_are_sent_at_once_and_after_every_change(link: RestLink, api: Api) -> None:
-    """A new api gets the tokens first, and each change without a request."""
     assert await api.until(1) == [TokensStated([kept(VIEWER), kept(ADMIN)])]
     link.state_tokens()
     assert len(await api.until(2)) == 2
 
 
 async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -> None:
-    """Enrolments that wait for charon run beside other requests, up to a limit, and are then answered."""
     world.only_slow = True
     world.go.clear()
     for number in range(20):
@@ -165,7 +151,6 @@ async def test_enrolments_block_no_other_requests(world: Everything, api: Api) -
 
 
 async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: list[str]) -> None:
-    """The api sends the pin of its key; an invalid pin ends the link."""
     pin = "sha256//" + "A" * 43 + "="
     api.channel.send(RestServed(pin))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
@@ -178,7 +163,6 @@ async def test_the_pin_of_the_api_is_passed_on(link: RestLink, api: Api, pins: l
 
 
 async def test_answers_are_in_order_with_their_numbers(world: Everything, api: Api) -> None:
-    """Requests run one after the other, each in the name of its token."""
     for number in (7, 3, 9):
         api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
     heard = await api.until(4)
@@ -188,7 +172,6 @@ async def test_answers_are_in_order_with_their_numbers(world: Everything, api: A
 
 
 async def test_a_flood_is_answered_busy_at_once(world: Everything, api: Api) -> None:
-    """Requests beyond the limit are answered busy while the others are served."""
     world.go.clear()
     for number in range(200):
         api.channel.send(RequestMade(number, StatusWanted(), TOKEN))
@@ -200,7 +183,6 @@ async def test_a_flood_is_answered_busy_at_once(world: Everything, api: Api) -> 
 
 
 async def test_abandoned_orders_do_not_take_effect(world: Everything, api: Api, pins: list[str]) -> None:
-    """An order past its timeout, or whose client or api is gone, is withdrawn; others take effect."""
     world.go.clear()
     api.channel.send(loading(1, "answered"))
     api.channel.send(msgspec.structs.replace(loading(2, "late"), until=clock.now() - 1.0))
@@ -220,7 +202,6 @@ async def test_abandoned_orders_do_not_take_effect(world: Everything, api: Api, 
 
 
 async def test_a_defect_costs_one_answer(api: Api) -> None:
-    """The answer reveals nothing of the error, and the next request is served."""
     api.channel.send(loading(1, "defect"))
     api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
     _tokens, failed, served = await api.until(3)
@@ -230,7 +211,6 @@ async def test_a_defect_costs_one_answer(api: Api) -> None:
 
 
 async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everything, api: Api) -> None:
-    """With on_audit_failure deny a change is refused with the reason; reading is possible."""
     world.obstacle = "the audit log cannot be written: disk full"
     api.channel.send(loading(1, "[Nodes]"))
     api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
@@ -241,7 +221,6 @@ async def test_nothing_is_changed_while_the_log_cannot_be_written(world: Everyth
 
 
 async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api) -> None:
-    """If an api invents a name or a role for a token, nothing is changed; reading continues."""
     for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
         api.channel.send(loading(number, "[Nodes]", shown))
     api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
@@ -252,7 +231,6 @@ async def test_a_change_with_a_wrong_name_is_refused(world: Everything, api: Api
 
 
 async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) -> None:
-    """A request to create a token, a message of another link, and garbage end the link; another api is served."""
     token = {"message": "RequestMade", "number": 1, "shown": TOKEN, "request": {"verb": "token add"}}
     for body in (
         msgspec.msgpack.encode(token),
@@ -272,7 +250,6 @@ async def test_invalid_messages_end_the_link(world: Everything, link: RestLink) 
 
 
 async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everything, link: RestLink) -> None:
-    """The request of an api that died does not delay its successor."""
     world.go.clear()
     first = Api(world, link)
     for number in range(3):
@@ -289,7 +266,6 @@ async def test_a_new_api_does_not_wait_for_the_old_ones_request(world: Everythin
 
 @pytest.mark.nightly
 async def test_an_api_that_does_not_read_loses_its_link(world: Everything, link: RestLink) -> None:
-    """If the api does not read its answers, control closes the link before memory grows."""
     here, there = socket.socketpair()
     control = Channel(here, ApiLink, limit=100_000)
     link.attach(control)
@@ -309,7 +285,6 @@ async def test_an_api_that_does_not_read_loses_its_link(world: Everything, link:
 
 
 async def test_calls_are_recorded_with_their_outcome(world: Everything, api: Api) -> None:
-    """A refusal is a denial and a warning; an unknown caller has no name; long texts are cut."""
     api.channel.send(RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
     api.channel.send(RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
@@ -321,7 +296,6 @@ async def test_calls_are_recorded_with_their_outcome(world: Everything, api: Api
 
 
 async def test_uses_of_tokens_are_not_recorded(world: Everything, api: Api) -> None:
-    """The part that has the tokens gets them; the audit log does not."""
     api.channel.send(TokenUsed(VIEWER.id))
     api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
     await api.until(2)

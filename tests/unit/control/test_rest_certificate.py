@@ -12,7 +12,6 @@ from tests.support.engines import InlineDatabase
 
 
 def test_a_replaced_certificate_is_recorded_once(tmp_path: Path) -> None:
-    """Over restarts of the api and of control; each of two appliances has its own."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     records = Records()
 

@@ -30,5 +30,4 @@ asyncio.run(main())
 
 
 def test_freed_memory_is_returned() -> None:
-    """glibc keeps much of the freed memory; the watch returns it to the system."""
     subprocess.run([sys.executable, "-c", _FREED], check=True, timeout=30)

@@ -31,23 +31,19 @@ class Pair:
         return example(StandbyState, name="a", role=self.role, other=other)
 
     async def hand_over(self) -> None:
-        """Change the role, or raise `HandOverError`."""
         if self.refusal:
             raise HandOverError(self.refusal)
         self.did.append("handed over")
         self.role = "standby" if self.role == "active" else "active"
 
     def happened(self, event: str, reason: str, *, who: str) -> str:
-        """Keep a record."""
         self.did.append(f"{event} by {who}: {reason}")
         return "id"
 
     async def durable(self) -> None:
-        """Keep that all records so far are on disk."""
         self.did.append("on disk")
 
     def orders(self) -> StandbyOrders:
-        """Return the answers of the appliance in service."""
         return StandbyOrders(self, cast(AuditTrail, self))
 
 
@@ -64,7 +60,6 @@ async def test_the_order_is_on_disk_before_the_switchover() -> None:
 
 
 async def test_a_failed_switchover_is_recorded_with_its_reason() -> None:
-    """The operator gets the reason, and so does the audit log."""
     pair = Pair("active")
     pair.refusal = "b does not have all changes"
     with pytest.raises(HandOverError, match="b does not have all changes"):
@@ -75,7 +70,6 @@ async def test_a_failed_switchover_is_recorded_with_its_reason() -> None:
 
 @pytest.mark.parametrize("request_", [admin.StandbyWanted(), admin.StandbyPromote()])
 async def test_a_single_appliance_says_how_it_gets_a_standby(request_: Any) -> None:
-    """Both requests are unknown there (404), and nothing is recorded."""
     pair = Pair("active")
     orders = StandbyOrders(SingleAppliance(), cast(AuditTrail, pair))
     with pytest.raises(UnknownThingError, match="rosrv standby join"):
@@ -88,7 +82,6 @@ async def test_a_single_appliance_says_how_it_gets_a_standby(request_: Any) -> N
 
 
 async def test_a_standby_answers_nothing_else() -> None:
-    """Every other request gets the name and the address of the active appliance, whatever it asks."""
     pair = Pair("standby")
     handler = StandbyAdministration(pair, orders=True)
     requests: list[admin.AdminRequest[Any]] = [
@@ -103,7 +96,6 @@ async def test_a_standby_answers_nothing_else() -> None:
 
 
 async def test_only_the_admin_socket_of_a_standby_orders_a_switchover() -> None:
-    """Over REST the order is for the active appliance; a reason against it reaches the operator."""
     pair = Pair("standby")
     over_rest = StandbyAdministration(pair, orders=False)
     assert (await over_rest.carry_out(admin.StandbyPromote(), who="alice")).trouble == "standby"

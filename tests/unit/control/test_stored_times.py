@@ -33,7 +33,6 @@ WALL = 1_790_000_000.0
 
 @pytest.fixture(scope="module")
 def members(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
-    """Return both appliances."""
     made, *_settings = memberships(tmp_path_factory.mktemp("members"))
     return {
         name: Pair(one, LeaseClient(), 0, None, taken_over=True, tunnels=StandbyTunnels())
@@ -53,27 +52,23 @@ class Two:
         self.store = StateStore(home, failed=pytest.fail, kind=InlineDatabase)
 
     def let_pass(self, seconds: float) -> None:
-        """Let time pass on both appliances."""
         for machine in self.clocks.values():
             machine.advance(seconds)
 
     @contextlib.contextmanager
     def active(self, name: str, away_seconds: float | None = None) -> Iterator[BlockTable]:
-        """Make an appliance active."""
         folder = self.home / name
         folder.mkdir(exist_ok=True)
         with clock.using(self.clocks[name]):
             yield blocks_at_start(self.store, self.members[name]._replace(away_seconds=away_seconds), folder)
 
     async def note(self, name: str, blocks: BlockTable) -> None:
-        """Replicate one reading of the clocks."""
         blocks.read_clock()
         noting = asyncio.create_task(note_times(self.store, self.members[name], blocks.age_now))
         await asyncio.sleep(0)
         noting.cancel()
 
     def left(self, blocks: BlockTable) -> dict[str, float]:
-        """Return the seconds that each duration has left, by the present appliance's clocks."""
         blocks.read_clock()
         settings, now = self.store.settings(), clock.wall()
         [row] = self.store.tokens()
@@ -89,7 +84,6 @@ class Two:
         }
 
     def begin(self, blocks: BlockTable) -> None:
-        """Begin one duration of each kind: an hour."""
         now = clock.wall()
         for name in LIMITS:
             self.store.save_setting(name, f"1 {now + HOUR} {HOUR}")
@@ -104,7 +98,6 @@ class Two:
 
 @pytest.fixture
 def two(tmp_path: Path, members: dict[str, Pair]) -> Iterator[Callable[[float], Two]]:
-    """Return the two appliances for a difference between their clocks."""
     made: list[Two] = []
 
     def make(ahead: float) -> Two:
@@ -120,7 +113,6 @@ def two(tmp_path: Path, members: dict[str, Pair]) -> Iterator[Callable[[float], 
 async def test_every_duration_keeps_its_length_over_takeovers(
     two: Callable[[float], Two], ahead: float
 ) -> None:
-    """It ends when the time has passed that was ordered, also after a takeover back."""
     pair = two(ahead)
     with pair.active("a") as blocks:
         blocks.read_clock()
@@ -143,7 +135,6 @@ async def test_every_duration_keeps_its_length_over_takeovers(
 async def test_without_a_view_of_the_other_appliance_durations_go_on_from_the_last_reading(
     two: Callable[[float], Two],
 ) -> None:
-    """After a time in which no appliance ran, a block has the time left that it had; tokens keep their date."""
     pair = two(HOUR)
     with pair.active("a") as blocks:
         blocks.read_clock()
@@ -158,7 +149,6 @@ async def test_without_a_view_of_the_other_appliance_durations_go_on_from_the_la
 
 
 async def test_a_single_appliance_moves_nothing(two: Callable[[float], Two]) -> None:
-    """Without another appliance, times stay in the clocks of this one."""
     pair = two(0.0)
     with pair.active("a") as blocks:
         blocks.read_clock()
@@ -198,7 +188,6 @@ DATES = {
 
 
 async def test_every_stored_time_is_moved_or_a_date() -> None:
-    """A new column with a time is moved at a takeover, or its row says why not."""
     found = {"host_block.ends"}
     for table, columns in re.findall(
         r"CREATE TABLE IF NOT EXISTS (\w+) \((.*?)\)(?: WITHOUT ROWID)?;", SCHEMA, re.DOTALL

@@ -41,18 +41,15 @@ class Supervisor:
         self._more.set()
 
     async def until_asked(self, count: int) -> None:
-        """Wait for this number of questions."""
         async with asyncio.timeout(_LIMIT_SECONDS):
             while len(self.asked) < count:
                 self._more.clear()
                 await self._more.wait()
 
     def answer(self, host: str) -> None:
-        """Send the route to a host."""
         self.say(RouteFound(host, f"way to {host}"))
 
     def say(self, message: Message) -> None:
-        """Send control a message."""
         self._channel.send(message)
 
     def close(self) -> None:
@@ -61,7 +58,6 @@ class Supervisor:
 
 @pytest.fixture
 def answers() -> list[TunnelsEnclosed]:
-    """Return the supervisor's answers about tunnels."""
     return []
 
 
@@ -77,7 +73,6 @@ async def ends(answers: list[TunnelsEnclosed]) -> AsyncIterator[tuple[ControlLif
 
 
 async def test_a_route_is_requested_once(ends: tuple[ControlLifeline, Supervisor]) -> None:
-    """One question serves all waiting callers; a later caller asks again."""
     lifeline, supervisor = ends
     many = [asyncio.create_task(lifeline.route_to("a")) for _ in range(50)]
     await supervisor.until_asked(1)
@@ -91,7 +86,6 @@ async def test_a_route_is_requested_once(ends: tuple[ControlLifeline, Supervisor
 
 
 async def test_routes_of_many_hosts_are_requested_in_turns(ends: tuple[ControlLifeline, Supervisor]) -> None:
-    """The supervisor gets few questions at a time, abandoned ones included; all callers get answers."""
     lifeline, supervisor = ends
     hosts = [f"host {number}" for number in range(ROUTES_AT_ONCE * 4)]
     tasks = {host: asyncio.create_task(lifeline.route_to(host)) for host in hosts}
@@ -111,7 +105,6 @@ async def test_routes_of_many_hosts_are_requested_in_turns(ends: tuple[ControlLi
 async def test_early_messages_are_not_lost(
     ends: tuple[ControlLifeline, Supervisor], answers: list[TunnelsEnclosed]
 ) -> None:
-    """Messages wait in order for their receiver; an answer that a caller awaits is delivered at once."""
     lifeline, supervisor = ends
     lifeline, supervisor = ends
     for message in (Announced(), PolicyReloadRequested(), TunnelsEnclosed("kernel"), SocketsRestored(0)):

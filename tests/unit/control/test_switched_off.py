@@ -23,7 +23,6 @@ class Scene:
         self.recorded: list[str] = []
 
     def watch(self, forgotten_after: float | None = 3600.0) -> SwitchedOffWatch:
-        """Begin a run of control."""
         monitors: Any = SimpleNamespace(
             switches=SimpleNamespace(switched_off=lambda: self.off),
             returns=SimpleNamespace(until=lambda name: self.until.get(name)),  # noqa: PLW0108  of whatever is there then
@@ -39,7 +38,6 @@ class Scene:
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Iterator[Scene]:
-    """Return a scene where everything is enabled."""
     store = StateStore(tmp_path, failed=pytest.fail, kind=InlineDatabase)
     yield Scene(store)
     store.close()
@@ -48,7 +46,6 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
 @pytest.mark.nightly
 @pytest.mark.anyio
 async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
-    """After `forgotten_after` of running, the monitor is recorded and marked until it is enabled, over restarts."""
     scene.off = {"a": False, "b": "shadow"}
     watch = scene.watch()
     watch.look(3000.0)
@@ -73,7 +70,6 @@ async def test_a_disabled_monitor_is_an_alarm_once(scene: Scene) -> None:
 
 
 def test_a_timed_change_is_not_forgotten(scene: Scene) -> None:
-    """A timed change has an age only if the monitor is still disabled after that time."""
     scene.off, scene.until = {"a": False}, {"a": 1e12}
     watch = scene.watch()
     watch.look(9000.0)
@@ -84,7 +80,6 @@ def test_a_timed_change_is_not_forgotten(scene: Scene) -> None:
 
 
 def test_an_audit_only_section_is_forgotten_like_a_monitor(scene: Scene) -> None:
-    """It is listed with its age; the configuration may turn the alarm off."""
     scene.audit_only = {"publish", "subscribe"}
     watch = scene.watch(None)
     watch.look(1e9)

@@ -43,18 +43,15 @@ class Standby:
         self.store.save_revision(self.revision(OPEN_POLICY))
 
     def revision(self, text: str, signature: str = "") -> RevisionRow:
-        """Return a revision of an operator that follows the last one."""
         number = len(self.store.revisions()) + 1
         return RevisionRow(number, text, f"revision {number}", 0.0, "alice", "", signature)
 
     def save_specification(self, text: str, who: str = "alice") -> None:
-        """Bring a specification into force on the active appliance."""
         number = len(self.store.monitor_revisions()) + 1
         sources = text_of(Sources({"one.rv": text}))
         self.store.save_monitor_revision(MonitorRevisionRow(number, sources, 0.0, who, ""))
 
     async def compiled(self, sources: Sources, site_keys: Any) -> Any:
-        """Compile, as the compiler process does."""
         self.compilations += 1
         return await here(sources, site_keys)
 
@@ -91,21 +88,18 @@ class Checked:
         self._store = store
 
     async def next_obstacle(self) -> str:
-        """Return the next result that differs from the one before."""
         await self.changed.wait()
         self.changed.clear()
         assert self.check.obstacle is not None
         return self.check.obstacle
 
     async def replicate(self) -> None:
-        """Report that a change of the policy or the specifications has arrived."""
         await self._store.settled()
         self.check.news.set()
 
 
 @pytest.fixture
 def standby(tmp_path: Path) -> Iterator[Standby]:
-    """Return a standby with a policy of an operator."""
     made = Standby(tmp_path)
     yield made
     made.store.close()
@@ -208,7 +202,6 @@ async def test_a_damaged_certificate(standby: Standby) -> None:
 
 
 async def test_the_same_specifications_are_compiled_once(standby: Standby) -> None:
-    """A repeated check costs no compilation."""
     standby.save_specification(TEXTS["a"])
     async with standby.checked() as checked:
         assert await checked.next_obstacle() == ""

@@ -25,8 +25,6 @@ def records(member: Member, event: str) -> list[dict[str, Any]]:
 
 
 def after(tmp_path: Path, story: Callable[[Member, Member], Awaitable[None]]) -> tuple[Member, Member]:
-    """Return two appliances after a story in which no time matters."""
-
     async def timeless(a: Member, b: Member, _world: World) -> None:
         await story(a, b)
 
@@ -45,7 +43,6 @@ async def sealed_by_b(a: Member, b: Member) -> SignedCheckpoint:
 
 
 def test_a_takeover_names_the_last_replicated_checkpoint(tmp_path: Path) -> None:
-    """The record has the epoch, both names, the other log's checkpoint with its signature, and the takeover before."""
     named: list[SignedCheckpoint] = []
 
     async def story(a: Member, b: Member) -> None:
@@ -68,8 +65,6 @@ def test_a_takeover_names_the_last_replicated_checkpoint(tmp_path: Path) -> None
 
 
 def test_the_first_takeover_says_that_no_checkpoint_was_replicated(tmp_path: Path) -> None:
-    """Without a replicated checkpoint, the record has null and the reason."""
-
     async def story(a: Member, _b: Member) -> None:
         await a.recorder.took_over(1)
 
@@ -79,8 +74,6 @@ def test_the_first_takeover_says_that_no_checkpoint_was_replicated(tmp_path: Pat
 
 
 def test_a_checkpoint_of_its_own_log_is_not_named(tmp_path: Path) -> None:
-    """A checkpoint by this appliance's own key is not named as the other's, whatever the state says."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
             await a.sealed()
@@ -110,8 +103,6 @@ def test_a_checkpoint_of_its_own_log_is_not_named(tmp_path: Path) -> None:
     ],
 )
 def test_a_lying_appliance_gets_no_checkpoint_named(tmp_path: Path, written: str, forged: str) -> None:
-    """A replicated checkpoint that its key did not sign is not named, and the record has the reason."""
-
     async def story(a: Member, b: Member) -> None:
         text = (await sealed_by_b(a, b)).as_json()
         a.store.save_setting("audit checkpoint of b", text.replace(written, forged, 1))
@@ -126,8 +117,6 @@ def test_a_lying_appliance_gets_no_checkpoint_named(tmp_path: Path, written: str
     "text", ["", "{", "[" * 100_000, '"\\ud800"', "null", '{"epoch": -1, "appliance": "b"}']
 )
 def test_a_state_without_a_last_takeover_has_no_previous_one(tmp_path: Path, text: str) -> None:
-    """A row that is not a takeover is ignored."""
-
     async def story(a: Member, _b: Member) -> None:
         a.store.save_setting("last takeover", text)
         await a.recorder.took_over(1)
@@ -136,8 +125,6 @@ def test_a_state_without_a_last_takeover_has_no_previous_one(tmp_path: Path, tex
 
 
 def test_a_restart_within_an_epoch_repeats_no_record(tmp_path: Path) -> None:
-    """When control starts again within its epoch, the takeover is not recorded again; the next epoch is."""
-
     async def story(a: Member, _b: Member) -> None:
         for epoch in (1, 1, 2, 2):
             await a.recorder.took_over(epoch)
@@ -175,8 +162,6 @@ def test_the_state_has_a_takeover_only_once_its_record_is_on_disk(tmp_path: Path
 
 
 def test_the_takeover_is_sealed_and_replicated_at_once(tmp_path: Path) -> None:
-    """Without any further record, the state soon has a checkpoint that seals the record of the takeover."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1, sealed=False):
             ((place),) = [one.sequence for one in search(a.path, Filter(event="took over")).entries]
@@ -190,8 +175,6 @@ def test_the_takeover_is_sealed_and_replicated_at_once(tmp_path: Path) -> None:
 
 
 def test_each_signed_checkpoint_is_replicated(tmp_path: Path) -> None:
-    """The state follows the newest signed checkpoint."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
             for _ in range(3):
@@ -202,8 +185,6 @@ def test_each_signed_checkpoint_is_replicated(tmp_path: Path) -> None:
 
 
 def test_an_earlier_checkpoint_is_replicated_at_the_start(tmp_path: Path) -> None:
-    """The checkpoint of an earlier run is replicated before a new one is signed."""
-
     signed: list[SignedCheckpoint] = []
 
     async def story(a: Member, _b: Member) -> None:
@@ -223,8 +204,6 @@ def test_an_earlier_checkpoint_is_replicated_at_the_start(tmp_path: Path) -> Non
 
 
 def test_a_hand_over_returns_when_the_state_has_the_sealed_log(tmp_path: Path) -> None:
-    """After an orderly hand-over, the replicated checkpoint seals the record of the hand-over."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
             await a.decide(2, 1)
@@ -240,8 +219,6 @@ def test_a_hand_over_returns_when_the_state_has_the_sealed_log(tmp_path: Path) -
 
 
 def test_a_log_that_cannot_be_read_does_not_end_the_replication(tmp_path: Path) -> None:
-    """After an unreadable log is back, its next checkpoint is replicated."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
             with structlog.testing.capture_logs() as printed:
@@ -261,8 +238,6 @@ def test_a_log_that_cannot_be_read_does_not_end_the_replication(tmp_path: Path) 
 
 
 def test_an_older_checkpoint_replaces_no_newer_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A checkpoint that was read before a newer one, and arrives later, is not replicated."""
-
     async def story(a: Member, _b: Member) -> None:
         async with a.active(1):
             older = a.replicated()

@@ -38,12 +38,10 @@ class Lives:
         self.store: StateStore | None = None
 
     def records(self, event: str) -> list[dict[str, Any]]:
-        """Return the details of all records of an event, oldest first."""
         found = search(self.home / "audit.db", Filter(event=event), newest_first=False)
         return [entry.record.detail for entry in found.entries]
 
     def next(self) -> TokenOrders:
-        """Start control after the previous one died."""
         if self.store is not None:
             self.store.close()
         self.store = StateStore(self.home, failed=pytest.fail, kind=InlineDatabase)
@@ -52,7 +50,6 @@ class Lives:
 
 @pytest.fixture
 def lives(tmp_path: Path) -> Iterator[Lives]:
-    """Return a state directory."""
     lives = Lives(tmp_path)
     yield lives
     assert lives.store is not None
@@ -61,7 +58,6 @@ def lives(tmp_path: Path) -> Iterator[Lives]:
 
 
 def opens(tokens: TokenOrders, text: str | None) -> bool:
-    """Whether a token is valid."""
     assert text is not None
     parsed = parse_token(text)
     assert parsed is not None
@@ -80,7 +76,6 @@ async def test_an_unannounced_token_is_replaced(lives: Lives) -> None:
 
 
 async def test_an_announced_token_stays(lives: Lives) -> None:
-    """No later control makes a new token, whether or not it knows of the announcement."""
     tokens = lives.next()
     text = await tokens.first()
     tokens.first_token_shown()
@@ -92,7 +87,6 @@ async def test_an_announced_token_stays(lives: Lives) -> None:
 
 
 async def test_a_late_notice_of_the_announcement_counts(lives: Lives) -> None:
-    """Control died before the supervisor's notice: the next control gets the notice first and makes no new token."""
     text = await lives.next().first()
     tokens = lives.next()
     tokens.first_token_shown()
@@ -101,14 +95,12 @@ async def test_a_late_notice_of_the_announcement_counts(lives: Lives) -> None:
 
 
 async def test_an_old_state_gets_no_first_token(lives: Lives) -> None:
-    """Tokens from a version without this mark count as announced."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "admin", 60))
     assert await lives.next().first() is None
 
 
 async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The text of such a token is never announced, and a later token may use its name."""
     tokens = lives.next()
     assert lives.store is not None
 
@@ -124,7 +116,6 @@ async def test_a_token_that_cannot_be_stored_is_void(lives: Lives, monkeypatch: 
 
 
 async def test_a_rotated_token_keeps_its_name_and_role(lives: Lives) -> None:
-    """The earlier token ends at once; the new one has its lifetime, and its own keys for signed requests."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "operator", 3600))
     new = await tokens.rotate(TokenRotate("alice"), "operator")
@@ -145,7 +136,6 @@ async def test_a_rotated_token_keeps_its_name_and_role(lives: Lives) -> None:
 
 
 async def test_earlier_tokens_are_valid_for_the_grace_time(lives: Lives) -> None:
-    """Both tokens are valid until then, over a restart; a second rotation brings no end later."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     new = await tokens.rotate(TokenRotate("alice", 7200, grace=600))
@@ -159,7 +149,6 @@ async def test_earlier_tokens_are_valid_for_the_grace_time(lives: Lives) -> None
 
 
 async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None:
-    """A token in its grace time has no rights after its name was revoked."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "admin", 3600))
     await tokens.rotate(TokenRotate("alice", grace=600))
@@ -170,7 +159,6 @@ async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None
 
 
 async def test_only_a_valid_token_can_be_rotated(lives: Lives) -> None:
-    """An unknown, a revoked and an expired name are rejected; the message lists the valid ones."""
     tokens = lives.next()
     for name, seconds in (("alice", 3600), ("bob", 3600), ("carol", 1)):
         await tokens.add(TokenAdd(name, "viewer", seconds))
@@ -186,7 +174,6 @@ async def test_only_a_valid_token_can_be_rotated(lives: Lives) -> None:
     "order", [TokenRotate("alice", -1), TokenRotate("alice", 1e12), TokenRotate("alice", grace=-1)]
 )
 async def test_impossible_times_of_a_rotation_change_nothing(lives: Lives, order: TokenRotate) -> None:
-    """The earlier token stays valid."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     with pytest.raises(TokenRefusedError):
@@ -195,7 +182,6 @@ async def test_impossible_times_of_a_rotation_change_nothing(lives: Lives, order
 
 
 async def test_one_of_two_simultaneous_rotations_is_rejected(lives: Lives) -> None:
-    """The text that one of them printed is valid."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "viewer", 3600))
     done = await asyncio.gather(
@@ -208,7 +194,6 @@ async def test_one_of_two_simultaneous_rotations_is_rejected(lives: Lives) -> No
 async def test_a_rotation_that_cannot_be_stored_leaves_the_earlier_token(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The new token, whose text was not shown, has no rights, now and after a restart."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     assert lives.store is not None
@@ -227,7 +212,6 @@ async def test_a_rotation_that_cannot_be_stored_leaves_the_earlier_token(
 async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A revocation while a rotation is being stored is final."""
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "viewer", 3600))
     assert lives.store is not None
@@ -245,7 +229,6 @@ async def test_a_failed_rotation_does_not_bring_back_a_revoked_token(
 
 @pytest.mark.nightly
 async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
-    """Wherever the file of queued statements was cut off, exactly one of the two tokens is valid at the next start."""
     tokens = lives.next()
     old = await tokens.add(TokenAdd("alice", "viewer", 3600))
     assert lives.store is not None
@@ -278,7 +261,6 @@ async def test_a_killed_control_has_rotated_or_not(lives: Lives) -> None:
 
 
 async def _rotate_and_die(lives: Lives) -> None:
-    """Rotate in a new control that is killed before its writer writes."""
     store = StateStore(lives.home, failed=pytest.fail, kind=InlineDatabase)
     # The writer never gets to it.
     pytest.MonkeyPatch().setattr(store.database, "_commit", lambda _statements: None)
@@ -293,12 +275,10 @@ async def _rotate_and_die(lives: Lives) -> None:
 
 
 async def uses(tokens: TokenOrders) -> dict[str, float | None]:
-    """Return the last use of each token, by name."""
     return {one.name: one.last_used for one in (await tokens.listed(TokenList())).tokens}
 
 
 async def test_the_last_use_survives_a_restart(lives: Lives) -> None:
-    """A token that was never used has no last use; the id of no token is ignored."""
     tokens = lives.next()
     alice = await tokens.add(TokenAdd("alice", "viewer", 60))
     await tokens.add(TokenAdd("bob", "viewer", 60))
@@ -316,7 +296,6 @@ async def test_the_last_use_survives_a_restart(lives: Lives) -> None:
 async def test_uses_are_stored_at_most_once_in_half_a_minute(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The list shows the newest use all the same, also after the clock was set back."""
     tokens = lives.next()
     alice = await tokens.add(TokenAdd("alice", "viewer", 600))
     assert lives.store is not None
@@ -335,7 +314,6 @@ async def test_uses_are_stored_at_most_once_in_half_a_minute(
 async def test_a_full_disk_keeps_no_use_and_harms_no_request(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is queued for the full disk; the next use after that is stored."""
     tokens = lives.next()
     alice = await tokens.add(TokenAdd("alice", "viewer", 600))
     assert lives.store is not None
@@ -355,7 +333,6 @@ async def test_a_full_disk_keeps_no_use_and_harms_no_request(
 async def test_a_rotation_needs_room_only_for_a_further_token(
     lives: Lives, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With as many tokens as possible, each can be rotated, but not with a grace time."""
     monkeypatch.setattr(token_orders, "_MOST", 2)
     tokens = lives.next()
     for name in ("alice", "bob"):

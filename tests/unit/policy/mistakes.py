@@ -8,7 +8,6 @@ _SECTIONS = (
 
 
 def mistakes(title: str) -> list[tuple[str, ...]]:
-    """Return the rows of a section, with escapes as in a string of Python."""
     rows = dict(section.split("\n", 1) for section in _SECTIONS)[title].rstrip("\n").split("\n")
     plain = (row.encode("latin-1").decode("unicode_escape") for row in rows)
     return [tuple(row.split(" => ")) for row in plain]

@@ -12,7 +12,6 @@ from appliance.policy.model import address_of
 
 @given(address=st.ip_addresses())
 def test_addresses_equal_those_of_ipaddress(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> None:
-    """The objects have the same hash, text, order and networks; the next call returns the same object."""
     ours = address_of(str(address))
     assert ours == address and hash(ours) == hash(address) and str(ours) == str(address) and repr(ours)
     assert {address: 1}[ours] == {ours: 1}[address] == 1
@@ -23,7 +22,6 @@ def test_addresses_equal_those_of_ipaddress(address: ipaddress.IPv4Address | ipa
 
 @pytest.mark.parametrize("text", ["", "host", "10.0.0", "10.0.0.1/8", "1", "::g", "10.0.0.1:1"])
 def test_an_invalid_address_is_refused(text: str) -> None:
-    """An invalid address raises the same error as in `ipaddress`, also the second time."""
     for _ in range(2):
         with pytest.raises(ValueError, match=r"\S"):
             address_of(text)

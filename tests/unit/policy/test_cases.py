@@ -28,12 +28,10 @@ audit-only = Commands
 
 
 def run(text: str) -> list[CaseResult]:
-    """Return the results of cases against `POLICY`."""
     return run_cases(POLICY, text, "p.ini.tests.yaml")
 
 
 def test_cases_pass_and_fail_with_their_place() -> None:
-    """Each action is one check with its line, its column and the decision."""
     results = run(
         "cases:\n"
         "  - host: 10.0.0.5\n"
@@ -48,7 +46,6 @@ def test_cases_pass_and_fail_with_their_place() -> None:
 
 
 def test_given_addresses_stand_for_robot_and_enrolled_hosts() -> None:
-    """Cases may set the addresses that the policy leaves open, and refer to them by name."""
     results = run(
         "given: {robot: 192.0.2.1, hosts: {ocu-1: 10.77.0.11}}\n"
         "cases:\n"
@@ -60,13 +57,11 @@ def test_given_addresses_stand_for_robot_and_enrolled_hosts() -> None:
 
 
 def test_audit_only_counts_as_denial() -> None:
-    """A case tests the rules: audit-only mode does not turn a deny into an allow."""
     assert run("cases: [{host: 10.9.9.9, deny: [command getPid]}]")[0].passed
 
 
 @pytest.mark.parametrize(("text", "expected"), mistakes("cases"))
 def test_a_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: str) -> None:
-    """An invalid file of cases is refused with line and column, never ignored."""
     with pytest.raises(PolicyError) as caught:
         run(text)
     shown = [f"{f.line}:{f.column}: {f.text}" for f in caught.value.findings]
@@ -74,7 +69,6 @@ def test_a_mistake_in_the_cases_is_an_error_with_its_place(text: str, expected: 
 
 
 def test_yaml_aliases_cannot_multiply_cases() -> None:
-    """YAML aliases that expand a small file to millions of checks are refused with the limit."""
     hosts = ", ".join(["10.0.0.1"] * 1000)
     text = f"cases:\n  - {{host: [{hosts}], allow: &a [{', '.join(['call /x'] * 1000)}]}}\n"
     with pytest.raises(PolicyError, match="more than 100000 checks"):
@@ -88,7 +82,6 @@ PIECES = [*VERBS, *WORDS.split(), "\n  "]
 @settings(max_examples=examples(200))
 @given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=40).map(" ".join)))
 def test_any_text_gives_results_or_a_policy_error(text: str) -> None:
-    """Any text gives results or a `PolicyError`, and no other exception."""
     try:
         assert run(text)
     except PolicyError as error:

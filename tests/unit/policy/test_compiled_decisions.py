@@ -21,14 +21,12 @@ Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value
 
 
 def group_members(word: str, groups: dict[str, list[str]], seen: tuple[str, ...] = ()) -> list[str]:
-    """Return the addresses, networks and stars that a word of a value stands for."""
     if word not in groups or word in seen:
         return [word]
     return [leaf for inner in groups[word] for leaf in group_members(inner, groups, (*seen, word))]
 
 
 def names_host(words: list[str], groups: dict[str, list[str]], host: str) -> bool:
-    """Whether a value names a host."""
     address = ipaddress.ip_address(host)
     for leaf in (leaf for word in words for leaf in group_members(word, groups)):
         if leaf == "*" or address in ipaddress.ip_network(leaf):
@@ -37,7 +35,6 @@ def names_host(words: list[str], groups: dict[str, list[str]], host: str) -> boo
 
 
 def key_matches(key: str, name: str) -> bool:
-    """Whether a key matches a name, by a regular expression made from it."""
     if key.endswith("/**"):
         beginning = re.escape(key[:-3]).replace(r"\*", "[^/]*")
         return re.fullmatch(beginning + "(/.*)?", name) is not None
@@ -99,7 +96,6 @@ def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
 def test_compiled_decisions_are_those_of_the_naive_decider(
     policy: tuple[Rules, dict[str, list[str]]], requests: list[tuple[str, str]]
 ) -> None:
-    """For any rules, the compiled policy and the naive decider give the same decision."""
     rules, groups = policy
     text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
     text += "[Publishers]\n" + "".join(f"{key} = {', '.join(words)}\n" for _, key, words in rules)
@@ -122,10 +118,6 @@ BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
 def test_namespace_may_be_touched_only_if_everything_in_it_may(
     policy: tuple[Rules, dict[str, list[str]]], host: str, key: str
 ) -> None:
-    """A call on a namespace is allowed if and only if every key that can be in it is allowed.
-
-    For keys with a star before their end only "only if" holds: an overridden rule may deny too much.
-    """
     rules, groups = policy
     text = "[Groups]\n" + "".join(f"{name} = {' '.join(words)}\n" for name, words in groups.items())
     text += "[Parameters]\n" + "".join(f"write {key} = {', '.join(words)}\n" for _, key, words in rules)
@@ -141,7 +133,6 @@ def test_namespace_may_be_touched_only_if_everything_in_it_may(
 @settings(max_examples=examples(400))
 @given(st.lists(KEYS, min_size=2, max_size=2, unique=True), st.lists(NAME, max_size=30))
 def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) -> None:
-    """If two keys load together, they never match a name with equal rank; refused pairs do."""
     text = "[Publishers]\n" + "".join(f"{key} = *\n" for key in keys)
     try:
         compile_policy(text, file="p.ini")

@@ -26,12 +26,10 @@ listMethods = 10.0.0.1
 
 
 def explained(host: str, category: Category, resource: str, node: str = "/ocu") -> DecisionExplanation:
-    """Return the explanation of one request."""
     return explain(POLICY, Request(ipaddress.ip_address(host), node, category, resource))
 
 
 def test_rules_that_lost_are_named_most_specific_first() -> None:
-    """Every rule that matches the name is listed once; overridden rules have the reason."""
     found = explained("10.0.0.5", Category.PUBLISH, "/arm/cmd")
     assert found.decision.rule is not None
     assert found.decision.rule.key == "/arm/cmd"
@@ -44,7 +42,6 @@ def test_rules_that_lost_are_named_most_specific_first() -> None:
 
 
 def test_the_word_that_matches_the_host_is_shown() -> None:
-    """The explanation names the group or network of the value that matches an allowed host."""
     assert explained("10.0.0.5", Category.PUBLISH, "/arm/cmd").through == ("ocu",)
     assert explained("10.0.0.7", Category.PUBLISH, "/arm/x").through == ("10.0.0.0/8",)
 
@@ -59,7 +56,6 @@ def test_node_rule_is_part_of_the_answer() -> None:
 
 
 def test_command_is_explained_under_its_wire_name_too() -> None:
-    """system.listMethods is explained by the key listMethods."""
     found = explained("10.0.0.1", Category.COMMAND, "system.listMethods")
     assert found.decision.allowed
     assert found.decision.rule is not None
@@ -68,7 +64,6 @@ def test_command_is_explained_under_its_wire_name_too() -> None:
 
 
 def test_text_says_decision_and_place() -> None:
-    """The rendered text has the decision as a sentence, and the file and line of every rule."""
     lines = list(render(explained("10.0.0.9", Category.COMMAND, "getPid")))
     assert lines[0].startswith(
         "denied: 10.0.0.9 is not among the hosts that may call getPid: only ocu (10.0.0.5)"
@@ -77,7 +72,6 @@ def test_text_says_decision_and_place() -> None:
 
 
 def test_dependence_on_a_namespace_is_explained() -> None:
-    """An exact key grants a value, not a namespace of that name; the explanation says so."""
     policy = compile_policy("[Parameters]\nread /arm = 10.0.0.5\nread /leg/** = 10.0.0.5\n", file="p.ini")
     host = ipaddress.ip_address("10.0.0.5")
     lines = list(render(explain(policy, Request(host, "/ocu", Category.READ, "/arm"))))

@@ -29,7 +29,6 @@ _LINE = re.compile(
 
 
 def decided(policy: Policy, line: re.Match[str], category: str, name: str) -> Decision:
-    """Return the decision on one request of a line."""
     node, how = line["node"], line["how"]
     request = Request(ipaddress.ip_address(line["host"]), (node or "/n").strip('"'), Category(category), name)
     if how is not None:

@@ -10,12 +10,10 @@ OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n
 
 
 def request(host: str, resource: str, node: str = "/n") -> Request:
-    """Return a request to publish."""
     return Request(ipaddress.ip_address(host), node, Category.PUBLISH, resource)
 
 
 def test_each_different_decision_is_listed_once_with_its_count() -> None:
-    """A repeated request is one difference with a count; unchanged decisions are left out."""
     old = compile_policy(OLD, file="old.ini")
     new = compile_policy(OLD.replace("/cmd = 10.0.0.5", "/cmd = 10.0.0.6"), file="new.ini")
     seen = [request("10.0.0.5", "/cmd"), request("10.0.0.6", "/cmd"), request("10.0.0.1", "/x")]
@@ -28,7 +26,6 @@ def test_each_different_decision_is_listed_once_with_its_count() -> None:
 
 
 def test_lost_node_name_is_a_difference() -> None:
-    """A publisher that loses its node name, not its topic, is listed as well."""
     old = compile_policy(OLD, file="old.ini")
     new = compile_policy(OLD.replace("default = *", "default = *\n/n = 10.0.0.9"), file="new.ini")
     found = diff(old, new, [request("10.0.0.1", "/x"), request("10.0.0.1", "/x", node="/m")])
@@ -36,7 +33,6 @@ def test_lost_node_name_is_a_difference() -> None:
 
 
 def test_audit_only_is_between_allowed_and_denied() -> None:
-    """When a section leaves audit-only mode, requests that were allowed and marked become denials."""
     old = compile_policy(OLD + "[Options]\naudit-only = Publishers\n", file="old.ini")
     new = compile_policy(OLD, file="new.ini")
     found = diff(old, new, [request("10.0.0.9", "/cmd"), request("10.0.0.1", "/x")])

@@ -15,23 +15,19 @@ PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text(encoding="ut
 
 
 def block(language: str, number: int = 0) -> str:
-    """Return a code block of the page."""
     found: list[str] = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
     return found[number]
 
 
 def test_first_policy_of_the_page_loads() -> None:
-    """A reader can copy the example at the top and go on from it."""
     policy = compile_policy(block("ini"), file="docs/policy.md")
     assert {warning.line for warning in policy.warnings} == {4}
 
 
 def test_cases_of_the_page_are_well_formed() -> None:
-    """The example of a tests file is accepted unchanged."""
     assert len(run_cases(compile_policy(block("ini"), file="p.ini"), block("yaml"), "docs/policy.md")) == 4
 
 
 @pytest.mark.parametrize("word", sorted([*COMMANDS, *VERBS, *(f"[{name}]" for name in NAMES)]))
 def test_every_word_of_the_language_is_on_the_page(word: str) -> None:
-    """Each section, command and verb is named in the page."""
     assert f"`{word}`" in PAGE or f"--{word}" in PAGE

@@ -26,12 +26,10 @@ CALLS = ("lookupService", "getParam", "setParam", "shutdown", "getSystemState", 
 
 
 def request(category: Category, resource: str, host: object = HOST) -> Request:
-    """Return a request of the node /it."""
     return Request(host, "/it", category, resource)  # type: ignore[arg-type]  # an address
 
 
 def everything(host: object) -> list[Request]:
-    """Draw a request of a host."""
     named = [category for category in Category if category is not Category.COMMAND]
     return [request(category, name, host) for category, name in product(named, NAMES)] + [
         request(Category.COMMAND, call, host) for call in CALLS
@@ -45,7 +43,6 @@ def compiled(text: str) -> Policy:
 @pytest.mark.parametrize("file", POLICIES, ids=lambda file: str(file.stem))
 @pytest.mark.parametrize("wanted", everything(HOST), ids=lambda one: f"{one.category} {one.resource}")
 def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
-    """In every shipped policy no host loses a right, no other host gains one, and the rest of the text is unchanged."""
     text = file.read_text(encoding="utf-8")
     found = grant(text, "p.ini", KNOWN, DecidedRequest(wanted, rights_of(wanted)))
     before, after = compiled(text), compiled(found.text)
@@ -62,7 +59,6 @@ def test_it_grants_that_and_nothing_else(file: Path, wanted: Request) -> None:
 
 
 def changed(text: str, category: str, resource: str, host: str = str(HOST), **detail: object) -> list[str]:
-    """Return the lines that were added or changed."""
     found = grant(text, "p.ini", KNOWN, asked(host, "/it", category, resource, detail))
     return [line[1:] for line in found.diff(text, "p.ini") if line[:1] == "+" and line[:3] != "+++"]
 
@@ -73,7 +69,6 @@ BASE = (
 
 
 def test_the_host_is_added_to_the_deciding_key() -> None:
-    """The line keeps its commas and its comment; the reported change is only the rule."""
     assert changed(BASE, "publish", "/x") == ["/x = 10.0.0.1, 10.0.0.2, 10.0.0.9  # the two"]
     padded = BASE.replace("/x =", "/x      =   ")
     found = grant(padded, "p.ini", KNOWN, asked(str(HOST), "/it", "publish", "/x", {}))
@@ -81,7 +76,6 @@ def test_the_host_is_added_to_the_deciding_key() -> None:
 
 
 def test_a_new_key_keeps_the_hosts_of_the_deciding_rule() -> None:
-    """Hosts that a pattern allowed stay allowed; a section without rules gets its first rule."""
     assert changed(BASE, "publish", "/yes") == ["/yes = 10.0.0.1 10.0.0.9"]
     assert changed(BASE, "subscribe", "/z") == ["/z = 10.0.0.9"]
     assert changed("[Nodes]\ndefault = *\n", "publish", "/z") == ["", "[Publishers]", "/z = 10.0.0.9"]
@@ -96,7 +90,6 @@ def test_a_host_is_named_by_its_group_or_certificate() -> None:
 
 
 def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
-    """Such a call needs the command and the key; denying rules below the key get the host as well."""
     text = (
         "[Nodes]\ndefault=*\n[Commands]\nsetParam = 10.0.0.1\n"
         "[Parameters]\nwrite /arm/max = 10.0.0.1\nwrite default = 10.0.0.1\n"
@@ -138,11 +131,6 @@ PARAMETERS = [
 def test_a_parameter_that_only_the_record_describes_is_granted(
     text: str, call: str, key: str, value: Value, tree: Tree
 ) -> None:
-    """Covers a parameter that is a namespace, a dictionary as value, and a key below a value.
-
-    No other host gains the right.
-    """
-
     def answer(policy: Policy, host: object, key: str = key, tree: Tree = tree) -> Decision:
         command = request(Category.COMMAND, call, host)
         return decide(policy, rights_of_call(command, call, key, value=value, tree=tree))
@@ -165,7 +153,6 @@ def test_a_parameter_that_only_the_record_describes_is_granted(
 
 
 def test_a_text_keeps_its_line_endings() -> None:
-    """A policy from another system keeps its line endings with a new section, a new line or a longer line."""
     for resource in ("/x", "/yes", "/new"):
         found = grant(
             BASE.replace("\n", "\r\n"), "p.ini", KNOWN, asked(str(HOST), "/it", "publish", resource, {})
@@ -193,7 +180,6 @@ def test_a_request_that_no_policy_can_grant(host: str, category: str, resource: 
 
 
 def test_failing_cases_are_reported() -> None:
-    """If a test case denies this host, the result names the case that fails."""
     known = PolicyContext(
         cases_file="p.tests.yaml", cases="cases:\n  - {host: 10.0.0.9, node: /it, deny: [subscribe /z]}\n"
     )

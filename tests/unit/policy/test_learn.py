@@ -21,7 +21,6 @@ NAMES = ["/a", "/a/b", "/a/b/c", "/cmd_vel", "/a_1", "/tool_4711_1700000000000",
 def seen(
     host: str, category: Category, resource: str, *, node: str = "/n", call: str = "", key: str = ""
 ) -> Observation:
-    """Return one allowed request."""
     return Observation(Request(ipaddress.ip_address(host), node, category, resource), call, key)
 
 
@@ -30,7 +29,6 @@ def compiled(learned: LearnedPolicy) -> Policy:
 
 
 def test_only_observed_requests_are_granted() -> None:
-    """The host gets the topic and its node name, but not the other direction, another name or another host."""
     policy = compiled(learn([seen("10.0.0.1", Category.PUBLISH, "/cmd_vel", node="/joy")]))
     host, other = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
     assert decide(policy, rights_of(Request(host, "/joy", Category.PUBLISH, "/cmd_vel"))).allowed
@@ -74,12 +72,10 @@ def test_a_search_for_a_parameter_may_find_it_the_next_time() -> None:
     ],
 )
 def test_only_the_appliances_own_robot_is_its_group(given: str, robot: list[str], expected: bool) -> None:
-    """`robot` means other addresses in another appliance, so no other address may become the group."""
     assert covered(ipaddress.ip_network(given), map(ipaddress.ip_network, robot)) == expected
 
 
 def test_anonymous_names_become_patterns() -> None:
-    """A tool that restarts with another number is allowed; a name that only looks similar is denied."""
     listener = "/listener_1700000000123456789"
     learned = learn([
         seen("10.0.0.1", Category.SUBSCRIBE, "/chatter", node="/rostopic_4711_1700000000000"),
@@ -97,7 +93,6 @@ def test_anonymous_names_become_patterns() -> None:
 
 
 def test_a_parameter_call_needs_the_call_and_the_key() -> None:
-    """A host that read a namespace may read all keys below it, even where another host used a narrower key."""
     policy = compiled(learn([
         seen("10.0.0.1", Category.COMMAND, "getParam", call="getParam", key="/arm"),
         seen("10.0.0.2", Category.COMMAND, "getParam", call="getParam", key="/arm/max"),
@@ -125,7 +120,6 @@ def test_the_robot_is_called_robot() -> None:
 
 
 def test_hosts_that_are_named_together_are_a_group() -> None:
-    """Several lines with the same hosts use a group; each line has its number of uses and its nodes as a comment."""
     learned = learn([
         seen(host, Category.PUBLISH, topic, node="/joy")
         for host in ("10.0.0.1", "10.0.0.2") for topic in ("/a", "/b", "/a")
@@ -141,7 +135,6 @@ def test_hosts_that_are_named_together_are_a_group() -> None:
 
 
 def test_a_parameter_is_left_out_where_the_one_above_says_the_same() -> None:
-    """A parameter is omitted if the one above has the same hosts; the key of another host stays."""
     learned = learn([
         seen(host, Category.COMMAND, "getParam", call="getParam", key=key)
         for host, key in (("10.0.0.1", "/arm"), ("10.0.0.1", "/arm/max"), ("10.0.0.2", "/arm/min"))
@@ -186,7 +179,6 @@ _observations = st.builds(
 
 @given(st.lists(_observations, min_size=1, max_size=40))
 def test_the_same_run_passes_under_what_was_learned(observations: list[Observation]) -> None:
-    """The learned policy is valid and grants every right that was used."""
     policy = compiled(learn(observations, [ROBOT]))
     for observation in observations:
         rights = rights_of_call(observation.request, observation.call, observation.key or None)
@@ -195,7 +187,6 @@ def test_the_same_run_passes_under_what_was_learned(observations: list[Observati
 
 @given(st.lists(_observations, min_size=1, max_size=20), _observations)
 def test_a_host_that_did_nothing_may_do_nothing(observations: list[Observation], other: Observation) -> None:
-    """Only hosts that made requests get rights."""
     policy = compiled(learn(observations, [ROBOT]))
     unknown = Request(
         ipaddress.ip_address("203.0.113.9"), "/n", other.request.category, other.request.resource

@@ -18,13 +18,11 @@ POLICY = compile_policy(
 
 @pytest.mark.parametrize(("tree", "kept"), [({}, True), ({"x": 1}, True), ({"x": {"y": 1}}, False)])
 def test_a_parameter_that_holds_others_needs_the_right_on_them(tree: Tree, kept: bool) -> None:
-    """If a parameter becomes a namespace, its subscriber receives the members, and needs the right to them."""
     live = live_by("subscribeParam", HOST, "/n", "/x", tree)
     assert may_keep(POLICY, LiveRight.of(live.fields())).allowed == kept
 
 
 def test_a_thing_that_ends_is_named_once() -> None:
-    """A subscription and its connections are listed as one loss; rights that stay granted are not listed."""
     calls = ("registerSubscriber", "requestTopic")
     live = [LiveRight(HOST, "/n", call, topic) for call in calls for topic in ("/secret", "/plain")]
     (ending,) = endings(POLICY, live)

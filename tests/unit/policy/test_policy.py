@@ -40,13 +40,11 @@ def compiled(text: str, **given: object) -> Policy:
 
 
 def ask(policy: Policy, host: str, category: str, resource: str, caller_id: str = "/n") -> Decision:
-    """Return the decision on one request."""
     return policy.decide(Request(ipaddress.ip_address(host), caller_id, Category(category), resource))
 
 
 @pytest.mark.parametrize("host", ["10.0.0.9", "2001:db8::9", "127.0.0.1"])
 def test_the_error_of_a_denied_host_names_no_other_host(host: str) -> None:
-    """By default the error text has no address or name of another host, whichever rule denies."""
     people = "10.0.0.1 10.7.0.0/16 2001:db8::/40 host:bot robot"
     text = f"""
 [Groups]
@@ -83,7 +81,6 @@ default = few
 
 
 def test_denial_names_who_may_and_the_rule() -> None:
-    """The reason for a denial is one sentence with the host, action, allowed hosts, file and line."""
     decision = ask(compiled(FIGURE), "10.0.0.9", "publish", "/landshark_control/trigger")
     assert decision.reason == (
         "10.0.0.9 is not among the hosts that may publish /landshark_control/trigger: "
@@ -98,7 +95,6 @@ def test_denial_names_who_may_and_the_rule() -> None:
 
 
 def test_reason_stays_short_and_keeps_the_place() -> None:
-    """However long names, values and file names are, a reason has fewer than 300 characters and ends with the line."""
     name = "/" + "n" * 900
     text = (
         f"[Groups]\n{'g' * 500} = ::1\n[Parameters]\nwrite {name} = {'g' * 500} host:{'h' * 200} fd00::/16\n"
@@ -118,14 +114,12 @@ def test_reason_stays_short_and_keeps_the_place() -> None:
 
 
 def test_an_empty_value_denies_all_hosts() -> None:
-    """A key without a value denies every host, and the reason says so."""
     decision = ask(compiled("[Publishers]\ndefault = *\n/cmd =\n"), "10.0.0.1", "publish", "/cmd")
     assert not decision.allowed
     assert "no host may" in decision.reason
 
 
 def test_robot_and_enrolled_hosts_come_from_outside() -> None:
-    """The caller gives the addresses of `robot` and host:NAME; a name that is not enrolled matches no host."""
     text = "[Nodes]\ndefault = robot host:ocu-1 host:gone\n"
     given_hosts: dict[str, Address] = {"ocu-1": ipaddress.ip_address("10.77.0.11")}
     policy = compiled(text, hosts=given_hosts, robot=[ipaddress.ip_address("172.17.0.1")])
@@ -137,7 +131,6 @@ def test_robot_and_enrolled_hosts_come_from_outside() -> None:
 
 @pytest.mark.parametrize("category", ["node", "publish", "subscribe", "command"])
 def test_missing_section_of_the_thesis_denies(category: str) -> None:
-    """A category of the thesis grants nothing if the policy lacks its section."""
     resource = "getPid" if category == "command" else "/x"
     decision = ask(compiled("[Groups]\n"), "127.0.0.1", category, resource)
     assert not decision.allowed
@@ -146,7 +139,6 @@ def test_missing_section_of_the_thesis_denies(category: str) -> None:
 
 @pytest.mark.parametrize("category", ["offer", "call", "read", "write"])
 def test_missing_extension_keeps_the_behaviour_of_the_thesis(category: str) -> None:
-    """Without [Services], [Clients] or [Parameters] every host is allowed; with an empty section no host is allowed."""
     section = {"offer": "Services", "call": "Clients"}.get(category, "Parameters")
     assert ask(compiled(FIGURE), "10.9.9.9", category, "/x").allowed
     assert not compiled(FIGURE).has_section(Category(category))
@@ -154,7 +146,6 @@ def test_missing_extension_keeps_the_behaviour_of_the_thesis(category: str) -> N
 
 
 def test_an_unknown_call_is_denied_with_any_default() -> None:
-    """`default = *` does not grant a call that is in no table, nor a call that other sections decide."""
     policy = compiled("[Commands]\ndefault = *\n")
     assert all(ask(policy, "127.0.0.1", "command", name).allowed for name in COMMANDS - NAMED_ONLY)
     for name in ("getparam", "foo", "", "default", *DECIDED_ELSEWHERE):
@@ -165,7 +156,6 @@ def test_an_unknown_call_is_denied_with_any_default() -> None:
     "name", ["", "/", "x", "//x", "/x/", "/x\n", "/x y", "~x", "/ä", "/**", "/x/*", "/" + "a" * 2000]
 )
 def test_name_that_is_not_resolved_is_denied(name: str) -> None:
-    """No spelling bypasses the rules: a name that is not canonical is denied even under `*`."""
     policy = compiled("[Nodes]\n/** = *\n[Publishers]\n/** = *\n[Subscribers]\ndefault = *\n")
     assert not any(
         ask(policy, "10.0.0.1", category, name).allowed for category in ("node", "publish", "subscribe")
@@ -175,13 +165,11 @@ def test_name_that_is_not_resolved_is_denied(name: str) -> None:
 def ask_parameter(
     policy: Policy, host: str, key: str, *, namespace: bool = False, verb: str = "write"
 ) -> Decision:
-    """Return the decision on a parameter call."""
     request = Request(ipaddress.ip_address(host), "/n", Category(verb), key)
     return policy.decide_parameter(request, namespace=namespace)
 
 
 def test_audit_only_allows_and_reports_would_deny() -> None:
-    """In an audit-only section, requests that its rules deny are allowed and marked; other sections still deny."""
     policy = compiled(f"{FIGURE}[Options]\naudit-only = publishers\n")
     decision = ask(policy, "10.9.9.9", "publish", "/landshark_control/trigger")
     assert (decision.allowed, decision.would_deny) == (True, True)
@@ -192,7 +180,6 @@ def test_audit_only_allows_and_reports_would_deny() -> None:
 
 
 def test_unknown_address_is_known_as_such() -> None:
-    """An address is unknown if only `*` or an unused group covers it; any other rule makes it known."""
     policy = compiled(f"[Groups]\nunused = 10.8.8.8\n{FIGURE.replace('[Groups]', '')}")
     assert policy.knows(ipaddress.ip_address("10.0.0.5"))
     assert policy.knows(ipaddress.ip_address("::ffff:10.0.0.5"))
@@ -202,7 +189,6 @@ def test_unknown_address_is_known_as_such() -> None:
 
 
 def test_audit_only_serves_every_host_and_still_knows_the_named_ones() -> None:
-    """Requests of other hosts pass, within the quotas of unknown hosts; a policy that names no host knows them all."""
     unnamed, named = ipaddress.ip_address("10.8.8.8"), ipaddress.ip_address("10.0.0.5")
     policy = compiled("[Nodes]\n/a = 10.0.0.5\n[Options]\naudit-only = Nodes\n")
     assert [(policy.serves(host), policy.knows(host)) for host in (named, unnamed)] == [
@@ -218,7 +204,6 @@ def test_audit_only_serves_every_host_and_still_knows_the_named_ones() -> None:
 
 
 def test_memory_does_not_grow_with_requests() -> None:
-    """Answers are cached for a limited number of names, and never for long names."""
     policy = compiled(FIGURE)
     for number in range(20_000):
         ask(policy, "10.0.0.1", "publish", f"/topic{number}")
@@ -240,7 +225,6 @@ BLOCK = {
 @pytest.mark.parametrize("options", ["", "[Options]\naudit-only = all\n"])
 @pytest.mark.parametrize("spelling", ["10.0.0.5", "::ffff:10.0.0.5"])
 def test_a_block_denies_every_request_of_its_host_alone(options: str, spelling: str) -> None:
-    """Whatever the rules say: named calls, parameters without a section, audit-only sections, unknown resources."""
     free = compiled(
         options + "[Nodes]\ndefault=10.0.0.0/24\n[Commands]\ndefault=*\nshutdownMaster=10.0.0.5\n"
     )
@@ -260,7 +244,6 @@ def test_a_block_denies_every_request_of_its_host_alone(options: str, spelling: 
 
 
 def test_a_blocked_host_counts_as_unknown() -> None:
-    """It is not named, and counted with all unknown hosts; the other hosts of its network are counted as before."""
     policy = replace(compiled("[Nodes]\ndefault=10.0.0.0/24 10.0.0.5\n"), blocks=BLOCK)
     host, other = ipaddress.ip_address("::ffff:10.0.0.5"), ipaddress.ip_address("10.0.0.6")
     assert (policy.knows(host), policy.names(host), policy.counted_as(host)) == (False, False, "")
@@ -269,7 +252,6 @@ def test_a_blocked_host_counts_as_unknown() -> None:
 
 @pytest.mark.parametrize(("tell", "told"), [("rule", "is blocked by an operator"), ("id", "denied")])
 def test_a_blocked_host_learns_neither_operator_nor_note(tell: str, told: str) -> None:
-    """Only `tell = full` gives it the whole reason."""
     policy = replace(compiled("[Nodes]\ndefault=*\n"), blocks=BLOCK)
     decision = ask(policy, "10.0.0.5", "node", "/n")
     assert text_for_caller(decision, tell).removeprefix("10.0.0.5 ") == told

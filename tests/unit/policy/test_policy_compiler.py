@@ -60,7 +60,6 @@ getBusInfo = localhost
 
 
 def errors_of(text: str) -> list[str]:
-    """Return `line:column: text` of every error, as `rosrv policy check` shows them."""
     with pytest.raises(PolicyError) as caught:
         compile_policy(text, file="p.ini")
     found = [f for f in caught.value.findings if f.severity is FindingSeverity.ERROR]
@@ -68,20 +67,17 @@ def errors_of(text: str) -> list[str]:
 
 
 def warnings_of(text: str, **given: object) -> list[str]:
-    """Return `line:column: text` of every warning."""
     policy = compile_policy(text, file="p.ini", **given)  # type: ignore[arg-type]  # forwarded as given
     return [f"{f.line}:{f.column}: {f.text}" for f in policy.warnings]
 
 
 def test_policy_of_the_shape_of_rosrvs_loads() -> None:
-    """Lower-case [groups], comments after values, trailing blanks, [Ports] and [Monitor] are read."""
     policy = compile_policy(SAMPLE_OF_ROSRV, file="access-policy.cfg")
     assert policy.ports == range(19001, 20001)
     assert policy.monitored_topics == {"/chatter", "/landshark_control/base_velocity/hmac", "/rosout"}
 
 
 def test_uses_of_a_commented_out_group_are_errors() -> None:
-    """If rules still use a group that is commented out, each use is an error with its position."""
     found = errors_of(SAMPLE_OF_ROSRV.replace("\nocu =", "\n#ocu ="))
     assert found[0].startswith('17:22: no group "ocu" is defined')
     assert len(found) == 8
@@ -89,32 +85,27 @@ def test_uses_of_a_commented_out_group_are_errors() -> None:
 
 @pytest.mark.parametrize(("text", "expected"), mistakes("policy"))
 def test_a_mistake_is_an_error_with_its_place_and_a_hint(text: str, expected: str) -> None:
-    """Each kind of mistake refuses the file; the error has line, column, the mistake and a valid text."""
     found = errors_of(text)
     assert len(found) == 1
     assert found[0].startswith(expected)
 
 
 def test_all_mistakes_are_reported_at_once() -> None:
-    """All mistakes of a file are reported at once, in the order of the file."""
     text = "[Groups]\na = 10.0.0\n[Nodes]\nx = a\n/y = b\n[Commands]\nfoo = a\n[Options]\ntakeover = no\n"
     assert [line.split(":")[0] for line in errors_of(text)] == ["2", "4", "5", "7", "9"]
 
 
 def test_misspelt_section_is_one_mistake() -> None:
-    """[Group] instead of [Groups] is one error, without further errors for each use of its groups."""
     assert len(errors_of("[Group]\na = ::1\n[Nodes]\ndefault = a\n")) == 1
 
 
 def test_error_says_file_line_and_column_as_compilers_do() -> None:
-    """str() of a finding is file:line:column: error: text; the exception lists them all."""
     with pytest.raises(PolicyError) as caught:
         compile_policy("[Nodes]\nx = *\n", file="policies/p.ini")
     assert str(caught.value).startswith("policies/p.ini:2:1: error: ")
 
 
 def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
-    """A file that is too long is refused unread, and the error names the limit."""
     found = errors_of("#" * (MAXIMUM_CHARACTERS + 1))
     assert str(MAXIMUM_CHARACTERS) in found[0]
 
@@ -136,7 +127,6 @@ def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
     ids=["garbage", "undefined", "chain", "stars", "deep", "many groups"],
 )
 def test_hostile_file_is_judged_in_bounded_time(text: str) -> None:
-    """The worst texts of the allowed length are loaded or refused within seconds; the list of errors is limited."""
     start = time.process_time()
     try:
         compile_policy(text, file="p.ini")
@@ -158,7 +148,6 @@ TEXTS = st.one_of(st.text(), *(st.lists(PIECES, max_size=60).map(glue.join) for 
 @given(TEXTS)
 @example("[Groups]\nrobot\n=")
 def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
-    """Any text gives a `Policy`, or a `PolicyError` with positions inside the text."""
     try:
         policy = compile_policy(text, file="p.ini", robot=[ipaddress.ip_address("172.17.0.1")])
     except PolicyError as error:
@@ -173,7 +162,6 @@ def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
 
 
 def test_options_and_ports_have_their_documented_defaults() -> None:
-    """Without [Ports] and [Options] the defaults apply: 19001-26000, takeover by the same host, no audit-only mode."""
     policy = compile_policy("", file="p.ini")
     assert policy.ports == range(19001, 26001)
     assert policy.takeover == "same-host"
@@ -184,6 +172,5 @@ def test_options_and_ports_have_their_documented_defaults() -> None:
 
 
 def test_lines_may_end_as_on_windows() -> None:
-    """Carriage returns and a byte-order mark change nothing."""
     policy = compile_policy("\ufeff[Groups]\r\na = ::1 # x\r\n[Nodes]\r\ndefault = a\r\n", file="p.ini")
     assert policy.knows(ipaddress.ip_address("::1"))

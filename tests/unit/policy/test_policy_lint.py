@@ -22,7 +22,6 @@ default = op 10.0.0.1
 
 
 def warnings_of(text: str, robot: str = "") -> list[str]:
-    """Return `line:column: text` of every warning."""
     given = [ipaddress.ip_address(robot)] if robot else []
     return [
         f"{w.line}:{w.column}: {w.text}" for w in compile_policy(text, file="p.ini", robot=given).warnings
@@ -30,19 +29,16 @@ def warnings_of(text: str, robot: str = "") -> list[str]:
 
 
 def test_a_correct_policy_has_no_warning() -> None:
-    """A policy without doubtful rules has no warnings."""
     assert warnings_of(RIGHT) == []
 
 
 @pytest.mark.parametrize(("old", "new", "expected"), mistakes("doubtful"))
 def test_doubtful_policy_is_warned_about_with_its_place(old: str, new: str, expected: str) -> None:
-    """Each kind of doubtful rule is a warning with file, line and column, and the policy still loads."""
     assert old in RIGHT
     assert any(warning.startswith(expected) for warning in warnings_of(RIGHT.replace(old, new)))
 
 
 def test_host_that_lacks_a_node_name_is_named_once() -> None:
-    """If many rules let a host publish but [Nodes] does not name it, one warning counts these rules."""
     text = RIGHT.replace("/ocu = op\n", "").replace("[Subscribers]", "/a = op\n/b = op\n[Subscribers]")
     found = [warning for warning in warnings_of(text) if "10.0.0.5" in warning]
     assert len(found) == 1
@@ -50,13 +46,11 @@ def test_host_that_lacks_a_node_name_is_named_once() -> None:
 
 
 def test_network_that_overlaps_a_node_right_is_not_dead() -> None:
-    """A rule for a network is not dead if one of its addresses may be a node, and the other way round."""
     assert warnings_of(RIGHT.replace("default = op\n", "default = 10.0.0.0/24\n")) == []
     assert warnings_of(RIGHT.replace("/ocu = op", "/ocu = 10.0.0.0/8")) == []
 
 
 def test_loopback_is_warned_about_where_the_robot_is_elsewhere() -> None:
-    """The appliance itself is 127.0.0.1 if the robot is elsewhere or unknown; the warning names the robot."""
     text = RIGHT.replace("10.0.0.1", "127.0.0.1")
     (unknown,) = warnings_of(text)
     assert "127.0.0.1 is the appliance itself (unless isolation is none): write robot" in unknown

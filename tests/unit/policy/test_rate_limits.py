@@ -28,7 +28,6 @@ GUEST, TABLET, ROBOT = (ipaddress.ip_address(one) for one in ("10.0.0.5", "10.0.
 
 
 def policy(*lines: str):  # type: ignore[no-untyped-def]  # what compile_policy gives
-    """Return a policy with these limits."""
     return compile_policy(HEAD + "[Limits]\n" + "\n".join(lines), file="p.ini")
 
 
@@ -61,7 +60,6 @@ def test_a_limit_is_for_messages_or_bytes_of_hosts(
 
 
 def test_the_most_specific_key_decides_alone() -> None:
-    """As everywhere in a policy, a wider key is ignored."""
     limits = policy(
         "/** = publisher 1 Hz, topic 2 Hz", "/camera/* = publisher 30 Hz", "/camera/left = topic 9 Hz"
     )
@@ -75,7 +73,6 @@ def test_the_most_specific_key_decides_alone() -> None:
 
 @pytest.mark.parametrize(("line", "place", "text"), mistakes("limits"))
 def test_a_mistake_is_reported_with_its_place(line: str, place: str, text: str) -> None:
-    """As every error does, a mistake in a limit refuses the file."""
     with pytest.raises(PolicyError) as refused:
         policy(line)
     found = [str(one) for one in refused.value.findings]
@@ -91,7 +88,6 @@ def test_the_number_of_limits_is_bounded() -> None:
 
 
 def test_a_default_that_never_limits_is_a_warning() -> None:
-    """A default that is never reached is a warning, as in the sections that decide."""
     warnings = [str(one) for one in policy("/** = topic 1 Hz", "default = topic 2 Hz").warnings]
     assert [one for one in warnings if "group" not in one] == [
         "p.ini:14:1: warning: never limits: /** at line 13 matches every name before it"
@@ -99,14 +95,12 @@ def test_a_default_that_never_limits_is_a_warning() -> None:
 
 
 def test_a_host_that_only_a_limit_names_is_unknown() -> None:
-    """A limit grants nothing, so its hosts stay unknown."""
     text = "[Nodes]\n/a = 10.0.0.1\n[Limits]\n/a = publisher 10.0.0.2 1 Hz\n"
     known = compile_policy(text, file="p.ini")
     assert [known.knows(ipaddress.ip_address(f"10.0.0.{last}")) for last in (1, 2)] == [True, False]
 
 
 def test_hosts_share_as_the_policy_names_them() -> None:
-    """A named host counts alone, the hosts of a network as one, and all unknown hosts as one."""
     known = compile_policy("[Nodes]\n/a = 10.0.0.1 10.1.0.0/16\n", file="p.ini")
     addresses = ("10.0.0.1", "10.1.0.1", "10.1.0.2", "10.9.0.1", "10.9.0.2")
     shared = [known.counted_as(ipaddress.ip_address(address)) for address in addresses]
@@ -114,7 +108,6 @@ def test_hosts_share_as_the_policy_names_them() -> None:
 
 
 def test_explain_shows_the_limit_and_its_line() -> None:
-    """The explanation of an allowed request has the limit of its host and the limit of all hosts together."""
     limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
     [publish, subscribe] = [
         list(render(explain(limits, Request(GUEST, "/lidar", category, "/scan"))))

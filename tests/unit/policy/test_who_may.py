@@ -37,7 +37,6 @@ HOSTS = [
 
 @pytest.mark.parametrize("topic", ["/covered", "/halves", "/six", "/other"])
 def test_the_answer_for_a_network_is_the_decision_on_each_host_in_it(topic: str) -> None:
-    """The answer for the smallest network with a host, or for all other hosts, is the decision on this host."""
     policy = compile_policy(POLICY, file="p.ini")
     answers = {answer.network: answer for answer in who_may(policy, Category.PUBLISH, topic, "/n")}
     assert ipaddress.ip_network("10.0.0.0/30") not in answers, "smaller networks cover it"
@@ -50,7 +49,6 @@ def test_the_answer_for_a_network_is_the_decision_on_each_host_in_it(topic: str)
 
 
 def test_no_answer_for_other_hosts_if_the_networks_are_all() -> None:
-    """If the networks of the policy contain every address, there are no other hosts."""
     policy = compile_policy("[Nodes]\ndefault = 0.0.0.0/0 ::/0\n", file="p.ini")
     assert [answer.hosts for answer in who_may(policy, Category.NODE, "/n")] == ["0.0.0.0/0", "::/0"]
 
@@ -117,7 +115,6 @@ def _edges(networks: dict[Network, int]) -> Iterator[Address]:
 @given(_policies(), st.sampled_from(_ACTIONS), st.sampled_from(["", "/n"]))
 @settings(max_examples=examples(1200), deadline=None)
 def test_every_host_has_the_answer_of_its_network(text: str, action: tuple[Category, str], node: str) -> None:
-    """For any policy and action, each host at the edges of the networks is decided as the answer says."""
     robot = [ipaddress.ip_network("10.0.0.2/31"), ipaddress.ip_network("::1")]
     policy = compile_policy(text, file="p.ini", hosts={"a": ipaddress.ip_address("10.0.0.5")}, robot=robot)
     answers = {answer.network: answer for answer in who_may(policy, *action, node)}
@@ -130,7 +127,6 @@ def test_every_host_has_the_answer_of_its_network(text: str, action: tuple[Categ
 
 
 def test_many_addresses_are_not_compared_with_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The work grows with the number of addresses, not with its square."""
     compared = []
 
     def count(outer: Network, inner: Network) -> bool:

@@ -69,12 +69,10 @@ TEXTS = {
 
 
 async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Compile in this process."""
     return await asyncio.to_thread(check, sources, site_keys)
 
 
 async def here_at_start(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
-    """Compile for a start, in this process."""
     return await asyncio.to_thread(check, sources, site_keys, compiler=contents_at_start)
 
 
@@ -108,7 +106,6 @@ class Desk:
         folder: bool = True,
         site_keys: Sequence[str] = (),
     ) -> SpecificationManager:
-        """Start a control."""
         relay = Taking(self)
         relay.monitors = WaitingManager(
             self.folder if folder else None,
@@ -133,7 +130,6 @@ class Desk:
         return relay.monitors
 
     def close(self) -> None:
-        """Close its files."""
         self.store.close()
         self.log.close()
 
@@ -178,11 +174,9 @@ class Taking:
         return True
 
     async def carried_out(self) -> None:
-        """Wait until the desk lets the relay confirm."""
         await self.desk.carried_out.wait()
 
     def live_resources(self) -> set[Resource]:
-        """Return none: nothing is carried."""
         return set()
 
     def withdraw(self, moves: Sequence[Move]) -> None:
@@ -223,7 +217,6 @@ class Dialogue:
         self._last = ""
 
     async def say(self, line: str) -> list[str]:
-        """Return the effects of one line."""
         self.desk.sent.clear()
         self.desk.trail.heard.clear()
         effects = await self._done(shlex.split(line))
@@ -282,7 +275,6 @@ class Dialogue:
 
     @property
     def monitors(self) -> SpecificationManager:
-        """Return the monitors of the control that started last."""
         assert self._monitors is not None
         return self._monitors
 

@@ -13,7 +13,6 @@ from appliance.specifications.specification_files import (
 
 
 def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
-    """Return a specification with an event on each topic."""
     events = "".join(
         f"event e{number}() {topic} std_msgs/String '{{}}' {{ {body} }}"
         for number, topic in enumerate(topics)
@@ -22,17 +21,14 @@ def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:
 
 
 def checked(**files: str) -> CheckedSpecifications:
-    """Return the specifications of these files."""
     return check(Sources({f"{name}.rv": text for name, text in files.items()}), ())
 
 
 def together(**files: str) -> list[set[str]]:
-    """Return the groups of files."""
     return [{name.removesuffix(".rv") for name in group.files} for group in groups_of(checked(**files))]
 
 
 def test_specifications_without_anything_in_common_are_apart() -> None:
-    """The largest group comes first, then by name."""
     two = spec("b", "/b") + spec("c", "/c")
     assert together(a=spec("a", "/a"), b=two, d=spec("d", "/d")) == [{"b"}, {"a"}, {"d"}]
 
@@ -47,14 +43,12 @@ def test_specifications_without_anything_in_common_are_apart() -> None:
     ids=["topic", "variable", "publishes onto the other's topic"],
 )
 def test_common_topics_join_specifications(other: str) -> None:
-    """This holds across a third one also."""
     a = spec("a", "/a", variables="int n;")
     assert together(a=a, b=other) == [{"a", "b"}]
     assert together(a=a, b=other, c=spec("c", "/c", "/b")) == [{"a", "b", "c"}]
 
 
 def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
-    """A topic and a service are unrelated."""
     service = "NAME() { event e() service /x std_srvs/SetBool request '{}' { } }"
     topic = spec("t", "/x")
     joined = together(a=service.replace("NAME", "a"), b=service.replace("NAME", "b"), t=topic)
@@ -62,7 +56,6 @@ def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
 
 
 def test_a_fresh_start_is_balanced_and_kept() -> None:
-    """A restarted control finds the same allocation; another number of relays makes a new one."""
     kept: list[str] = []
     first = Allocation(2, kept.append)
     names = "abcd"
@@ -97,7 +90,6 @@ def test_a_specification_goes_to_the_relay_of_its_topics() -> None:
 
 
 def test_running_monitors_move_only_when_they_must() -> None:
-    """Where monitors of two relays are joined, those of the relay with more stay, whatever topics that moves."""
     allocation = Allocation(2)
     first = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
     allocation.adopt(allocation.plan(checked(**first)))
@@ -126,7 +118,6 @@ def test_topics_move_in_one_direction() -> None:
 
 
 def test_a_relay_whose_topic_gets_its_monitor_elsewhere_gives_something_up() -> None:
-    """Although no file moves: its monitors stay until it does not carry the topic any more."""
     allocation = Allocation(2)
     files = {"a": spec("a", "/a"), "b": spec("b", "/b")}
     allocation.adopt(allocation.plan(checked(**files)))

@@ -22,8 +22,6 @@ GUARD = """guard() {
 
 
 def test_a_wrong_automaton_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The finding has the position of the formula, and says whose defect it is."""
-
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
 
@@ -39,7 +37,6 @@ def test_a_wrong_automaton_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_no_relay_gets_a_wrong_module(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process that compiles refuses the specification."""
     monkeypatch.setattr(batch_codegen.TopicCodegen, "_handle", lambda *_: b"")
     compiled = encoded(compiled_from({"guard.rv": GUARD}, standard_definitions()))
     with pytest.raises(SpecificationsRefusedError, match="this is a defect of the monitor compiler"):

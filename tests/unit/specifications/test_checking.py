@@ -18,12 +18,10 @@ USER = f"begin user() {{ {TWIST} {{ v = last; }} }}"
 
 
 def unbuilt(**files: str) -> dict[str, str]:
-    """Return the monitors that a start leaves without code, with the errors."""
     return contents_at_start({f"{name}.rv": text for name, text in files.items()}, {}).unbuilt
 
 
 def test_a_start_leaves_out_only_the_files_with_errors() -> None:
-    """The others come into force, wherever they are in the order; the topics of those left out are known."""
     found = contents_at_start(
         {"a.rv": USER, "b.rv": WRONG, "c.rv": GOOD, "d.rv": WRONG.replace("wrong", "d")}, {}
     )
@@ -40,7 +38,6 @@ def test_a_file_is_left_out_with_the_file_whose_variables_it_uses() -> None:
 
 
 def test_nothing_is_left_out_without_an_error() -> None:
-    """A start then compiles what a load compiles."""
     files = {"a.rv": GOOD, "b.rv": USER}
     assert contents_at_start(files, {}) == contents(files, {})
 
@@ -62,7 +59,6 @@ def test_a_definition_that_cannot_be_read_leaves_out_all_files() -> None:
 
 
 def test_a_defect_of_the_compiler_leaves_out_one_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever is raised while a module is made, the other files come into force."""
     written = batch_codegen.written_of
 
     def broken(compiled: Compiled) -> object:
@@ -76,8 +72,6 @@ def test_a_defect_of_the_compiler_leaves_out_one_file(monkeypatch: pytest.Monkey
 
 
 def test_an_invalid_module_is_an_error_of_its_specification(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A load is refused with the position of the specification whose code the runtime rejects."""
-
     data = contents({"a.rv": GOOD, "b.rv": WRONG.replace("missing", "2")}, {}).compiled
     monkeypatch.setattr(build, "check_steps", rejecting("wrong"))
     with pytest.raises(
@@ -87,8 +81,6 @@ def test_an_invalid_module_is_an_error_of_its_specification(monkeypatch: pytest.
 
 
 def rejecting(name: str) -> Callable[[Compiled, object], int]:
-    """Return a check of modules that finds an invalid one if it has this specification."""
-
     def check_steps(compiled: Compiled, _module: object) -> int:
         if any(one.name == name for one in compiled.specifications):
             raise WasmError("type mismatch")

@@ -30,12 +30,10 @@ class Scene:
         self.compiler = SpecificationCompiler(self.called)
 
     def called(self) -> None:
-        """Start another compiler, in the next turn of the loop."""
         self.calls += 1
         asyncio.get_running_loop().call_soon(self.come)
 
     def come(self) -> None:
-        """Link a compiler."""
         ours, theirs = socket.socketpair()
         channel = Channel(theirs, messages.CompilerLink)
         self._channels.append(channel)
@@ -47,29 +45,24 @@ class Scene:
         self.compiler.attach(Channel(ours, messages.CompilerLink))
 
     def close(self) -> None:
-        """End all compilers."""
         for channel in self._channels:
             channel.close()
 
 
 def finds(channel: Channel, wanted: messages.ContentsWanted) -> None:
-    """Answer that the question is valid."""
     channel.send(messages.ContentsFound(wanted.number, FOUND))
 
 
 def refuses(channel: Channel, wanted: messages.ContentsWanted) -> None:
-    """Answer that the question is invalid."""
     channel.send(messages.CompilationRefused(wanted.number, ["a.rv:1:1: error: no"]))
 
 
 def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
-    """Die while compiling."""
     channel.close()
 
 
 @pytest.mark.nightly
 async def test_the_compiler_is_started_for_the_first_question() -> None:
-    """It is started once for all questions, and not if there are no files."""
     scene = Scene(finds, refuses, finds)
     assert (await scene.compiler.check(Sources(), ())).monitors == {}
     assert scene.calls == 0
@@ -83,7 +76,6 @@ async def test_the_compiler_is_started_for_the_first_question() -> None:
 
 @pytest.mark.nightly
 async def test_a_compiler_that_just_ended_is_replaced() -> None:
-    """The next compiler gets the same question."""
     scene = Scene(dies, finds)
     assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
     assert scene.calls == 2
@@ -92,7 +84,6 @@ async def test_a_compiler_that_just_ended_is_replaced() -> None:
 
 @pytest.mark.nightly
 async def test_only_texts_that_crash_it_are_refused() -> None:
-    """A text that crashes the compiler never comes into force."""
     scene = Scene(dies, dies, finds)
     with pytest.raises(SpecificationsRefusedError, match="the compiler exited while it read them"):
         await scene.compiler.check(SOURCES, ())
@@ -104,7 +95,6 @@ async def test_only_texts_that_crash_it_are_refused() -> None:
 async def test_a_silent_or_missing_compiler_is_not_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The answer is a refusal; the next question starts the compiler again."""
     monkeypatch.setattr(module, "_WORK_SECONDS", 0.05)
     monkeypatch.setattr(module, "_START_SECONDS", 0.05)
     scene = Scene(lambda _channel, _wanted: None)
@@ -126,14 +116,12 @@ class Told:
         self.heard: asyncio.Queue[Any] = asyncio.Queue()
 
     def __call__(self, channel: Channel, wanted: Any) -> None:
-        """Accept a question."""
         self.heard.put_nowait(wanted)
         if not wanted.dry_run:
             finds(channel, wanted)
 
 
 async def test_an_order_ends_a_dry_run() -> None:
-    """An order is compiled at once, by another process; the dry run is refused with the reason."""
     told = Told()
     scene = Scene(told, told)
     dry_run = asyncio.ensure_future(scene.compiler.try_out(SOURCES, ()))
@@ -146,7 +134,6 @@ async def test_an_order_ends_a_dry_run() -> None:
 
 
 async def test_a_dry_run_begins_after_earlier_orders_and_dry_runs() -> None:
-    """No dry run begins while an order is compiled, and dry runs are compiled one at a time."""
     heard: list[tuple[Channel, Any]] = []
     scene = Scene(*[lambda channel, wanted: heard.append((channel, wanted))] * 3)
 
@@ -170,7 +157,6 @@ async def test_a_dry_run_begins_after_earlier_orders_and_dry_runs() -> None:
 
 
 async def test_a_compilation_ends_when_its_order_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A load whose client was killed does not delay other orders."""
     monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
     heard: asyncio.Queue[Any] = asyncio.Queue()
     scene = Scene(lambda _channel, wanted: heard.put_nowait(wanted), finds)

@@ -25,13 +25,11 @@ LIVE: dict[str, dict[str, LiveType]] = {"/chatter": {"/talker": LiveType("std_ms
 def judged(
     live: dict[str, dict[str, LiveType]], *, shadow: Collection[str] = (), forced: bool = False
 ) -> tuple[list[str], list[str]]:
-    """Return the findings on a new specification."""
     found = judge_topics(CODE, CheckedSpecifications(), live, shadow=shadow, forced=forced)
     return found.conflicts, found.warnings
 
 
 def test_a_fitting_type_is_not_a_finding() -> None:
-    """A topic with the publisher's type, or with one that its publisher leaves open, is not reported."""
     assert judged(LIVE) == ([], [])
     assert judged({"/chatter": {"/talker": LiveType("*")}}) == ([], [])
 
@@ -56,7 +54,6 @@ def test_a_topic_that_monitors_publish_has_one_type() -> None:
     [({"/chater": {"/t": LiveType("std_msgs/String")}}, "; did you mean /chater?"), ({}, "")],
 )
 def test_a_topic_without_a_publisher_is_a_warning(live: dict[str, dict[str, LiveType]], hint: str) -> None:
-    """The nearest live name is named where there is one; what monitors publish themselves needs no publisher."""
     assert judged(live) == ([], [f"a.rv:2:5: warning: no node publishes /chatter now{hint}"])
 
 
@@ -80,7 +77,6 @@ def test_a_type_of_the_same_name_with_another_definition() -> None:
 
 
 def test_another_definition_of_a_topic_in_force_is_judged_again() -> None:
-    """The same type with a new definition may no longer fit its publisher."""
     live = {"/chatter": {"/talker": LiveType("std_msgs/String", OTHER)}}
     before = msgspec.structs.replace(CODE, texts={"std_msgs/String": "string data\nstring more\n"})
     assert judge_topics(CODE, CODE, live, shadow=(), forced=False).conflicts == []
@@ -101,7 +97,6 @@ CHANGED = DEADMAN.replace("300ms", "500ms")
 def held(
     text: str, live: dict[str, dict[str, LiveType]] = DRIVING, before: str = DEADMAN, **how: Any
 ) -> tuple[list[str], list[str]]:
-    """Return the findings on a text that replaces another."""
     present, coming = (check(Sources({"d.rv": one}), ()) for one in (before, text))
     given: dict[str, Any] = {"acting": ["deadman"], "moved": (), "hold": False} | how
     found = judge_holds(coming, present, live, **given)
@@ -136,7 +131,6 @@ def test_a_change_that_holds_a_topic_without_traffic_warns_only() -> None:
 
 
 def test_a_move_to_another_relay_that_holds_a_topic_needs_consent() -> None:
-    """The state stays in the relay that the monitor leaves."""
     [conflict], _ = held(DEADMAN, moved=["d.rv"])
     assert "because it moves to another relay" in conflict
 
@@ -154,5 +148,4 @@ def test_a_move_to_another_relay_that_holds_a_topic_needs_consent() -> None:
     ],
 )
 def test_a_change_that_holds_nothing_needs_no_consent(text: str, how: dict[str, Any]) -> None:
-    """The text is the same, or the monitor is new, or begins again, or acts by no state, or no node publishes."""
     assert held(text, **how) == ([], [])

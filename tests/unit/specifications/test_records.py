@@ -17,7 +17,6 @@ NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", 
 
 @pytest.mark.parametrize("kind", ["verdict", "drop", "change", "fault", "log", "publish"])
 def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
-    """A verdict has a category of its own, and a robot may use any names."""
     log = open_log(tmp_path / "audit.db")
     records = MonitorRecords(
         AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {}),

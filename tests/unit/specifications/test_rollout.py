@@ -26,7 +26,6 @@ pytestmark = pytest.mark.anyio
 
 
 def spec(name: str, *topics: str) -> str:
-    """Return a specification with an event on each topic."""
     events = "".join(
         f"event e{number}() {topic} std_msgs/String '{{}}' {{ }}" for number, topic in enumerate(topics)
     )
@@ -34,18 +33,15 @@ def spec(name: str, *topics: str) -> str:
 
 
 def revision(number: int, **files: str) -> Revision:
-    """Return a revision with files of these names."""
     sources = Sources({f"{name}.rv": text for name, text in files.items()})
     return Revision(number, sources, check(sources, ()))
 
 
 def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTaken:
-    """Return a relay's answer."""
     return messages.SpecificationsTaken(statement.revision, [], [], statement.statement)
 
 
 def files_of(message: messages.SpecificationsStated) -> list[str]:
-    """Return the files of the monitors that a statement gives to a relay."""
     return list(dict.fromkeys(f"{name[0]}.rv" for name in message.enabled))
 
 
@@ -86,17 +82,14 @@ class Fleet:
         """As `Relays`."""
 
     def live_resources(self) -> set[Resource]:
-        """As `Relays`."""
         return self.carried
 
     def withdraw(self, moves: Sequence[Move]) -> None:
-        """As `Relays`."""
         self.story += [
             ("withdrawn", move.name, self.rollout.allocation.of(move.kind, move.name)) for move in moves
         ]
 
     def place(self, moves: Sequence[Move]) -> None:
-        """As `Relays`."""
         self.story += [
             ("placed", move.name, self.rollout.allocation.of(move.kind, move.name)) for move in moves
         ]
@@ -117,14 +110,12 @@ class World:
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    """As it says."""
     world = World(tmp_path)
     yield world
     world.log.close()
 
 
 async def test_a_relay_with_unchanged_specifications_gets_the_same_statement(world: World) -> None:
-    """A change for the other relay does not affect it."""
     other = world.rollout.relay_of("b")
     before = {relay: world.rollout.statement(relay).part for relay in range(2)}
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/a")))
@@ -144,8 +135,6 @@ async def test_each_relay_receives_its_own_specifications(world: World) -> None:
 
 
 async def test_a_refusal_of_one_relay_stops_all(world: World) -> None:
-    """The other relay, which had accepted it, receives the specifications in force again."""
-
     def answer(relay: int, statement: messages.SpecificationsStated) -> messages.Message:
         if relay == 1 and statement.revision == 2:
             return messages.SpecificationsRefused(2, ["c.rv:1:1: error: no"], statement.statement)
@@ -162,7 +151,6 @@ async def test_a_refusal_of_one_relay_stops_all(world: World) -> None:
 
 @pytest.mark.nightly
 async def test_a_relay_that_dies_counts_as_a_refusal(world: World) -> None:
-    """An absent relay receives the change when it returns, and does not stop the others."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     taking = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))))
     while len(world.fleet.story) < 2:
@@ -176,7 +164,6 @@ async def test_a_relay_that_dies_counts_as_a_refusal(world: World) -> None:
 
 
 async def test_a_topic_moves_only_between_monitors(world: World) -> None:
-    """The new relay has them first, the old one until the topic is withdrawn; restarted ones hold and are reported."""
     moved = await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     assert moved == ["b"]
     assert world.fleet.story == [
@@ -192,7 +179,6 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
 
 
 async def test_crossing_moves_go_one_way_and_are_tried_first(world: World) -> None:
-    """If two loads at once join monitors of both relays, each topic is placed where its monitors already are."""
     files = {name: spec(name, f"/{name}") for name in "abcd"}
     await world.rollout.take(revision(2, **files))
     world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
@@ -223,7 +209,6 @@ async def test_a_relay_that_starts_during_a_load_gets_it_before_any_topic(
 
 
 async def test_a_load_ends_once_the_relays_that_lost_topics_confirm(world: World) -> None:
-    """A relay that does not confirm in time is reported as having other specifications in force."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     over = asyncio.ensure_future(world.rollout.all_taken())
@@ -236,7 +221,6 @@ async def test_a_load_ends_once_the_relays_that_lost_topics_confirm(world: World
 
 
 async def test_a_topic_published_during_a_load_moves_as_well(world: World) -> None:
-    """The old plan did not have it: a new plan is made and tried before any topic moves."""
     world.fleet.carried = set()
 
     def answer(_relay: int, statement: messages.SpecificationsStated) -> messages.Message:
@@ -252,7 +236,6 @@ async def test_a_topic_published_during_a_load_moves_as_well(world: World) -> No
 async def test_an_answer_to_an_earlier_try_does_not_count(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two tries of a revision are two statements: a late answer to the first brings no wrong text into force."""
     monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 0.01)
     world.fleet.answer = lambda _relay, _statement: None
     with pytest.raises(SpecificationsRefusedError, match="try again"):
@@ -272,7 +255,6 @@ async def test_an_answer_to_an_earlier_try_does_not_count(
 
 
 async def test_monitors_in_their_initial_state_are_reported(world: World) -> None:
-    """Only answers to the present statement count."""
     world.fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
         statement.revision, ["c", "b"] if relay else [], [], statement.statement
     )
@@ -282,7 +264,6 @@ async def test_monitors_in_their_initial_state_are_reported(world: World) -> Non
 
 
 async def test_held_monitors_and_rows_of_both(world: World) -> None:
-    """A row of a monitor that has moved counts only where it is now."""
     rollout = world.rollout
 
     def row(name: str, events: int) -> messages.MonitorRow:
@@ -299,7 +280,6 @@ async def test_held_monitors_and_rows_of_both(world: World) -> None:
 
 
 async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(world: World) -> None:
-    """The answer of the other relay does not change that."""
     rollout = world.rollout
     rollout.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
     rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
@@ -309,7 +289,6 @@ async def test_a_relay_with_other_specifications_is_reported_until_it_agrees(wor
 
 
 async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
-    """The next control has the saved allocation; a relay's first answer to it does not count as a restart."""
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     files = {"b": spec("b", "/b"), "z": spec("z", "/z")}
@@ -328,7 +307,6 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
 async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
     world: World,
 ) -> None:
-    """The allocation of a removal was saved, its revision was not: the monitor stays in force, with its topic."""
     kept: list[str] = []
     allocation = Allocation(2, kept.append)
     names = [f"/t{number}" for number in range(20)]
@@ -343,7 +321,6 @@ async def test_a_crash_during_a_change_leaves_no_topic_without_its_monitors(
 
 
 async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
-    """This holds for any number of clients that load large sets without waiting for the answer."""
     before = dict(world.rollout.compiled_parts)
     with awaited(lambda: True), pytest.raises(WithdrawnError):
         await world.rollout.take(revision(2, **world.files, c=spec("c", "/c")))
@@ -352,7 +329,6 @@ async def test_a_withdrawn_load_leaves_nothing_in_memory(world: World) -> None:
 
 
 async def test_each_relay_inherits_once(world: World) -> None:
-    """A relay gets the inherited state until it has taken it, also in a new process; then none gets it again."""
     done: list[bool] = []
     world.rollout.inherit(InheritedState(left=(b"state",)), lambda: done.append(True))
     first, again = (world.rollout.statement(0) for _ in range(2))

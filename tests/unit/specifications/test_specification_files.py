@@ -19,7 +19,6 @@ OWN = "b() { event trigger() /trigger own_msgs/Trigger '{}' { } }"
 
 
 def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
-    """`.rv` files by name, and `.msg` files under `msg/`, with or without a folder `msg` in the package."""
     (tmp_path / "b.rv").write_text(OWN)
     (tmp_path / "a.rv").write_text("﻿" + SPEC)
     (tmp_path / "notes.txt").write_text("not a specification")
@@ -47,14 +46,12 @@ def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
     ],
 )
 def test_a_mistake_in_a_file_is_reported_with_its_place(sources: Sources, said: str) -> None:
-    """No file is loaded in part."""
     with pytest.raises(SpecificationsRefusedError) as error:
         check(sources, ())
     assert said in str(error.value)
 
 
 def test_a_folder_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
-    """A missing folder, a definition outside of a package or a file that is not text is refused."""
     with pytest.raises(SpecificationsRefusedError, match="does not exist"):
         read_folder(tmp_path / "nowhere")
     (tmp_path / "a.rv").write_bytes(b"\xff\xfe")
@@ -80,7 +77,6 @@ def test_an_unreadable_folder_is_not_an_empty_one(
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Return the folders that were read, in order."""
     done: list[Path] = []
 
     def noted(folder: Path) -> Sources:
@@ -92,7 +88,6 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 
 def test_the_folder_is_read_again_only_after_a_change(tmp_path: Path, reads: list[Path]) -> None:
-    """A new file, another text with the date of the one before, a definition and a removal are changes."""
     folder = SpecificationFolder(tmp_path)
     assert folder.looked_at() == folder.looked_at() == Sources()
     assert len(reads) == 1
@@ -111,7 +106,6 @@ def test_the_folder_is_read_again_only_after_a_change(tmp_path: Path, reads: lis
 
 
 def test_an_unusable_folder_has_no_files(tmp_path: Path) -> None:
-    """The folder is missing or has a file that is not text."""
     (tmp_path / "a.rv").write_bytes(b"\xff")
     assert SpecificationFolder(tmp_path).looked_at() is None
     assert SpecificationFolder(tmp_path / "gone").looked_at() is None

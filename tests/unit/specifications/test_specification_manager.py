@@ -31,7 +31,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Desk]:
-    """A folder with one specification."""
     desk = Desk(tmp_path)
     yield desk
     desk.close()
@@ -47,7 +46,6 @@ async def test_orders(desk: Desk, title: str) -> None:
 
 
 async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> None:
-    """It is enabled again automatically, as before, and both changes are recorded."""
     monitors = await desk.monitors()
     await monitors.shadow(admin.MonitorShadow(["a"], True), "eve")
     for state, seconds in (("shadow", 0.05), (True, 0.05)):
@@ -67,7 +65,6 @@ async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> N
 
 
 def killed() -> None:
-    """End the time limits of earlier controls, as the death of their process does."""
     for task in asyncio.all_tasks() - {asyncio.current_task()}:
         if "TimedDisables" in str(task.get_coro()):
             task.cancel()
@@ -76,7 +73,6 @@ def killed() -> None:
 async def test_a_kill_between_two_writes_disables_no_monitor_forever(
     desk: Desk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whichever write of an enabling is the last one, a later control enables the monitor."""
     monitors = await desk.monitors()
     for writes in range(3):
         await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
@@ -90,13 +86,11 @@ async def test_a_kill_between_two_writes_disables_no_monitor_forever(
 
 
 def first(count: int, write: Callable[[str, str], None]) -> Callable[[str, str], None]:
-    """Return a function that writes `count` times, and then nothing."""
     left = iter(range(count))
     return lambda name, value: write(name, value) if next(left, None) is not None else None
 
 
 async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -> None:
-    """After a restart the monitor comes back; an operator's switch, or a removal, ends the time."""
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     switched = await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
@@ -118,7 +112,6 @@ async def test_a_time_off_survives_restarts_and_ends_with_a_switch(desk: Desk) -
 
 
 async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
-    """A slow load that is withdrawn while it is compiled, or while it waits for another change, changes nothing."""
     begun, goes_on, gone = asyncio.Event(), asyncio.Event(), False
 
     async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
@@ -154,7 +147,6 @@ async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> Non
 
 
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
-    """A second dry run of the same token is refused, that of another token is not; then it may have another one."""
     begun, goes_on = asyncio.Event(), asyncio.Event()
 
     async def slow(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
@@ -176,7 +168,6 @@ async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
 
 
 async def test_records_of_loads_have_the_hash_of_the_files_and_of_what_was_compiled(desk: Desk) -> None:
-    """The first is the `sha256sum` of the files; equal texts have the same hash, by whichever process compiled."""
     monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     await monitors.reload(admin.MonitorReload(prune=True), "operator")
@@ -193,7 +184,6 @@ async def test_records_of_loads_have_the_hash_of_the_files_and_of_what_was_compi
 
 
 async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk) -> None:
-    """Messages after the answer are judged by the switch; the same holds when monitors are resumed."""
     monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["a"], monitors.statement(0).statement))
     for order in (
@@ -214,7 +204,6 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
 
 
 async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
-    """Both arrive together, and the first takes long."""
     (desk.folder / "b.rv").write_text(B)
     monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
@@ -231,7 +220,6 @@ async def test_one_of_two_concurrent_changes_is_made(desk: Desk) -> None:
 
 
 async def test_actions_of_monitors_are_recorded_with_their_count(desk: Desk) -> None:
-    """Records have the bytes before and after as hexadecimal digits, and the count of unreported actions."""
     monitors = await desk.monitors()
     told = [
         messages.MonitorEvent("change", "a", "k", "/chatter", 1, "a changed", {}, b"\x01", b"\x02", 1),
@@ -255,13 +243,11 @@ async def test_actions_of_monitors_are_recorded_with_their_count(desk: Desk) -> 
 
 
 def sources(**texts: str) -> Sources:
-    """Files and their signatures."""
     files = {f"{name}.rv": text for name, text in texts.items()}
     return Sources(files, {}, {name: signed(text) for name, text in files.items()})
 
 
 async def test_with_site_keys_only_signed_specifications_come_into_force(desk: Desk) -> None:
-    """Start, load, reload, removal, rollback, and the start after a crash each require the site's signatures."""
     unsigned = "a.rv:1:1: error: it has no signature of the site"
     with pytest.raises(SpecificationsRefusedError, match=unsigned):
         await desk.monitors(site_keys=[LINE])
@@ -303,7 +289,6 @@ async def test_with_site_keys_only_signed_specifications_come_into_force(desk: D
 
 
 async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
-    """Keys are replaced by signing the files again; definitions of messages also have signatures."""
     (desk.folder / "msg" / "own").mkdir(parents=True)
     texts = {desk.folder / "a.rv": A, desk.folder / "msg" / "own" / "T.msg": "int32 x"}
     for path, text in texts.items():
@@ -320,7 +305,6 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
 
 
 async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) -> None:
-    """They are in neither the events nor the counts of drops; `detail` names the intervention."""
     monitors = await desk.monitors()
     told = [
         messages.MonitorEvent(
@@ -342,7 +326,6 @@ async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) ->
 
 @pytest.mark.parametrize("broken", ["a() { event e() /x std_msgs/String '{}' { missing = 1; } }", "nonsense"])
 async def test_a_folder_that_a_reload_refuses_is_refused_at_a_start(desk: Desk, broken: str) -> None:
-    """The revision in force stays, with an alarm, so its monitors still guard; a corrected folder is taken."""
     monitors = await desk.monitors()
     (desk.folder / "a.rv").write_text(broken)
     with pytest.raises(SpecificationsRefusedError):

@@ -30,7 +30,6 @@ _LIMIT_SECONDS = 60
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    """Return the state directory of a stopped appliance with a short log."""
     (tmp_path / "control").mkdir()
     log = open_log(tmp_path / "control" / "audit.db")
     for number in range(20):
@@ -45,7 +44,6 @@ def state(tmp_path: Path) -> Path:
 
 
 def test_every_recorded_category_is_known() -> None:
-    """A search for a category that the appliance records gets no note."""
     sources = Path(appliance.__file__).parent.rglob("*.py")
     written = {word for path in sources for word in re.findall(r'category="(\w+)"', path.read_text())}
     assert written | {TOPIC, SERVICE, *Category, *Kind} == set(CATEGORIES)
@@ -53,7 +51,6 @@ def test_every_recorded_category_is_known() -> None:
 
 @pytest.mark.nightly
 def test_search_on_a_terminal_is_a_table(state: Path) -> None:
-    """A terminal gets a table, in which escape codes from unknown hosts have no effect."""
     ours, theirs = pty.openpty()
     command = [sys.executable, "-m", "appliance.cli.main", "audit", "search", "--deny", "--state", str(state)]
     environment = os.environ | {"COLUMNS": "200", "TERM": "xterm"}
@@ -105,7 +102,6 @@ def test_tail_follows(state: Path) -> None:
 
 
 def test_an_export_is_private(tmp_path: Path) -> None:
-    """Records name hosts and messages, so only the owner of the file reads it, whatever the umask is."""
     before = os.umask(0o022)
     try:
         with _new_file(tmp_path / "week.ndjson") as file:

@@ -36,7 +36,6 @@ def test_a_log_is_complete_only_once_something_is_signed(
 def test_a_table_of_records_has_their_numbers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table has the record numbers that `rosrv audit why` and `rosrv policy grant` take as arguments."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")
@@ -48,7 +47,6 @@ def test_a_table_of_records_has_their_numbers(
 def test_a_table_of_records_has_the_author_of_a_change(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is in the column of hosts and callers; a damaged author is text too, and a missing one is not shown."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")
@@ -97,7 +95,6 @@ def test_a_narrow_terminal_has_the_reason_below(
 def test_a_table_needs_room_for_its_reasons(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, columns: int, head: str
 ) -> None:
-    """Reasons are beside the records if the longest names leave room; no name is ever broken at these widths."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(columns))
@@ -114,7 +111,6 @@ def test_a_table_needs_room_for_its_reasons(
 def test_equal_records_are_one_row(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The row has monitor, topic, the first record's number, count, times and the last value; `each` shows all."""
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "200")

@@ -12,11 +12,9 @@ NO_TEXT = "alice\udcff"
 
 
 def test_it_waits_for_the_slowest_answer() -> None:
-    """The client waits longer than the slowest order of REST takes: adding a host."""
     assert max(operation.seconds for operation in OPERATIONS) < admin_client.SECONDS
 
 
 def test_undecodable_bytes_are_an_error(tmp_path: Path) -> None:
-    """The error shows the word; nothing is sent."""
     with pytest.raises(NotRunningError, match=r"'alice\\udcff' is not valid UTF-8"):
         AdminSocket(tmp_path).ask(TokenAdd(NO_TEXT, "viewer", 60.0))

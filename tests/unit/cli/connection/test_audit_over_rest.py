@@ -40,13 +40,11 @@ class Rest:
         self.answers = list(answers)
 
     def call(self, _method: str, path: str, **_more: Any) -> dict[str, Any]:
-        """Return a page without records."""
         assert path == "/v1/audit"
         return {"records": [], "cursor": None}
 
     @contextmanager
     def streamed(self, _method: str, _path: str, **_more: Any) -> Iterator[Answer]:
-        """Return the next answer."""
         answer = self.answers.pop(0)
         if isinstance(answer, Exception):
             raise answer
@@ -58,7 +56,6 @@ def log_of(*answers: Answer | Exception) -> RestLog:
 
 
 def line(sequence: int) -> str:
-    """Return a record as a line of REST."""
     return json.dumps(
         as_object(LogEntry(sequence, AuditRecord(id=f"{sequence:020x}", time=1, event="decision")))
     )
@@ -75,7 +72,6 @@ def line(sequence: int) -> str:
 def test_refused_streams_raise_the_errors_of_a_file(
     refusal: RestProblemError, told: type[Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If REST refuses an export or a stream, the caller gets the same errors as from the log's file."""
     monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
     with pytest.raises(told, match=refusal.lines[0]):
         list(log_of(refusal).export(Filter()))
@@ -86,19 +82,16 @@ def test_refused_streams_raise_the_errors_of_a_file(
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"sequence": 1}', '"text"', "7"])
 def test_invalid_lines_are_an_error_of_the_server(text: str) -> None:
-    """A server that is not an appliance is reported as such, not as our defect."""
     with pytest.raises(NotRunningError, match="is not an appliance's REST API"):
         list(log_of(Answer([text], breaks=False)).export(Filter()))
 
 
 def test_an_export_gives_its_records() -> None:
-    """Every line is a record, in order."""
     found = list(log_of(Answer([line(1), "", line(2)], breaks=False)).export(Filter()))
     assert [one.sequence for one in found] == [1, 2]
 
 
 def test_following_survives_broken_connections(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stream that opened and broke does not count as a failure, even without a record."""
     monkeypatch.setattr(audit_rest, "_AGAIN_SECONDS", 0.0)
     broken = [Answer([": ping"], breaks=True) for _ in range(20)]
     last = Answer(["event: record", f"data: {line(9)}", "event: end", END], breaks=False)
@@ -121,5 +114,4 @@ def test_following_ends_without_a_server(monkeypatch: pytest.MonkeyPatch) -> Non
     "record_id", ["XYZ", "18E9AA02EFC40ABB0E51", "a" * 21, "verify", "stream", "", "../x", "é"]
 )
 def test_an_invalid_id_matches_no_record(record_id: str) -> None:
-    """As with the log's file, no record matches; REST gets no request."""
     assert log_of().show(record_id, 500) is None

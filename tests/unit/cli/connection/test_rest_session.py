@@ -17,7 +17,6 @@ pytestmark = pytest.mark.nightly
 
 
 def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SSLContext:
-    """Return a self-signed certificate for an address, and the context that serves it."""
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
@@ -65,7 +64,6 @@ CERTIFICATES = {"right": {}, "other": {}, "elsewhere": {"address": "10.9.9.9"}, 
 def test_an_untrusted_certificate_gets_nothing(
     tmp_path: Path, served: str, trusted: str | None, said: str
 ) -> None:
-    """An unknown, expired or missing certificate, or one for another name, has its own message, and nothing is sent."""
     contexts = {name: certificate(tmp_path / name, **given) for name, given in CERTIFICATES.items()}  # type: ignore[arg-type]  # a table
     (tmp_path / "text").write_text("nothing")
     with FakeAppliance(contexts[served]) as fake:
@@ -76,7 +74,6 @@ def test_an_untrusted_certificate_gets_nothing(
 
 
 def test_a_trusted_certificate_gets_the_request(tmp_path: Path) -> None:
-    """The option or the environment names the certificate; https to a server without TLS is an error."""
     right = str(tmp_path / "right.pem")
     with FakeAppliance(certificate(Path(right))) as fake:
         fake.problem(403, "refused", "reached")
@@ -89,7 +86,6 @@ def test_a_trusted_certificate_gets_the_request(tmp_path: Path) -> None:
 
 
 def test_deeply_nested_json_is_an_error_of_the_server() -> None:
-    """A deeply nested answer of another server does not exhaust the stack."""
     with FakeAppliance() as fake:
         fake.body = b"[" * 100_000
         done = rosrv("status", "--api", fake.url, ROSRV_TOKEN=TOKEN)

@@ -20,7 +20,6 @@ VERBS = [("status",), ("policy", "reload"), ("token", "list"), ("audit", "search
 
 @pytest.fixture
 def state() -> Iterator[Path]:
-    """Return a state directory as root makes it: others may enter but not list it."""
     with tempfile.TemporaryDirectory() as name, socket.socket(socket.AF_UNIX) as listener:
         Path(name).chmod(0o711)
         listener.bind(f"{name}/admin.sock")
@@ -32,7 +31,6 @@ def state() -> Iterator[Path]:
 
 @pytest.mark.parametrize("verb", VERBS, ids=" ".join)
 def test_a_user_who_is_not_root_gets_advice(state: Path, verb: tuple[str, ...]) -> None:
-    """One sentence names the file and the user to run as; exit status 2."""
     need_root()
     command = [*NOBODY, ROSRV, *verb, "--state", str(state)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

@@ -19,7 +19,6 @@ from tests.support.answers import example
 
 
 def run(*arguments: str) -> Any:
-    """Run the command."""
     return CliRunner().invoke(app, ["host", *arguments], env={"COLUMNS": "400"})
 
 
@@ -30,7 +29,6 @@ KIT = example(
 
 
 def test_a_refused_request_leaves_no_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The same holds for an interrupted request; the file is opened before the request is sent."""
     out, interrupted = tmp_path / "kit", [False]
 
     def refuse(_self: AdminSocket, _request: AdminRequest[Any]) -> AdminAnswer[Any]:

@@ -27,7 +27,6 @@ CONNECTION: Part = (
 
 
 def record(fields: dict[str, bytes], data: bytes) -> bytes:
-    """Return one record of a bag."""
     header = b"".join(
         U32(len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in fields.items()
     )
@@ -56,12 +55,10 @@ def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> 
 
 
 def message(seconds: int, text: bytes) -> bytes:
-    """Return the record of a message."""
     return record({"op": b"\x02", "conn": U32(0), "time": U64(seconds)}, U32(len(text)) + text)
 
 
 def refusal(place: Path) -> str:
-    """Return the message for a bag that is rejected."""
     with pytest.raises(RecordingError) as ended:
         list(RecordedFile(place, ["*"]).messages())
     return str(ended.value)
@@ -74,7 +71,6 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
     name: str, pack: Callable[[bytes], bytes], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    """A chunk of the largest size is read; a larger one is not unpacked further."""
     one = message(1, b"x" * 1000)
     place = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", len(one))
@@ -87,14 +83,12 @@ def test_a_chunk_is_unpacked_up_to_a_limit(
 
 @pytest.mark.parametrize(("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress)])
 def test_a_damaged_chunk_is_reported(name: str, pack: Callable[[bytes], bytes], tmp_path: Path) -> None:
-    """A cut, invalid or empty chunk ends the command with the reason."""
     packed = pack(message(1, b"x" * 1000))
     for wrong in (packed[:-4], b"?" * 50, b"", packed[:20] + b"?" * 20 + packed[40:]):
         assert "is damaged" in refusal(bag(tmp_path / "x.bag", [(name, wrong, [(1, 0)])]))
 
 
 def test_repeated_reading_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alternating chunks, several entries for one message, and repeated connections share one limit."""
     monkeypatch.setattr(regular_files, "LARGEST_CHUNK", 1 << 20)
     monkeypatch.setattr(bounded_bag, "PER_BYTE", 4)
     large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
@@ -131,7 +125,6 @@ def test_chunks_of_the_same_time_are_unpacked_once(
 
 
 def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
-    """A hundred index entries for one chunk count its messages only once."""
     place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
     data = place.read_bytes()
     info = data[data.index(record(*CONNECTION)) + len(record(*CONNECTION)) :]
@@ -143,7 +136,6 @@ def test_chunks_cannot_share_an_index(tmp_path: Path) -> None:
 @pytest.mark.parametrize("times", [[1000.0], [1000.0, 1000.0], [1000.0, 1000.000000001], [1000.0, 1001.0]])
 @pytest.mark.parametrize("share", ["0", "0.3", "0.9"])
 def test_a_short_recording_is_learned_from(times: list[float], share: str, tmp_path: Path) -> None:
-    """One message, two at one time, or two far apart give a proposal or the note that they are too few."""
     place = make_bag(tmp_path / "x.bag", [("/t", "std_msgs/Int32", time, number(1)) for time in times])
     other = shutil.copy(place, tmp_path / "other.bag")
     for arguments in (["--hold-out", share], ["--bag", str(other)]):

@@ -8,7 +8,6 @@ from tests.support.bags import make_bag, number
 
 
 def test_a_damaged_bag_ends_with_the_reason(tmp_path: Path) -> None:
-    """With changed bytes the messages are read, or the command ends with a usage error."""
     rows = [(f"/t{at % 2}", "std_msgs/Int32", 1000.0 + at, number(at)) for at in range(20)]
     whole = make_bag(tmp_path / "whole.bag", rows).read_bytes()
     place, chance, ended = tmp_path / "damaged.bag", random.Random(5), 0  # noqa: S311  the same each time

@@ -13,14 +13,12 @@ from tests.support.command import rosrv
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return a recording of a drive."""
     bag = tmp_path_factory.mktemp("drive") / "drive.bag"
     record(Simulation().run(), bag)
     return str(bag)
 
 
 def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Path) -> None:
-    """The file passes `check` without warnings beside the robot's own definitions, and drops no message."""
     out = str(tmp_path / "learnt.rv")
     assert rosrv("monitor", "learn", "--bag", drive, "--out", out).returncode == 0
     checked = rosrv("monitor", "check", out)
@@ -35,7 +33,6 @@ def test_a_learned_specification_accepts_its_recording(drive: str, tmp_path: Pat
 
 
 def test_json_lists_the_evidence(drive: str) -> None:
-    """The output is one object for each condition of the chosen topics."""
     learnt = rosrv("monitor", "learn", "--bag", drive, "--topic", "*/odom", "--json").stdout
     rows = [json.loads(line) for line in learnt.splitlines()]
     assert {row["topic"] for row in rows} == {"/landshark/odom"}
@@ -44,7 +41,6 @@ def test_json_lists_the_evidence(drive: str) -> None:
 
 
 def test_coverage_lists_what_never_happened(drive: str) -> None:
-    """The missing events are a table, or with `--json` one object each; the exit status tells a pipeline."""
     file = str(MONITORS / "logging.rv")
     result = rosrv("monitor", "coverage", file, "--bag", drive, "--fail-under", "80")
     assert result.returncode == 0

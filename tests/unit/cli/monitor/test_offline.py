@@ -14,7 +14,6 @@ from tests.support.engines import InlineDatabase
 
 
 def state_with(tmp_path: Path, who: str) -> Path:
-    """Return a state directory whose last specifications were loaded by `who`."""
     home = tmp_path / "control"
     home.mkdir()
     store = StateStore(home, failed=print, kind=InlineDatabase)
@@ -24,7 +23,6 @@ def state_with(tmp_path: Path, who: str) -> Path:
 
 
 def reset(state: Path, *options: str) -> tuple[int, str]:
-    """Return the exit status and output."""
     result = CliRunner().invoke(app, ["monitor", "reset", "--state", str(state), *options])
     if isinstance(result.exception, StartError):
         return 1, str(result.exception)
@@ -41,7 +39,6 @@ def last(state: Path) -> MonitorRevisionRow | None:
 
 @pytest.mark.nightly
 def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
-    """The next start reads the folder; the old revision is stored, and a second reset does nothing."""
     state = state_with(tmp_path, "operator")
     assert json.loads(reset(state, "--json")[1]) == {"given_up": 7}
     row = last(state)
@@ -54,7 +51,6 @@ def test_specifications_loaded_by_command_are_dropped(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
-    """The error names the verb for a running appliance."""
     state = state_with(tmp_path, "operator")
     running = StateDirectory(state)
     status, said = reset(state)
@@ -65,7 +61,6 @@ def test_a_running_appliance_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_directory_without_a_state_is_an_error(tmp_path: Path) -> None:
-    """Exit status 2, and nothing is created."""
     status, said = reset(tmp_path / "nowhere")
     assert status == 2
     assert "--state" in said

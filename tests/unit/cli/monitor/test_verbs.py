@@ -12,7 +12,6 @@ from tests.support.command import rosrv
 
 
 def test_proving_needs_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the prover, the exit status is 2 and the error names the package to install; nothing is checked."""
     (tmp_path / "a.rv").write_text("a() { event e() /t std_msgs/Empty '{}' { } }")
     monkeypatch.setattr("rosmop.tool.check_command.find_spec", lambda name: None)
     result = rosrv("monitor", "check", str(tmp_path / "a.rv"), "--prove")
@@ -21,7 +20,6 @@ def test_proving_needs_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_output_has_what_subscribers_would_receive(tmp_path: Path) -> None:
-    """`--output` writes passed, changed and published messages, with types and definitions, and overwrites nothing."""
     (tmp_path / "a.rv").write_text("""a() { std_msgs::String s; event e(int x) /t std_msgs/Int32 '{data:x}' {
         if (x == 2) return; x = x * 10; s.data = "n"; PUBLISH(/out, std_msgs/String, s); } }""")
     bag = make_bag(tmp_path / "in.bag", [
@@ -67,7 +65,6 @@ def test_output_is_in_the_order_of_the_robot_for_every_tool(tmp_path: Path) -> N
 
 
 def test_the_types_of_the_recording_are_known(tmp_path: Path) -> None:
-    """A type that only the recorded publisher defines is read from its connection header."""
     path, file = tmp_path / "in.bag", tmp_path / "own.rv"
     with Writer(path) as writer:
         connection = writer.add_connection(

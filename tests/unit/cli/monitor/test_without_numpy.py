@@ -34,7 +34,6 @@ for arguments in json.loads(sys.argv[1]):
 
 
 def scan(number: int) -> bytes:
-    """Return a `sensor_msgs/LaserScan`, with an infinite range."""
     ranges = [0.25 if number % 10 == 9 else 1.0 + number / 100, 2.0, 3.0, float("inf"), *[4.0] * 8]
     header = struct.pack("<3I", number, number, 0) + struct.pack("<I5s", 5, b"laser")
     return (
@@ -49,7 +48,6 @@ def scan(number: int) -> bytes:
 def test_recordings_are_read_and_written(
     compression: Writer.CompressionFormat | None, tmp_path: Path
 ) -> None:
-    """Learning from arrays, runs, replays and coverage work with each compression of bags."""
     bag, kind, definitions = tmp_path / "a.bag", "sensor_msgs/LaserScan", standard_definitions()
     writer = Writer(bag)
     if compression is not None:

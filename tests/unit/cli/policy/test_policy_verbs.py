@@ -13,7 +13,6 @@ POLICIES = Path(__file__).parents[4] / "policies"
 
 @pytest.mark.parametrize("file", sorted(POLICIES.glob("*.ini")), ids=lambda file: file.name)
 def test_shipped_policies_are_valid_and_pass_their_cases(file: Path) -> None:
-    """Every policy in policies/ has no errors or warnings, and its cases pass."""
     checked = rosrv("policy", "check", str(file), "--robot", "192.0.2.1", "--json")
     assert (checked.returncode, checked.stdout) == (0, "")
     assert rosrv("policy", "test", str(file)).returncode == 0
@@ -21,7 +20,6 @@ def test_shipped_policies_are_valid_and_pass_their_cases(file: Path) -> None:
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_explain_has_an_option_for_every_action(tmp_path: Path, verb: str) -> None:
-    """The command line can ask about everything that a case can."""
     file = tmp_path / "p.ini"
     file.write_text("[Nodes]\n/ocu = *\n")
     resource = "shutdown" if verb == "command" else "/cmd"

@@ -27,11 +27,9 @@ class Log:
         self.machine = VirtualClock()
 
     def audit(self) -> "Log":
-        """Return the log as an appliance has it."""
         return self
 
     def last(self) -> int:
-        """Return the last record before the call."""
         return 5
 
     def search(self, *_arguments: object, newest_first: bool) -> Any:
@@ -57,13 +55,11 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
 
 
 def outcome(log: Log) -> tuple[str, str]:
-    """Return the result of the check."""
     (found,) = selftest_running.check_call(cast(Appliance, log), "http://127.0.0.1:11311")
     return found.outcome, found.text
 
 
 def test_a_delayed_record_is_found(log: Log) -> None:
-    """The log is written in batches, so the search is repeated."""
     log.answers = [[NOT_OURS], [NOT_OURS], [OURS, NOT_OURS]]
     found, text = outcome(log)
     assert found == "ok"
@@ -73,7 +69,6 @@ def test_a_delayed_record_is_found(log: Log) -> None:
 
 @pytest.mark.nightly
 def test_a_missing_record_is_searched_for_five_seconds(log: Log) -> None:
-    """Over REST each search is a request, and too many at once are refused (429)."""
     log.answers = [[NOT_OURS]]
     found, text = outcome(log)
     assert found == "fail"
@@ -82,7 +77,6 @@ def test_a_missing_record_is_searched_for_five_seconds(log: Log) -> None:
 
 
 def test_a_refused_search_is_repeated(log: Log) -> None:
-    """Too many requests, or a restarting process, is temporary."""
     log.answers = [NotRunningError("https://h: too many requests"), [OURS]]
     assert outcome(log)[0] == "ok"
 

@@ -38,7 +38,6 @@ class Place:
         ]
 
     def run(self) -> tuple[int, dict[str, dict[str, Any]]]:
-        """Return the exit status and the findings by check."""
         config = self.home / "appliance.yaml"
         config.write_text("\n".join(self.lines) + "\n")
         done = CliRunner().invoke(app, ["selftest", "--config", str(config), "--json"])
@@ -48,7 +47,6 @@ class Place:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
-    """Return a folder where everything is valid."""
     for name in [name for name in os.environ if name.startswith("ROSRV_")]:
         monkeypatch.delenv(name)
     yield Place(tmp_path)
@@ -69,7 +67,6 @@ def test_a_valid_setup_passes(place: Place) -> None:
 
 @pytest.mark.nightly
 def test_a_used_port_names_its_program(place: Place) -> None:
-    """The failure names the address, the program that uses it, and the remedy."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         place.lines[2] = f"listen: 127.0.0.1:{port}"
@@ -84,7 +81,6 @@ def test_a_used_port_names_its_program(place: Place) -> None:
 
 @pytest.mark.nightly
 def test_a_certificate_that_has_ended_fails(place: Place) -> None:
-    """The failure has advice; exit status 1."""
     certificate(place.state, days=-1)
     status, found = place.run()
     assert (status, found["certificate"]["outcome"]) == (1, "fail")
@@ -93,7 +89,6 @@ def test_a_certificate_that_has_ended_fails(place: Place) -> None:
 
 @pytest.mark.nightly
 def test_a_certificate_near_its_end_is_a_warning(place: Place) -> None:
-    """The warning has the remaining days; the exit status is 0."""
     certificate(place.state, days=5)
     place.run()
     status, found = place.run()
@@ -102,8 +97,6 @@ def test_a_certificate_near_its_end_is_a_warning(place: Place) -> None:
 
 
 def test_a_crashing_check_is_a_finding() -> None:
-    """If one check crashes, the other checks continue."""
-
     def broken() -> Iterator[Any]:
         yield ok("one", "fine")
         raise RuntimeError("odd")
@@ -116,7 +109,6 @@ def test_a_crashing_check_is_a_finding() -> None:
 
 
 def certificate(state: Path, days: int) -> None:
-    """Write a certificate for REST that ends in this number of days."""
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])

@@ -21,7 +21,6 @@ AWAY = AdminAnswer[Any](False, error="RVMaster is being restarted", trouble="fai
 
 
 def state(role: str, epoch: int, holder: str) -> AdminAnswer[Any]:
-    """Return what appliance `a` answers in this role, while the witness names the holder."""
     others = {"other": {"name": "b"}, "witness": {"holder": holder}}
     return AdminAnswer(True, example(StandbyState, name="a", role=role, epoch=epoch, **others))
 
@@ -53,14 +52,12 @@ class Pair:
 
 @pytest.fixture
 def pair(tmp_path: Path) -> Iterator[Pair]:
-    """Return the active appliance of two."""
     pair = Pair(tmp_path)
     with pair.fake:
         yield pair
 
 
 def test_it_waits_for_the_other_appliance(pair: Pair) -> None:
-    """Neither the old state, a process that is restarted, nor an interim without a holder ends the wait."""
     pair.answers = [
         state("active", 4, "a"), state("active", 4, "a"), AWAY, state("standby", 4, ""), state("standby", 5, "b"),
     ]  # fmt: skip
@@ -69,7 +66,6 @@ def test_it_waits_for_the_other_appliance(pair: Pair) -> None:
 
 
 def test_a_lost_answer_is_not_a_failure(pair: Pair) -> None:
-    """The switchover ends the process that answers; the state afterwards decides. The order is sent only once."""
     pair.answers = [state("active", 4, "a"), state("standby", 5, "b")]
 
     def dies(_request: dict[str, Any]) -> AdminAnswer[Any]:
@@ -82,7 +78,6 @@ def test_a_lost_answer_is_not_a_failure(pair: Pair) -> None:
 
 
 def test_a_standby_that_does_not_take_over_is_an_error(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the time limit the verb fails; a takeover back to the first appliance also counts as none."""
     monkeypatch.setattr(live_verbs, "_SWITCH_SECONDS", 0.3)
     pair.answers = [state("active", 4, "a"), state("active", 6, "a")]
     assert pair.promote() == (

@@ -23,7 +23,6 @@ FIRST = (
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Work in an empty folder with a policy."""
     monkeypatch.chdir(tmp_path)
     Path("p.ini").write_text("[Nodes]\n/talker = *\n[Ports]\nrange = 19001-19100\n")
     Path("appliance.yaml").write_text("policy: p.ini\n")
@@ -31,20 +30,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def join_first(out: str = "kit", *more: str, state: str = "first") -> None:
-    """Join on the first appliance."""
     done = rosrv("standby", "join", "--state", state, *FIRST, "--out", out, *more)
     assert done.returncode == 0, done.stderr
 
 
 def joined(state: str) -> Membership:
-    """Return the membership of a state directory."""
     found = load_membership(path_of(Path(state)))
     assert found is not None
     return found
 
 
 def write_epoch(state: str, epoch: int) -> Path:
-    """Write the epoch that an earlier process saved."""
     path = Path(state, "lease", EPOCH)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.parents[1].joinpath("lock").touch()  # it is the state of an appliance that ran
@@ -53,7 +49,6 @@ def write_epoch(state: str, epoch: int) -> Path:
 
 
 def test_all_machines_have_keys_that_fit() -> None:
-    """Each key is on the two machines that need it; the witness accepts its settings as they are."""
     join_first("kit", "--follower", "arm=192.0.2.11")
     assert rosrv("standby", "join", "kit/standby-b.json", "--state", "second").returncode == 0
     a, b = joined("first"), joined("second")
@@ -78,7 +73,6 @@ def test_all_machines_have_keys_that_fit() -> None:
 
 
 def test_each_kit_has_a_lease_of_its_own() -> None:
-    """The lease of an earlier kit, in which another appliance may be in sync, is never used."""
     join_first("one")
     join_first("two", "--again")
     leases = {read_settings(f"{kit}/witness/witness.json").state for kit in ("one", "two")}
@@ -101,7 +95,6 @@ def test_a_damaged_epoch_is_refused() -> None:
 
 
 def test_the_ports_are_those_of_the_running_appliance() -> None:
-    """Its command line may have changed the configuration file's."""
     running = plain(resolve(Path("appliance.yaml"), {}, {"listen": "0.0.0.0:12345", "api": "off"}))
     Path("first/run").mkdir(parents=True)
     Path("first/run/config.json").write_text(json.dumps(running))
@@ -146,14 +139,12 @@ def test_the_epoch_of_the_same_pair_is_kept(leaves: bool) -> None:
 
 
 def joined_secrets(path: str) -> list[str]:
-    """Return the secrets in a file."""
     found = load_membership(Path(path))
     assert found is not None
     return [found.witness_key, found.peer_key, found.key]
 
 
 def test_a_failed_write_leaves_neither_kit_nor_membership(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder with keys is removed."""
     Path("first/standby/membership.json").mkdir(parents=True)
     Path("first/lock").touch()
     done = rosrv("standby", "join", "--state", "first", *FIRST, "--out", "kit")
