@@ -9,7 +9,7 @@ of chunks whose times overlap, and adds limits:
 3. The index has at most as many entries as fit in the bag, so chunks cannot share an index.
 
 The flight recorder writes a chunk for each stream, so the times of its chunks overlap. Messages of a chunk that is not
-compressed are read from the file. Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes in all.
+compressed are read from the file. Unpacked chunks are kept until their last message, up to `LARGEST_CHUNK` bytes.
 """
 
 import bz2
