@@ -1,10 +1,12 @@
 """The gate's rule for all tests: only those marked `real` or `nightly` may depend on chance (CONTRIBUTING.md)."""
 
 import contextlib
+import logging
 from collections.abc import Generator
 from typing import Any
 
 import pytest
+import structlog
 
 from appliance.base import clock
 from tests.support.determinism import WATCH, may_depend_on_chance
@@ -39,6 +41,16 @@ def _watched(item: pytest.Item) -> Generator[None, Any, Any]:
         result = yield
     if found:  # the product may have caught the error
         pytest.fail(f"this test {'; '.join(dict.fromkeys(found))}: mark it `nightly`", pytrace=False)
+    return result
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol() -> Generator[None, Any, Any]:
+    """Restore logging after each test: a command that ran in it logs to its captured output, which is closed then."""
+    before, handlers = structlog.get_config(), logging.root.handlers.copy()
+    result = yield
+    structlog.configure(**before)
+    logging.root.handlers[:] = handlers
     return result
 
 
