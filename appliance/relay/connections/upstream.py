@@ -21,8 +21,8 @@ from appliance.channel.messages.relay_link import Violation
 from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.introductions import Introductions
 from appliance.relay.connections.named_subscribers import NamedSubscribers
-from appliance.relay.connections.publisher_reader import PublisherReader, header_refusal, violation_of
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
+from appliance.relay.connections.upstream_reader import UpstreamReader, header_refusal, violation_of
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import LoopTimer
 from appliance.relay.transport.sockets import BufferedSocket, begin_connect
@@ -34,7 +34,7 @@ _REASON = 1000  # most characters of a reported error; a publisher chooses the t
 
 
 class UpstreamState(Enum):
-    """What the connection to a publisher waits for. WAITING: for the next try, after a failure."""
+    """The next event that a connection to a publisher waits for. WAITING: for the next try, after a failure."""
 
     IDLE = auto()
     ASKED = auto()
@@ -86,7 +86,7 @@ class PublisherConnection(Upstream):
         self._linger: LoopTimer | None = None
         self._attempt: _Attempt | None = None
         self._header: dict[str, str] = {}
-        self._reader: PublisherReader | None = None
+        self._reader: UpstreamReader | None = None
 
     def connect(self) -> None:
         """Connect, unless a connection exists or is under way."""
@@ -240,7 +240,7 @@ class PublisherConnection(Upstream):
         self._introductions.accepted()
         self._enter(UpstreamState.FLOWING)
         self._named_subscribers.open(attempt.address, self._introductions.fields)
-        self._reader = reader = PublisherReader(
+        self._reader = reader = UpstreamReader(
             self._context,
             self._topic,
             attempt.stream.take(),

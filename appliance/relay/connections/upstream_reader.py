@@ -31,7 +31,7 @@ class _State(Enum):
     CLOSED = auto()
 
 
-class PublisherReader:
+class UpstreamReader:
     """The open connection to a publisher, behind its header of `header_size` bytes. `lost` is called once.
 
     `since`: when the connection opened.
