@@ -21,6 +21,7 @@ from appliance.channel.answers.standby_answers import OtherAppliance, StandbySta
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.admin_socket import AdminServer
+from appliance.control.inheritance import CopyAge
 from appliance.control.lease_client import HandOverError, LeaseClient
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.control.replication import Pair, host_endpoint, state_of
@@ -81,6 +82,7 @@ class PassiveControl:
             lambda: self._check.obstacle or "",
             self._check.news.set,
         )
+        self.copies = CopyAge(self._replica.setting)
         self._epoch = 0
         self._connected = False
         self._away_since = clock.now()
@@ -110,6 +112,7 @@ class PassiveControl:
         self._lifeline.say(messages.Ready({"stands_by": True}))
         tasks += [
             begin("the copy of the state", self._sync),
+            begin("the age of the copies of monitors", self.copies.run),
             begin("the check of a takeover", partial(self._check.run, self._state_presence)),
         ]
         try:
@@ -148,6 +151,11 @@ class PassiveControl:
         if not self._receiver.followed:
             return None
         return 0.0 if self._connected else clock.now() - self._away_since
+
+    @property
+    def copy_age(self) -> float | None:
+        """Return the age of the copies of monitors' state when this appliance last followed the active one."""
+        return self.copies.at(clock.now() if self._connected else self._away_since)
 
     def _state_presence(self) -> None:
         """Let the lease claim only while this appliance has all data and could serve."""
@@ -265,6 +273,7 @@ async def until_activated(
         return None
     taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
     away: float | None = None
+    copy_age: float | None = None
     if taken_over and not stopping.is_set():
         passive = PassiveControl(settings, membership, lifeline, lease, compiler)
         ended, loop = asyncio.Event(), asyncio.get_running_loop()
@@ -273,11 +282,11 @@ async def until_activated(
             wait.add_done_callback(lambda _task: ended.set())
         try:
             await passive.run(ended)
-            away = passive.away_seconds
+            away, copy_age = passive.away_seconds, passive.copy_age
         finally:
             for wait in waits:
                 wait.cancel()
         api, tunnels = passive.api, passive.tunnels
     if lifeline.epoch is None:
         return None
-    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels, away)
+    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels, away, copy_age)

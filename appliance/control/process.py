@@ -28,6 +28,7 @@ from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
 from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.inheritance import StateCopies
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
@@ -172,6 +173,9 @@ class _Control:
                 work["the readings of the clocks"] = partial(
                     note_times, base.store, base.pair, base.blocks.age_now
                 )
+                followed = base.replication.followed
+                copies = StateCopies(base.pair, base.store, parts.monitors.rollout, followed)
+                work["the copies of monitors' state"] = copies.run
             work["the orders of the standby"] = partial(
                 operators.standby.obey,
                 base.replication.switchover_wanted,

@@ -51,7 +51,8 @@ class Pair(NamedTuple):
 
     `api` is the link to the api, and `tunnels` has the link to the process for charon, if they were opened while this
     appliance stood by. `taken_over`: this process stood by before, so the epoch is new.
-    `away_seconds`: the time since this process last followed the other appliance; None: it did not.
+    `away_seconds`: the time since this process last followed the other appliance; None: it did not. `copy_age`: the age
+    of the copies of monitors' state when it last followed (`inheritance.py`); None: it got none.
     """
 
     membership: Membership
@@ -61,6 +62,7 @@ class Pair(NamedTuple):
     taken_over: bool
     tunnels: StandbyTunnels
     away_seconds: float | None = None
+    copy_age: float | None = None
 
 
 def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
@@ -264,6 +266,10 @@ class Replication:
             other=other,
             obstacle=lag.obstacle,
         )
+
+    def followed(self) -> bool:
+        """Whether the standby gets the changes now."""
+        return self.sender.lag().connected
 
     def _connected(self) -> bool:
         """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any, Protocol
 
 import structlog
@@ -12,7 +13,7 @@ from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
 from appliance.control.foundation import Foundation
-from appliance.control.inheritance import inherited_state, leave_state
+from appliance.control.inheritance import inherited_state, keep_state, leave_state
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Replication
 from appliance.control.takeover_record import TakeoverRecorder
@@ -111,7 +112,7 @@ def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | 
         except TimeoutError:
             _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
-    return ActiveAppliance(replication, leaving, rollout.pass_again)
+    return ActiveAppliance(replication, leaving, partial(keep_state, base.store, rollout))
 
 
 class StandbyOrders:

@@ -67,10 +67,14 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class InheritedState:
-    """After a takeover: the states that the other appliance's relays `left`, or the reason why they are `lost`."""
+    """After a takeover: the states that the other appliance's relays `left`.
+
+    `at`: the time of its monitors by then, if it is later than that in the states. `lost`: why other states are lost.
+    """
 
     lost: str = ""
     left: tuple[bytes, ...] = ()
+    at: int = 0
 
 
 Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
@@ -110,7 +114,8 @@ class Rollout:
     _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _inherited: InheritedState = field(default_factory=InheritedState)
     _heirs: set[int] = field(default_factory=set)  # relays that have not taken the inherited state yet
-    _left: list[asyncio.Future[bytes]] = field(default_factory=list)
+    _left: dict[int, asyncio.Future[messages.StateLeft]] = field(default_factory=dict)
+    _leaving: bool = False  # whether the relays drop all messages, because this appliance hands over
     _inheritance_taken: Callable[[], None] = lambda: None
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
@@ -147,17 +152,32 @@ class Rollout:
 
         Raises `ConnectionError` if a relay is away, and `TimeoutError` if one does not answer within `seconds`.
         """
-        loop, relays = asyncio.get_running_loop(), range(self.allocation.relays)
-        self._left = [loop.create_future() for _ in relays]
-        if not all(self.relays.send(messages.StateWanted(relay), relay) for relay in relays):
-            raise ConnectionError("a relay is being restarted")
+        self._leaving = True
+        return [answer.content or b"" for answer in await self._states(seconds, copy=False)]
+
+    async def copies(self, seconds: float, *, full: bool) -> list[messages.StateLeft]:
+        """Return copies of the states of all relays' monitors, `full` or only if changed. Raises as `leave` does."""
+        return await self._states(seconds, copy=True, full=full)
+
+    async def _states(self, seconds: float, *, copy: bool, full: bool = True) -> list[messages.StateLeft]:
+        loop, self._left = asyncio.get_running_loop(), {}
+        for relay in range(self.allocation.relays):
+            wanted = messages.StateWanted(next(self._numbers), copy, full)
+            if not self.relays.send(wanted, relay):
+                raise ConnectionError("a relay is being restarted")
+            self._left[wanted.number] = loop.create_future()
         async with asyncio.timeout(seconds):
-            return [await left for left in self._left]
+            return [await answer for answer in [*self._left.values()]]
 
     def pass_again(self) -> None:
         """Make all relays pass messages again after `leave`."""
+        self._leaving = False
         for relay in range(self.allocation.relays):
             self.relays.send(self.statement(relay), relay)
+
+    def has_state(self) -> bool:
+        """Whether monitors run whose state may be copied: no relay leaves it, and all have the inherited one."""
+        return bool(self._now.checked.monitors) and not self._leaving and not self._heirs
 
     def inherit(self, state: InheritedState, taken: Callable[[], None]) -> None:
         """Give each relay the state of the other appliance's monitors; call `taken` once all relays have it."""
@@ -364,6 +384,7 @@ class Rollout:
             self.slices,
             inherited.lost,
             inherited.left,
+            inherited.at,
             {name: why for name, why in revision.checked.unbuilt.items() if name in names.monitors},
         )
 
@@ -374,9 +395,8 @@ class Rollout:
         match message:
             case messages.SpecificationsTaken():
                 self._taken(relay, message)
-            case messages.StateLeft(number, content) if number < len(self._left):
-                if not self._left[number].done():
-                    self._left[number].set_result(content)
+            case messages.StateLeft(number) if number in self._left:
+                self._left.pop(number).set_result(message)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
             case messages.MonitorsCounted(rows):

@@ -86,6 +86,12 @@ class Replica:
             query = "SELECT EXISTS (SELECT 1 FROM host WHERE revoked IS NULL)"
             return bool(self._connection.execute(query).fetchone()[0])
 
+    def setting(self, name: str) -> str:
+        """Return a replicated setting; empty if there is none. Raises `StoreError`."""
+        with self._lock, self._explained():
+            found = self._connection.execute("SELECT value FROM setting WHERE name = ?", (name,)).fetchone()
+            return str(found[0]) if found else ""
+
     def sync(self) -> None:
         """Wait until everything stored is on the disk. Raises `StoreError`."""
         try:

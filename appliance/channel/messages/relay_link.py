@@ -301,8 +301,9 @@ class SpecificationsStated(Message):
     is placed before its monitors. The monitors in `shadows` are in shadow mode: they get copies of messages. `slices`
     is the largest number of slices of a parametric specification.
 
-    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`). If they left
-    none, `lost` is the reason. In both cases the relay does not use its own memory.
+    After a takeover, `left` has the states that the relays of the other appliance left (`StateLeft`), and `left_at` the
+    time of its monitors by then (0: that in the states). `lost` is the reason why other states are lost. In both cases
+    the relay does not use its own memory.
 
     `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they are
     declared `begin`, they hold their topics.
@@ -320,23 +321,32 @@ class SpecificationsStated(Message):
     slices: int = 100_000
     lost: str = ""
     left: tuple[bytes, ...] = ()
+    left_at: int = 0
     unbuilt: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class StateWanted(Message):
-    """Control of an appliance that hands over asks a relay to drop all messages from now on, and for `StateLeft`."""
+    """Control asks a relay for `StateLeft`.
 
-    number: int
-
-
-class StateLeft(Message):
-    """A relay passes no messages any more. `content` is the state of its monitors (empty: it has none).
-
-    `number` is that of the `StateWanted`.
+    An appliance that hands over also asks it to drop all messages from now on. `copy`: the relay goes on; it sends its
+    state if that has changed since the last copy, or if `full`.
     """
 
     number: int
-    content: bytes
+    copy: bool = False
+    full: bool = False
+
+
+class StateLeft(Message):
+    """The answer to the `StateWanted` with this number.
+
+    `content` is the state of the relay's monitors (empty: it has none; None: unchanged since the last copy). `at` is the
+    time of the monitors in nanoseconds. Without `at` there is no copy.
+    """
+
+    number: int
+    content: bytes | None
+    at: int = 0
 
 
 class MonitorSwitched(Message):

@@ -121,10 +121,10 @@ class Interceptor:
     def state(self, message: SpecificationsStated | StateWanted) -> None:
         """Apply these specifications, at once or when they are loaded; unchanged monitors keep their state.
 
-        With `StateWanted`, drop all messages from now on, and send the state of the monitors.
+        With `StateWanted`, send the state of the monitors; unless it is for a copy, drop all messages from now on.
         """
         if isinstance(message, StateWanted):
-            self._leave(message.number)
+            self._leave(message)
             return
         self._switches = dict(message.enabled)
         if not self._loader.busy:
@@ -170,11 +170,12 @@ class Interceptor:
         anew = None if first else result.replaced_topics(before)
         self._taken(message, began, anew)
 
-    def _leave(self, number: int) -> None:
-        self.blocked = LEAVING
-        self.invalidate_prepared()
-        self._changed(None)
-        self._reporter.send(state_left(number, self._keeper))
+    def _leave(self, message: StateWanted) -> None:
+        if not message.copy:
+            self.blocked = LEAVING
+            self.invalidate_prepared()
+            self._changed(None)
+        self._reporter.send(state_left(message, self._keeper))
 
     def holder_of(self, source: int) -> str:
         """Return the host that is charged for the slices created by messages of this source."""

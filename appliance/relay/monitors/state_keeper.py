@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from appliance.base import clock
-from appliance.channel.messages import SpecificationsStated, StateGiven, StateLeft
+from appliance.channel.messages import SpecificationsStated, StateGiven, StateLeft, StateWanted
 from appliance.relay.monitors.state_memory import NOT_KEPT, CellsPlace, Memory, StateMemory, StoredState, read
 
 if TYPE_CHECKING:
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 _UNREADABLE = "its saved state cannot be read"
 _NO_ROOM = "the states of all monitors together exceed the limit"
+LARGEST_COPY = 1 << 20
+"""The bytes of the largest state that is copied to the other appliance while it changes."""
+
 LEAVING = "the other appliance takes over"
 """Why a relay drops all messages whose appliance hands over."""
 
@@ -89,6 +92,7 @@ class StateKeeper:
         self._left = [own] if _has_head(own) else [*earlier]
         self._entries: list[_Entry] = []
         self._by_channel: dict[str, _Entry] = {}
+        self._copied: list[tuple[bytes, bytes | None]] | None = None  # the sections of the last copy
         self.shift = 0
         """The nanoseconds that a takeover added to the clock of monitors; `continued` sets it."""
 
@@ -149,6 +153,15 @@ class StateKeeper:
             return b""
         head = msgspec.structs.replace(_HEADS.decode(kept.head), written=self.offset + clock.now_ns())
         return _CONTENT.encode(kept._replace(head=msgspec.msgpack.encode(head)))
+
+    def changed_content(self, *, full: bool) -> bytes | None:
+        """Return the `content` for a copy; None if it has not changed since the last copy, unless `full`."""
+        kept = read(self._own)
+        sections = kept.sections if kept is not None else []
+        if sections == self._copied and not full:
+            return None
+        self._copied = sections
+        return self.content()
 
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these monitors from now on."""
@@ -241,9 +254,14 @@ class StateKeeper:
         return msgspec.msgpack.encode(head)
 
 
-def state_left(number: int, keeper: StateKeeper | None) -> StateLeft:
-    """Return the answer to `StateWanted` with this number."""
-    return StateLeft(number, b"" if keeper is None else keeper.content())
+def state_left(message: StateWanted, keeper: StateKeeper | None) -> StateLeft:
+    """Return the answer to `StateWanted`. A state that is too large is not copied."""
+    if not message.copy:
+        return StateLeft(message.number, b"" if keeper is None else keeper.content())
+    content = keeper.changed_content(full=message.full) if keeper is not None else b""
+    if keeper is None or (content is not None and len(content) > LARGEST_COPY):
+        return StateLeft(message.number, b"")
+    return StateLeft(message.number, content, keeper.offset + clock.now_ns())
 
 
 def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: int) -> int:
@@ -253,8 +271,9 @@ def continued(message: SpecificationsStated, keeper: StateKeeper | None, now: in
     another one continues the clock of that one.
     """
     shift = 0
-    if message.left and not message.lost:
+    if message.left:
         times = [head.written for _content, head in _left(message.left, RecoveredState())]
+        times = [message.left_at] if message.left_at else times
         shift = max(times) - now if times else 0
     elif keeper is not None and not message.lost:
         shift = keeper.kept_shift()
@@ -277,10 +296,10 @@ def start_outcome(
     relay replaces one that died. `now` is the time of monitors (ns), `continued`.
     """
     left = keeper.recovered() if keeper is not None else None
-    if message.lost:
-        left = RecoveredState(lost={"": message.lost})
-    elif message.left:
+    if message.left or message.lost:
         left = received_states(message.left)
+        if message.lost:
+            left.lost.setdefault("", message.lost)  # of the monitors without a state in `left`
     elif keeper is None and restarted:
         left = RecoveredState(lost={"": _NO_MEMORY})
     if left is None:

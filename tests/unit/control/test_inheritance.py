@@ -1,17 +1,24 @@
-"""The state of monitors passes from one appliance to the other only if nothing can have changed it since."""
+"""The state of monitors passes from one appliance to the other if nothing changed it since, or as a fresh copy."""
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
+from unittest.mock import AsyncMock
 
 import pytest
 
-from appliance.control.inheritance import inherited_state
+from appliance.base import clock
+from appliance.channel.messages import StateLeft
+from appliance.control.inheritance import CopyAge, StateCopies, inherited_state, keep_state, leave_state
 from appliance.control.lease_client import LeaseClient
 from appliance.control.replication import Pair
 from appliance.control.standby_tunnels import StandbyTunnels
+from appliance.specifications.rollout import Rollout
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.standby_site import memberships
+from tests.support.virtual_clock import VirtualClock, let_time_pass
 
 
 @pytest.fixture
@@ -36,17 +43,58 @@ class Pairs:
     def __init__(self, members: dict[str, Pair], store: StateStore) -> None:
         self.members, self.store = members, store
         self.epoch = 1
+        self.copy_age: float | None = 1.0
 
     def active(self, name: str, *, taken: bool = True) -> tuple[str, tuple[bytes, ...]]:
         """Make an appliance active; return why the state is lost, and what was left. `taken`: its relays have it."""
         self.epoch += 1
-        state, settle = inherited_state(self.members[name]._replace(epoch=self.epoch), self.store)
+        state, settle = inherited_state(
+            self.members[name]._replace(epoch=self.epoch, copy_age=self.copy_age), self.store
+        )
         if taken:
             settle()
         return state.lost, state.left
 
     def hand_over(self, content: bytes) -> None:
-        self.store.save_monitor_state(0, self.epoch, content)
+        """Leave the state of one relay in a planned switchover."""
+        asyncio.run(leave_state(self.present, self.store, cast(Rollout, Relays(content))))
+
+    @property
+    def present(self) -> Pair:
+        """Return an appliance in the present epoch."""
+        return self.members["a"]._replace(epoch=self.epoch)
+
+    def copies(self, *contents: bytes | None, followed: bool = True) -> StateCopies:
+        """Return the copies of the present epoch, after one turn."""
+        made = StateCopies(self.present, self.store, cast(Rollout, Relays(*contents)), lambda: followed)
+        asyncio.run(made.copy_once())
+        return made
+
+
+class Relays:
+    """The relays of an appliance, each with the state of its monitors; None: it does not answer."""
+
+    def __init__(self, *contents: bytes | None) -> None:
+        self.contents = contents
+        self.state = True
+        self.at = 5
+
+    def has_state(self) -> bool:
+        """Act as `Rollout`."""
+        return self.state
+
+    async def leave(self, _seconds: float) -> list[bytes]:
+        """Act as `Rollout`."""
+        return [content or b"" for content in self.contents]
+
+    async def copies(self, _seconds: float, *, full: bool) -> list[StateLeft]:
+        """Act as `Rollout`."""
+        if None in self.contents and full:
+            raise ConnectionError
+        return [StateLeft(0, content, self.at) for content in self.contents]
+
+    def pass_again(self) -> None:
+        """Act as `Rollout`."""
 
 
 @pytest.fixture
@@ -82,6 +130,55 @@ def test_a_state_that_was_left_is_void_if_its_appliance_went_on(pairs: Pairs) ->
     lost, left = pairs.active("b")
     assert lost
     assert left == ()
+
+
+def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
+    """The appliance passes messages again, and dies in the same epoch."""
+    pairs.active("a")
+    pairs.hand_over(b"left by a")
+    keep_state(pairs.store, cast(Rollout, Relays()))
+    assert pairs.active("b")[1] == ()
+
+
+def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
+    """Monitors without a copy lose their state; a copy of an earlier epoch, or one that was not continued, is not used."""
+    pairs.active("a")
+    pairs.copies(b"of relay 0", b"of relay 1")
+    lost, left = pairs.active("b")
+    assert "appliance b" not in lost and "appliance a was active" in lost
+    assert left == (b"of relay 0", b"of relay 1")
+    assert pairs.active("a")[1] == ()
+
+
+@pytest.mark.parametrize("why", ["old", "none", "a relay is away", "no standby", "no state"])
+def test_a_copy_that_is_not_up_to_date_is_not_used(pairs: Pairs, why: str) -> None:
+    """The monitors may have changed their state since; the copies begin again with all relays."""
+    pairs.active("a")
+    relays, followed = Relays(b"of relay 0", b"of relay 1"), [True]
+    copies = StateCopies(pairs.present, pairs.store, cast(Rollout, relays), lambda: followed[0])
+    asyncio.run(copies.copy_once())
+    pairs.copy_age = {"old": 6.0, "none": None}.get(why, 1.0)
+    relays.contents = (b"of relay 0", None)  # the second has not changed
+    asyncio.run(copies.copy_once())
+    followed[0] = why != "no standby"
+    if why == "a relay is away":
+        relays.copies = AsyncMock(side_effect=TimeoutError)  # type: ignore[method-assign]  # as a relay that hangs
+    elif why == "no state":
+        relays.at = 0
+    asyncio.run(copies.copy_once())
+    assert pairs.active("b")[1] == ()
+
+
+def test_the_age_of_copies_counts_from_a_new_note() -> None:
+    """The note that a standby finds at its start may be old."""
+    with clock.using(VirtualClock(now=100.0)):
+        age = CopyAge(lambda _name: "old")
+        age.look("old")
+        assert age.at(clock.now()) is None
+        age.look("new")
+        let_time_pass(3.0)
+        age.look("new")
+        assert age.at(clock.now()) == 3.0
 
 
 def test_an_epoch_in_between_makes_the_state_void(pairs: Pairs) -> None:

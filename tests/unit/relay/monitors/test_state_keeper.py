@@ -8,8 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.base import clock
-from appliance.channel.messages import StateGiven
-from appliance.relay.monitors.state_keeper import StateKeeper, received_states
+from appliance.channel.messages import SpecificationsStated, StateGiven, StateLeft, StateWanted
+from appliance.relay.monitors import state_keeper
+from appliance.relay.monitors.state_keeper import StateKeeper, received_states, start_outcome, state_left
 from rosmop.check.sources import compiled_from
 from rosmop.form.findings import SpecificationError
 from rosmop.run.engine import MonitorSet
@@ -287,6 +288,53 @@ def test_the_other_appliance_goes_on_with_the_state_that_was_left() -> None:
     assert second.began == ()
     assert drives(second) == "dropped"
     assert not second.monitor("stop").held
+
+
+COPY = StateWanted(7, copy=True)
+
+
+@pytest.mark.parametrize("modifier", ["", "hold"])
+def test_the_other_appliance_goes_on_with_a_copy(modifier: str) -> None:
+    """A monitor without a copy holds its topics, and so does one that is declared `hold`."""
+    first = stop(modifier)
+    keeper = begun(first, bytearray(SIZE))
+    press(first, keeper)
+    copy = state_left(COPY, keeper)
+    assert copy.at and copy.content
+    for monitors, held in ((stop(modifier), bool(modifier)), (other_stop(), True)):
+        stated = SpecificationsStated(
+            1, b"", {}, restarted=True, lost="gone", left=(copy.content,), left_at=copy.at
+        )
+        start_outcome(monitors, stated, StateKeeper(GIVEN, bytearray(SIZE)), 0, restarted=True)
+        assert monitors.monitors[0].held is held
+
+
+def other_stop() -> MonitorSet:
+    """Return a stop of another name."""
+    text = STOP.format(modifier="", more="").replace("stop()", "late_stop()")
+    return on_module(compiled_from({"stop.rv": text}, standard_definitions()))
+
+
+def test_only_a_changed_state_of_a_bounded_size_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each copy has the present time of the monitors; without a time there is no copy."""
+    monitors = stop()
+    keeper = begun(monitors, bytearray(SIZE))
+    for _ in range(2):
+        monitors.judge("/stop", b"\x00", 1)
+        keeper.keep("/stop")
+    assert state_left(COPY, keeper).content
+    let_time_pass(2.0)
+    copies = [state_left(COPY, keeper)]
+    monitors.judge("/stop", b"\x00", 1)
+    keeper.keep("/stop")
+    copies += [state_left(COPY, keeper), state_left(StateWanted(8, copy=True, full=True), keeper)]
+    press(monitors, keeper)
+    copies += [state_left(COPY, keeper), state_left(COPY, keeper)]
+    assert [copy.content is not None for copy in copies] == [False, False, True, True, False]
+    assert {copy.at for copy in copies} == {keeper.offset + clock.now_ns()}
+    monkeypatch.setattr(state_keeper, "LARGEST_COPY", 10)
+    assert state_left(StateWanted(9, copy=True, full=True), keeper) == StateLeft(9, b"")
+    assert state_left(StateWanted(9, copy=True), None) == StateLeft(9, b"")
 
 
 def test_a_damaged_state_is_lost() -> None:

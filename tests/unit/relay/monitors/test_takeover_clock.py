@@ -75,3 +75,19 @@ def test_bounds_are_ages_over_a_switchover_and_a_crash(ahead: float) -> None:
     assert third.drive() == "dropped"
     let_pass(2.0)
     assert third.drive() == "passed"
+
+
+def test_a_copy_is_as_old_as_its_last_note() -> None:
+    """An unchanged state is not copied again, but the time of its monitors went on until the takeover."""
+    one, other = VirtualClock(wall=WALL, now=5.0), VirtualClock(wall=WALL + 3600.0, now=7000.0)
+    first = Relay(one, bytearray(SIZE), "one")
+    first.send("/halt", "std_msgs/Bool", data=True)
+    copy = first.left()
+    one.advance(30.0)
+    with clock.using(one):
+        noted = first.keeper.offset + clock.now_ns()
+    second = Relay(other, bytearray(SIZE), "other", left=copy, left_at=noted)
+    other.advance(29.0)
+    assert second.drive() == "dropped"
+    other.advance(2.0)
+    assert second.drive() == "passed"
