@@ -38,6 +38,7 @@ class TakeoverFindingKind(enum.StrEnum):
     """The kind of a finding between two logs."""
 
     SAME_LOG = "same log"
+    LOG_MISSING = "log missing"
     UNREADABLE = "takeover unreadable"
     TAKEOVER_MISSING = "takeover missing"
     EPOCH_ORDER = "epoch out of order"
@@ -83,12 +84,16 @@ class TakeoverProof(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PairVerification(msgspec.Struct, frozen=True, kw_only=True):
-    """The verification of two logs and of the takeovers between them; `ok` if nothing is wrong in any."""
+    """The verification of two logs and of the takeovers between them; `ok` if nothing is wrong in any.
+
+    `absent` is the name of an appliance that has no log, because it was never active.
+    """
 
     ok: bool
-    logs: tuple[Verification, Verification]
+    logs: tuple[Verification, ...]
     takeovers: list[TakeoverProof]
     findings: list[TakeoverFinding]
+    absent: str = ""
 
 
 class VerifiedLog(NamedTuple):
@@ -114,6 +119,37 @@ def verify_takeovers(first: VerifiedLog, second: VerifiedLog) -> PairVerificatio
     results = (first.result, second.result)
     ok = not findings and all(result.ok for result in results)
     return PairVerification(ok=ok, logs=results, takeovers=proofs, findings=findings[:_MOST_FINDINGS])
+
+
+def verify_alone(log: VerifiedLog, absent: str) -> PairVerification:
+    """Verify the log of an appliance whose other one, `absent`, has no log: then its own records name none.
+
+    Raises `LogUnreadableError` if the file is no longer a log.
+    """
+    kind = TakeoverFindingKind.LOG_MISSING
+    findings: list[TakeoverFinding] = []
+    with reading(log.path, advice="") as connection:
+        try:
+            found = _opened(connection, log)
+            for sequence, _time, took in found.takeovers:
+                named = took.checkpoint is not None or (took.previous and took.previous.appliance == absent)
+                if named:
+                    message = f"record {sequence} names the log of {absent}, which is missing"
+                    findings.append(TakeoverFinding(kind, took.epoch, message))
+            for sequence, _time, handed in found.handovers:
+                if found.stayed(sequence, found.end_of(sequence)) is None:
+                    message = f"record {sequence} hands over to {absent}, whose log is missing"
+                    findings.append(TakeoverFinding(kind, handed.epoch, message))
+        except sqlite3.DatabaseError as error:
+            message = f"the records of takeovers cannot be read: {error}"
+            findings.append(TakeoverFinding(TakeoverFindingKind.UNREADABLE, 0, message))
+    return PairVerification(
+        ok=not findings and log.result.ok,
+        logs=(log.result,),
+        takeovers=[],
+        findings=findings[:_MOST_FINDINGS],
+        absent=absent,
+    )
 
 
 def _opened(connection: sqlite3.Connection, log: VerifiedLog) -> TakeoverLog:

@@ -340,8 +340,8 @@ class StateWanted(Message):
 class StateLeft(Message):
     """The answer to the `StateWanted` with this number.
 
-    `content` is the state of the relay's monitors (empty: it has none; None: unchanged since the last copy). `at` is the
-    time of the monitors in nanoseconds. Without `at` there is no copy.
+    `content` is the state of the relay's monitors (empty: it has none; None: unchanged since the last copy). `at` is
+    the time of the monitors in nanoseconds. Without `at` there is no copy.
     """
 
     number: int

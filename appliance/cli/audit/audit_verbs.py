@@ -22,7 +22,12 @@ from appliance.audit.query import Filter
 from appliance.audit.record_format import LogEntry, as_json, as_object
 from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
-from appliance.audit.takeover_verification import PairVerification, VerifiedLog, verify_takeovers
+from appliance.audit.takeover_verification import (
+    PairVerification,
+    VerifiedLog,
+    verify_alone,
+    verify_takeovers,
+)
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.filter import filtered
 from appliance.cli.audit.record_argument import RecordArgument
@@ -39,6 +44,7 @@ from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.evidence.export_verification import ExportVerification, verify_export
+from appliance.standby.membership import MembershipError, load_membership, path_of
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (
@@ -187,7 +193,11 @@ def verify(
         source = appliance.audit()
         partner = None if other is None else _files(source, other)
         result = _verified(source, key, checkpoints)
-        if partner is not None:
+        absent = _absent(partner[1], other) if partner is not None and other is not None else ""
+        if partner is not None and absent:
+            pair = verify_alone(VerifiedLog(partner[0].path, result), absent)
+            _print_result(pair, print_pair, as_json_lines=appliance.as_json)
+        elif partner is not None:
             of_other = VerifiedLog(partner[1].path, _verified(partner[1], other_key, other_checkpoints))
             pair = verify_takeovers(VerifiedLog(partner[0].path, result), of_other)
             _print_result(pair, print_pair, as_json_lines=appliance.as_json)
@@ -201,6 +211,17 @@ def _files(source: FileLog | RestLog, other: Path) -> tuple[FileLog, FileLog]:
     if not other.is_dir():
         fail(f"{other}: no such directory; give the other appliance's state directory with --other", 2)
     return source, FileLog(other)
+
+
+def _absent(log: FileLog, state: Path) -> str:
+    """Return the name of the other appliance of a pair if it has no log; else an empty text."""
+    if log.path.exists():
+        return ""
+    try:
+        membership = load_membership(path_of(state))
+    except MembershipError as error:
+        fail(str(error), 2)
+    return membership.name if membership is not None else ""
 
 
 def _verified(source: FileLog | RestLog, key: Path | None, checkpoints: Path | None) -> Verification:

@@ -53,6 +53,8 @@ def _proven(takeover: TakeoverProof) -> Iterator[str]:
 def _verdict(pair: PairVerification) -> str:
     if not pair.ok:
         return "A log was tampered with or is damaged, or the two logs do not fit together."
+    if pair.absent:
+        return f"{pair.absent} has no log yet, because it was never active: there is no takeover to verify."
     if not pair.takeovers:
         return "Both logs are complete and unchanged, but neither has a takeover: nothing links them."
     count = len(pair.takeovers)

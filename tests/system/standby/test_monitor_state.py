@@ -10,7 +10,7 @@ from examples.landshark.lab import Lab
 from tests.integration.monitors.test_emergency_stop import STOP
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs
-from tests.support.standby_site import StandbySite
+from tests.support.standby_site import ADDRESSES, ROBOT, StandbySite
 from tests.support.waiting import eventually
 
 
@@ -41,8 +41,8 @@ def dropped(site: StandbySite, name: str, least: int) -> bool:
     return int(monitor(site, name)["drops"]) >= least
 
 
-@pytest.mark.parametrize("planned", [True, False], ids=["switchover", "power cut"])
-def test_a_latched_stop_stays(site: StandbySite, planned: bool) -> None:
+@pytest.mark.parametrize("takeover", ["switchover", "power cut", "cut from the robot"])
+def test_a_latched_stop_stays(site: StandbySite, takeover: str) -> None:
     """The monitor of the other appliance goes on with the state, or with its copy, and holds no topic."""
     with site.ros() as ros:
         listener = ros.listener("rospy", "/chatter")
@@ -51,11 +51,13 @@ def test_a_latched_stop_stays(site: StandbySite, planned: bool) -> None:
         ros.run("rostopic", "pub", "-1", "/stop", "std_msgs/Bool", "data: true")
         eventually(lambda: dropped(site, "a", 10), site.story)  # earlier messages have arrived by then
         seen = len(listener.seen(event="received"))
-        if planned:
+        if takeover == "switchover":
             site.promote("a")
-        else:
+        elif takeover == "power cut":
             site.cut("a")
-        eventually(lambda: site.holder() == "b", site.story)
+        cut = ((ADDRESSES["a"], ROBOT),) if takeover == "cut from the robot" else ()
+        with site.without_link(*cut):
+            eventually(lambda: site.holder() == "b", site.story)
         eventually(lambda: dropped(site, "b", 10), site.story)
         assert len(listener.seen(event="received")) == seen
         assert not monitor(site, "b")["held"]

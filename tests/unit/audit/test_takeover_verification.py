@@ -19,13 +19,17 @@ from appliance.audit.takeover_verification import (
     PairVerification,
     TakeoverFindingKind,
     VerifiedLog,
+    verify_alone,
     verify_takeovers,
 )
 from appliance.audit.verification import verify
 from appliance.signing.signed_statements import parse_checkpoint
+from appliance.standby.membership import path_of, save_membership
 from tests.support.appliance_pair import Member, Story, World, four_takeovers, play
 from tests.support.audit import decision
+from tests.support.command import rosrv
 from tests.support.forgery import write_anew
+from tests.support.standby_site import memberships
 
 pytestmark = pytest.mark.nightly
 
@@ -130,6 +134,29 @@ def test_an_honest_pair_is_proven(pair: Pair) -> None:
         (4, "a", "b", "proven", "excluded"),
         (5, "b", "a", "proven", "unknown"),
     ]
+
+
+def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) -> None:
+    """The other log is verified alone; it is a finding if that log names the missing one."""
+
+    async def first_hour(a: Member, _b: Member, _world: World) -> None:
+        async with a.active(1):
+            await a.decide(3, 10)
+
+    fresh = build(tmp_path / "fresh", first_hour)
+    for log, findings in ((fresh.a, []), (pair.a, [(Kind.LOG_MISSING, 4)])):
+        result = verify_alone(VerifiedLog(log, verify(log)), "b")
+        assert [(one.kind, one.epoch) for one in result.findings] == findings
+        assert result.ok is not bool(findings)
+    states = fresh.a.parents[1], fresh.b.parents[1]
+    fresh.b.unlink()
+    command = "audit", "verify", "--state", str(states[0]), "--other", str(states[1])
+    assert rosrv(*command).returncode == 2  # a wrong directory
+    save_membership(path_of(states[1]), memberships(tmp_path)[0]["b"])
+    done = rosrv(*command)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (
+        0, "b has no log yet, because it was never active: there is no takeover to verify.",
+    )  # fmt: skip
 
 
 def test_the_tail_is_counted(pair: Pair) -> None:
