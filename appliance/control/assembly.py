@@ -50,6 +50,8 @@ def assemble(base: Foundation) -> Parts:
     ends = make_endpoints(base, core)
     settings = base.settings
     reminders = Reminders(core.registry, core.graph, ends.enactor)
+    if base.replication is not None:
+        base.replication.admission.on_end_of_gap(reminders.begin)
     arrivals = Arrivals(
         core.registry,
         core.graph,

@@ -5,6 +5,8 @@ appliances after a takeover and after a gap in the witness's answers, until they
 time a refused connection does not mean that a node has ended.
 """
 
+from collections.abc import Callable
+
 from appliance.base import clock
 
 _GAP_SECONDS = 0.9  # without an answer of the witness; less than the confidence of a follower
@@ -16,12 +18,19 @@ class RobotAdmission:
 
     def __init__(self) -> None:
         self._answered = self._admitted = clock.since_boot()
+        self._gap_ended: Callable[[], None] = lambda: None
+
+    def on_end_of_gap(self, gap_ended: Callable[[], None]) -> None:
+        """Call this at the first answer after each gap."""
+        self._gap_ended = gap_ended
 
     def note_answer(self, at: float) -> None:
         """Note an answer of the witness."""
-        if at - self._answered > _GAP_SECONDS:
-            self._admitted = at
+        gap = at - self._answered > _GAP_SECONDS
         self._answered = max(self._answered, at)
+        if gap:
+            self._admitted = at
+            self._gap_ended()
 
     def in_doubt(self) -> bool:
         """Whether a computer of the robot may shut out this appliance."""

@@ -646,6 +646,9 @@ class Supervisor:
         self.stopping.set()
         for task in self._tasks:
             task.cancel()
+        for slot in self.slots if self._lease.suspended else ():
+            if slot.process is not None and not slot.role.outlives_takeover:
+                slot.process.kill()  # it is stopped, and cannot end in order
         await end_all(self.slots, self._process_died)
 
 

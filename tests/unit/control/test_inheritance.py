@@ -141,7 +141,7 @@ def test_a_failed_switchover_makes_the_state_void(pairs: Pairs) -> None:
 
 
 def test_after_a_failure_a_fresh_copy_is_used(pairs: Pairs) -> None:
-    """Monitors without a copy lose their state; a copy of an earlier epoch, or one that was not continued, is not used."""
+    """Monitors without a copy lose their state; a copy of an earlier epoch is not used."""
     pairs.active("a")
     pairs.copies(b"of relay 0", b"of relay 1")
     lost, left = pairs.active("b")

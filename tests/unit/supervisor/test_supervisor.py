@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import AsyncMock
 
 import pytest
 from structlog.testing import capture_logs
@@ -205,8 +206,10 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
     supervisor.kept.close()
 
 
-@pytest.mark.parametrize("end", ["renewed", "a death", "a new epoch"])
-async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(tmp_path: Path, end: str) -> None:
+@pytest.mark.parametrize("end", ["renewed", "a death", "a new epoch", "a stop"])
+async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
+    tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A renewal in the same epoch lets it go on. Otherwise it is killed, also if a process ends in the meantime."""
     roles = (CONTROL, Role("relay", "u", "p", "m:f"), Role("lease", "u", "p", "m:f", outlives_takeover=True))
     admin = socket.create_server(("127.0.0.1", 0))
@@ -228,6 +231,9 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(tmp_path: Path, 
     if end == "a death":
         supervisor.died(cast(ProcessHandle, relay), -9)
         supervisor.slots[1].due.cancel()
+    elif end == "a stop":
+        monkeypatch.setattr(module, "end_all", AsyncMock())
+        await supervisor._end()
     else:
         report(LeaseHeld(clock.since_boot() + 60, 5 if end == "renewed" else 7))
     assert control.signals[1:] == [signal.SIGCONT if end == "renewed" else signal.SIGKILL]
