@@ -30,6 +30,8 @@ _MOST_PROVEN = 10_000
 # Handshakes, or requests: of each proven address, behind which there may be many robots, and of all others together.
 _PROVEN_A_SECOND, _PROVEN_AT_ONCE = 200.0, 256.0
 _OTHERS_A_SECOND, _OTHER_AT_ONCE = 50.0, 32.0
+# Of all others, also if each comes once: IPv6 has any number of addresses. A thousand robots may begin at once.
+_ALL_OTHERS_A_SECOND, _ALL_OTHERS_AT_ONCE = 200.0, 1000.0
 _log = structlog.get_logger()
 
 
@@ -44,6 +46,7 @@ class Shares:
         # By address, unless its whole share is left: the time of its last request, and the rest of its share then.
         self._left: dict[bool, dict[str, tuple[float, float]]] = {False: {}, True: {}}
         self._looked = 0.0
+        self._all_others = (clock.now(), _ALL_OTHERS_AT_ONCE)
 
     def take(self, owner: str, *, proven: bool) -> bool:
         """Take one from the share of an address; return False if nothing is left."""
@@ -52,6 +55,8 @@ class Shares:
             self._looked = now
             self._forget_rested(now)
         left = self._left_of(owner, now, proven=proven)
+        if left >= 1.0 and not proven and not self._take_of_all(now):
+            return False
         if len(self._left[proven]) < _MOST_PROVEN or owner in self._left[proven]:
             self._left[proven][owner] = (now, left - 1.0 if left >= 1.0 else left)
         return left >= 1.0
@@ -62,6 +67,13 @@ class Shares:
         most = _PROVEN_AT_ONCE if proven else _OTHER_AT_ONCE
         at, left = there.get(owner, (now, most))
         return min(most, left + (now - at) * rate)
+
+    def _take_of_all(self, now: float) -> bool:
+        """Take one from the share of all addresses that are not proven."""
+        at, left = self._all_others
+        left = min(_ALL_OTHERS_AT_ONCE, left + (now - at) * _ALL_OTHERS_A_SECOND)
+        self._all_others = (now, left - 1.0 if left >= 1.0 else left)
+        return left >= 1.0
 
     def _forget_rested(self, now: float) -> None:
         for proven, most in ((False, _OTHER_AT_ONCE), (True, _PROVEN_AT_ONCE)):

@@ -3,7 +3,7 @@
 import asyncio
 import json
 from collections.abc import Callable
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +112,7 @@ def test_every_connection_that_ends_makes_room(table: ClientConnections) -> None
 
 
 def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections) -> None:
-    """An address that only shakes hands gets 50 a second, two 25 each; operators and robots are not delayed."""
+    """An address that only shakes hands gets 50 a second, two 25 each, all new ones 200; others are not delayed."""
 
     def handshakes(seconds: int, *addresses: str) -> int:
         done = 0
@@ -132,6 +132,9 @@ def test_handshakes_of_unproven_addresses_have_a_share(table: ClientConnections)
         assert all(table.accepted(_Socket(), "10.0.0.1") for _ in range(60))
         let_time_pass(60)
         assert all(table.accepted(_Socket(), "203.0.113.1") for _ in range(32))
+        let_time_pass(60)
+        once = (f"203.{number >> 8}.{number & 255}.1" for number in range(65_536))
+        assert 10_900 <= sum(handshakes(1, *islice(once, 30)) for _ in range(50)) <= 11_000
 
     _in_loop(story)
 
