@@ -37,7 +37,7 @@ LANES = {
         "tests/unit/distribution/",
     ),
     "standby": ("standby", "two_appliances", "lease", "insertion_at_large"),
-    "fleet": ("fleet", "bundle", "collector", "rollout", "clickhouse"),
+    "fleet": ("fleet", "bundle", "collector", "rollout"),
     "recorder": ("recorder", "evidence", "recording"),
     "language": ("rosmop/", "tests/proofs/", "monitor", "specification", "compiler"),
 }
@@ -66,7 +66,6 @@ STAGES = (
         "machine",
         (
             "tests/system/vm",
-            "tests/system/test_clickhouse.py",
             "tests/system/test_examples.py",
             "tests/system/test_generated_client.py",
             "tests/system/test_recordings_cluster.py",
