@@ -67,7 +67,7 @@ class Operator:
 
     def remote(self, *arguments: str, token: Path | None = None, status: int = 0) -> str:
         """Run a command that asks the running collector."""
-        url, ca = f"https://127.0.0.1:{self._site.port}", str(self._site.server.ca)
+        url, ca = f"https://{self._site.address}:{self._site.port}", str(self._site.server.ca)
         access = ("--collector", url, "--ca", ca, "--token-file", str(token or self.token))
         return self.run(*arguments, *access, status=status)
 

@@ -15,6 +15,7 @@ from tests.support.requirements import need_program, need_root, needs
 from tests.support.standby_site import StandbySite
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetSite
+from tests.system.fleet.test_bundles import BUNDLE, Operator, serve_bundles
 
 COLLECTOR = "10.79.0.50"
 NAMES = ("a", "b")
@@ -62,19 +63,25 @@ def test_both_join_and_a_takeover_goes_on(
     lab, site = pair
     host = lab.host("collector", f"{COLLECTOR}/24")
     fleet = Fleet(tmp_path / "fleet", database, address=COLLECTOR, popen=host.popen)
+    operator = Operator(fleet, tmp_path / "operator")
     with host.entered():
-        fleet.start()
+        serve_bundles(fleet, operator)
     try:
         _join(lab, site, fleet)
+        _configure(site, operator)
         _restart(site, "b")
         eventually(lambda: fleet.heard()["b"], "the standby is heard without a log")
         _restart(site, "a")
         site.until_active("b")
         eventually(lambda: _all_pushed(site, fleet, "a"), "the new standby pushes its log")
         eventually(lambda: len(fleet.proven()) == 2, "the active appliance pushes")
+        with host.entered():
+            operator.rollout("start", BUNDLE)
+        eventually(lambda: _bundles(site, "b") == (BUNDLE, False), "the active appliance takes a bundle")
         site.cut("b")
         site.until_active("a")
         eventually(lambda: _all_pushed(site, fleet, "a"), "the other appliance pushes after a takeover")
+        eventually(lambda: _bundles(site, "a") == (BUNDLE, False), "it has the bundle, and polls")
         site.restore("b")
         eventually(
             lambda: _all_pushed(site, fleet, "b"), "the standby pushes what it recorded before the cut"
@@ -90,10 +97,27 @@ def _join(lab: Lab, site: StandbySite, fleet: Fleet) -> None:
     fleet.server.certificate.write_bytes(whole)
     for name, words in (("a", ()), ("b", ("--appliance", "b"))):
         file = fleet.folder / f"{name}.json"
-        file.write_text(fleet.run("robot", "invite", "arm7", *words).stdout)
+        file.write_text(fleet.run("robot", "invite", "arm7", "--group", "site-a/arms", *words).stdout)
         appliance = site.appliances[name]
         with lab.hosts[name].entered():
             assert "arm7 is enrolled" in appliance.rosrv("fleet", "join", str(file)).stdout
+
+
+def _configure(site: StandbySite, operator: Operator) -> None:
+    """Give both appliances the same settings of bundles."""
+    for one in site.appliances.values():
+        root, config = one.directory / "root.json", one.directory / "appliance.yaml"
+        root.write_bytes((operator.repository / "root.json").read_bytes())
+        root.chmod(0o644)
+        bundles = {"root": str(root), "interval": 5, "confirm_seconds": 1}
+        config.write_text(json.dumps({"fleet": {"bundles": bundles}}))
+        one.options = ("--config", str(config), *one.options)
+
+
+def _bundles(site: StandbySite, name: str) -> tuple[str, bool] | None:
+    """Return the bundle in force, and whether it was changed, once an appliance has verified the metadata."""
+    state = site.appliances[name].status()["bundles"]
+    return None if state["checked"] is None else (state["in_force"], state["changed"])
 
 
 def _restart(site: StandbySite, name: str) -> None:
