@@ -21,6 +21,7 @@ from appliance.api.access import Bearer
 from appliance.api.denials import asks_policy
 from appliance.api.dry_run_policy import explained, granted
 from appliance.api.moments import given
+from appliance.api.named_hosts import has_name, with_networks
 from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Operator, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
@@ -75,7 +76,13 @@ def _wanted(
     decision: Annotated[list[Literal["allow", "deny", "would deny"]] | None, Query()] = None,
     since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
     until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
-    host: Annotated[str | None, Query(max_length=256, description="address of the peer; a glob")] = None,
+    host: Annotated[
+        str | None,
+        Query(
+            max_length=256,
+            description="the peer: an address, a glob, a network, or a name (of a group, robot, or an enrolled host)",
+        ),
+    ] = None,
     caller_id: Annotated[
         str | None, Query(max_length=256, description="the name that the peer gave; a glob")
     ] = None,
@@ -137,6 +144,7 @@ class LogReader:
 
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
+        self._control = services.control
         self.searches = Work("searches of the audit log", _SEARCHES)
         self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
         self.verification = Work("verifications", 1)
@@ -145,6 +153,12 @@ class LogReader:
         """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
         async with self.searches.turn(bearer):
             return await self.in_thread(function, *arguments, **named)
+
+    async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
+        """Replace the name of the filter's host by its networks. Raises `ProblemError`."""
+        if not has_name(wanted):
+            return wanted
+        return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
 
     async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
         """Return a record with its neighbours. Raises `ProblemError`."""
@@ -194,6 +208,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
         newest = order == "newest"
+        wanted = await desk.named(bearer, wanted)
         return JSONResponse(
             await desk.read(
                 bearer,
@@ -224,6 +239,7 @@ def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
 
         Ends when the token does. A browser that reconnects goes on where it was.
         """
+        wanted = await desk.named(bearer, wanted)
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(bearer, Follower, desk.path, wanted, start)
         give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
@@ -259,6 +275,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records as a search
         shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
         """
+        wanted = await desk.named(bearer, wanted)
         found = await desk.read(bearer, _exported, desk.path, wanted, bearer)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         return StreamResponse(

@@ -19,7 +19,7 @@ from appliance.audit.why import lines_of
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph_answers import Registration
 from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
-from appliance.policy.actions import BadWordError, check_resource, find_hosts
+from appliance.policy.actions import BadWordError, check_resource, find_host
 from appliance.policy.decision_reasons import DecisionExplanation, explain
 from appliance.policy.diff import diff
 from appliance.policy.grant import UngrantableError, grant
@@ -125,7 +125,7 @@ def explanation(
     fields = msgspec.structs.asdict(current)
     policy = replace(judge_text(text, current, cases=False).policy, blocks=PolicyContext.of(fields).blocks)
     try:
-        request = Request(find_hosts(host, policy)[0], node, category, check_resource(category, resource))
+        request = Request(find_host(host, policy), node, category, check_resource(category, resource))
     except BadWordError as error:
         raise ProblemError(422, "bad-input", str(error)) from error
     if needs_node(request) and not node:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from appliance.api.access import Bearer
 from appliance.api.dry_run_policy import explanation, judge_change, judge_text
+from appliance.api.named_hosts import HostLabels, labels_of
 from appliance.api.operation_routes import Answer, OperationCall
 from appliance.api.policy_models import Decided, Explained, LostRule, Question, Report, RuleText
 from appliance.api.problems import ProblemError
@@ -71,6 +72,12 @@ def routes(services: Services) -> Routes:
         known = await ask(control, admin.PolicyWanted(), bearer)
         return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
 
+    @router.get("/hosts")
+    async def host_names(bearer: Viewer) -> HostLabels:
+        """Return the names of hosts: enrolled hosts, `robot` and groups of the policy in force, with their networks."""
+        known = await ask(control, admin.PolicyWanted(), bearer)
+        return await asyncio.to_thread(labels_of, known)
+
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(control, admin.PolicyWanted(), bearer)
         async with services.judging.turn(bearer):
@@ -80,7 +87,9 @@ def routes(services: Services) -> Routes:
     @router.get("/explain", operation_id="explain")
     async def explain_request(
         bearer: Viewer,
-        host: Annotated[str, Query(min_length=1, max_length=100, description="an address, or `robot`")],
+        host: Annotated[
+            str, Query(min_length=1, max_length=100, description="an address, or the name of a host")
+        ],
         category: Category,
         resource: Annotated[str, Query(min_length=1, max_length=256)],
         node: Annotated[

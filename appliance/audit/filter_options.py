@@ -30,7 +30,13 @@ def filter_given(
             "--topic", "--resource", help="Topic, service, parameter or call; a glob such as '/cmd_*'"
         ),
     ] = None,
-    host: Annotated[str | None, typer.Option("--host", help="Address of the peer; a glob")] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            "--host",
+            help="Peer: an address or a glob; of an appliance also a network, or a host's name",
+        ),
+    ] = None,
     caller: Annotated[str | None, typer.Option("--caller", help="Name that the node gave; a glob")] = None,
     event: Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")] = None,
     category: Annotated[

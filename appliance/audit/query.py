@@ -11,6 +11,8 @@ import msgspec
 from appliance.audit.log_database import TEXT_OF_RECORD
 from appliance.audit.record import Severity
 
+IN_NETWORKS = "in_networks"
+"""A function of SQL that `search` defines: whether a host is in one of the networks, which spaces separate."""
 _LONGEST_PATTERN = 256
 _MOST_STARS = 8
 _TRIGRAM = 3
@@ -27,7 +29,7 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     `caller_id`, `resource`, `category` and `event` are exact, or globs if they contain `*`, `?` or `[`; `rule` is a
     glob for the rule's section or key. `text` is searched in names, reason and details, ignoring case. `who` is a glob
     for the name of the token (or `operator`) that made the request. `without_looks` omits allowed REST calls that only
-    read (GET, HEAD).
+    read (GET, HEAD). `hosts` are networks, one of which contains the host: the meaning of a host's name.
     """
 
     decision: tuple[str, ...] = ()
@@ -43,6 +45,7 @@ class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     text: str | None = None
     who: str | None = None
     without_looks: bool = False
+    hosts: tuple[str, ...] = ()
 
 
 # Records with a damaged detail have no author.
@@ -73,6 +76,8 @@ def conditions(wanted: Filter) -> list[Condition]:
         value = getattr(wanted, column)
         if value is not None:
             found.append(_match(column, value))
+    if wanted.hosts:
+        found.append(_within(wanted.hosts))
     if wanted.severity is not None:
         order = list(Severity)
         names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
@@ -95,6 +100,15 @@ def conditions(wanted: Filter) -> list[Condition]:
     if wanted.until is not None:
         found.append(Condition("time < ?", (wanted.until,), "record_time"))
     return found
+
+
+def _within(networks: tuple[str, ...]) -> Condition:
+    """Return the condition that the host is in one of the networks; only hosts' addresses have an index."""
+    if all(network.endswith(("/32", "/128")) for network in networks):
+        addresses = tuple(network.rpartition("/")[0] for network in networks)
+        marks = ", ".join("?" * len(addresses))
+        return Condition(f"(host IN ({marks}) AND host IS NOT NULL)", addresses, "record_host")
+    return Condition(f"(host IS NOT NULL AND {IN_NETWORKS}(host, ?))", (" ".join(networks),))
 
 
 def _match(column: str, value: str) -> Condition:

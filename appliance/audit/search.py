@@ -4,6 +4,8 @@ Reading works whether or not the appliance runs, and never blocks the writer. Te
 and in the records that are not indexed yet.
 """
 
+import functools
+import ipaddress
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -14,7 +16,15 @@ from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
 from appliance.audit.ids import ID_LENGTH
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, open_for_reading
-from appliance.audit.query import Condition, Filter, FilterError, conditions, text_condition, text_match
+from appliance.audit.query import (
+    IN_NETWORKS,
+    Condition,
+    Filter,
+    FilterError,
+    conditions,
+    text_condition,
+    text_match,
+)
 from appliance.audit.record_format import LogEntry
 
 LARGEST_PAGE = 10_000
@@ -155,6 +165,8 @@ def _last_sequence(connection: sqlite3.Connection) -> int:
 
 def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> SearchPage:
     found = conditions(wanted)
+    if wanted.hosts:
+        connection.create_function(IN_NETWORKS, 2, _in_networks, deterministic=True)
     index = _most_selective(connection, found)
     if wanted.text:
         found.append(text_condition(wanted.text))
@@ -166,6 +178,19 @@ def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: in
     if len(entries) <= limit:
         return SearchPage(entries, None)
     return SearchPage(entries[:limit], str(entries[limit - 1].sequence))
+
+
+def _in_networks(host: object, networks: str) -> bool:
+    try:
+        address = ipaddress.ip_address(str(host))
+    except ValueError:
+        return False
+    return any(address in network for network in _networks_of(networks))
+
+
+@functools.lru_cache(8)
+def _networks_of(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+    return tuple(map(ipaddress.ip_network, text.split()))
 
 
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:

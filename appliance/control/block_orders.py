@@ -13,7 +13,6 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 
 from msgspec.structs import asdict, replace
 
-from appliance.base.validation_messages import meant
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import host_answers as answers
@@ -23,6 +22,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.host_blocks import BlockTable
 from appliance.control.policies import Policies
 from appliance.hosts.host_table import HostRefusedError
+from appliance.policy.host_names import HostNames, UnknownHostError
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, address_of
 from appliance.rpc.front import plain_address
@@ -33,6 +33,8 @@ from appliance.telemetry.audit_trail import AuditTrail
 
 MOST = 1000
 _LONGEST_NOTE = 200
+_LONGEST_NAME = 300
+_MOST_NAMED = 5
 _FEW = 10  # registrations: two nodes; a robot has more
 _LOOK_SECONDS = 10.0  # the timer does not count while the machine is suspended; the age clock does
 _REGISTERED = {
@@ -196,16 +198,21 @@ class BlockOrders:
     # --- what may be blocked ---
 
     def _address(self, text: str) -> Address:
-        """Return the canonical address of a host, given as an address or as the name of an enrolled host."""
+        """Return the canonical address of a host, given as an address, or as the name of one host."""
         with contextlib.suppress(ValueError):
             return plain_address(str(ipaddress.ip_address(text)))
-        enrolled, name = self._enrolled(), text.removeprefix("host:")
-        if name not in enrolled:
-            guess = meant(name, enrolled) or "; a network cannot be blocked" * ("/" in text)
-            raise SenselessError(
-                f"{text[:80]!r} is neither an IPv4 or IPv6 address nor the name of an enrolled host{guess}"
+        policy = self._policies.current
+        enrolled = {name: address_of(address) for name, address in self._enrolled().items()}
+        try:
+            networks = HostNames.of(policy.text, enrolled, policy.robot).networks(text[:_LONGEST_NAME])
+        except UnknownHostError as error:
+            raise SenselessError(str(error)) from None
+        if len(networks) > 1 or networks[0].num_addresses > 1:
+            some = ", ".join(
+                str(one).removesuffix("/32").removesuffix("/128") for one in networks[:_MOST_NAMED]
             )
-        return plain_address(enrolled[name])
+            raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
+        return plain_address(str(networks[0].network_address))
 
     def _require_not_the_robot(self, address: Address, held: answers.BlockEnded) -> None:
         own, whole = _registrations_of(held), self._registrations()

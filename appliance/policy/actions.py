@@ -4,6 +4,8 @@ import ipaddress
 
 from appliance.base.validation_messages import meant
 from appliance.policy.commands import ALIASES, COMMANDS, DECIDED_ELSEWHERE
+from appliance.policy.groups import ROBOT
+from appliance.policy.host_names import HostNames, UnknownHostError
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
@@ -12,6 +14,7 @@ from appliance.policy.policy_findings import quoted
 from appliance.policy.sections import PARAMETERS
 from roswire.names import is_global_name
 
+_MOST_NAMED = 3
 VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}
 
 
@@ -42,21 +45,29 @@ def check_resource(category: Category, name: str) -> str:
 
 
 def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
-    """Return the addresses that an address, `robot` or `host:NAME` means in this policy. Raises `BadWordError`."""
-    if text == "robot":
-        if not policy.robot:
-            raise BadWordError("the address of robot is not known")
-        return tuple(_first(network) for network in policy.robot)
-    if text.startswith("host:"):
-        name = text.removeprefix("host:")
-        address = policy.enrolled.get(name)
-        if address is None:
-            raise BadWordError(f"no host {quoted(name)} is enrolled{meant(name, policy.enrolled)}")
-        return (canonical_address(address),)
+    """Return the addresses that an address or a name means in this policy; of a group's network the first host.
+
+    Raises `BadWordError`.
+    """
     try:
         return (canonical_address(ipaddress.ip_address(text)),)
     except ValueError:
-        raise BadWordError(f"{quoted(text)} is not an address, robot or host:NAME") from None
+        if "/" in text:
+            raise BadWordError(f"{quoted(text)} is not one host: give an address in it") from None
+        names = HostNames.of(policy.text, policy.enrolled, policy.robot)
+    try:
+        return tuple(_first(network) for network in names.networks(text))
+    except UnknownHostError as error:
+        raise BadWordError(str(error)) from None
+
+
+def find_host(text: str, policy: Policy) -> Address:
+    """Return the address of one host (of `robot` the first). Raises `BadWordError`, also for a group of several."""
+    found = find_hosts(text, policy)
+    if len(found) > 1 and text != ROBOT:
+        some = ", ".join(map(str, found[:_MOST_NAMED]))
+        raise BadWordError(f"{quoted(text)} is not one host: give the address, such as {some}")
+    return found[0]
 
 
 def _first(network: Network) -> Address:

@@ -5,11 +5,15 @@ import inspect
 from collections.abc import Callable
 from typing import Concatenate, ParamSpec
 
+from appliance.api.named_hosts import has_name, with_networks
 from appliance.api.unrecorded import unrecorded
 from appliance.audit.filter_options import filter_given
-from appliance.audit.query import Filter
+from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import printable
+from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, note
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
 
 _P = ParamSpec("_P")
@@ -30,9 +34,24 @@ def filtered(
             wanted = filter_given(**given)  # type: ignore[arg-type]  # as the options say
             for warning in unrecorded(wanted):
                 note(printable(warning))
+            if has_name(wanted) and appliance.place is None:  # over REST, the appliance looks the name up
+                wanted = with_networks(wanted, _known(appliance, wanted))
             verb(appliance, wanted, *args, **kwargs)
 
     own = inspect.signature(verb, eval_str=True)
     first, _wanted, *rest = own.parameters.values()
     asked.__signature__ = own.replace(parameters=[first, *options.values(), *rest])  # type: ignore[attr-defined]  # what `speaks` reads
     return asked  # type: ignore[return-value]  # mypy gives the appliance a name that it is not called by
+
+
+def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
+    """Return the policy in force, which has the names of hosts. Raises `FilterError` if no appliance answers."""
+    try:
+        answer = appliance.ask(PolicyWanted())
+    except NotRunningError:
+        raise FilterError(
+            f"--host {wanted.host}: only the running appliance knows the names of hosts; give an address or a glob"
+        ) from None
+    if not answer.ok:
+        raise FilterError(f"--host {wanted.host}: {answer.error}")
+    return answer.given()

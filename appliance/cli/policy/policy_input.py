@@ -20,7 +20,7 @@ from appliance.channel.answers.policy_answers import PolicyInForce
 from appliance.cli import output
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance
-from appliance.policy.actions import BadWordError, find_hosts
+from appliance.policy.actions import BadWordError, find_host
 from appliance.policy.host_sets import Network, canonical_address, canonical_network
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.live_rights import LiveRight
@@ -111,10 +111,10 @@ def _over_rest(appliance: Appliance) -> PolicyInForce:
         raise usage_error(str(error)) from error
 
 
-def find_host(text: str, policy: Policy) -> Address:
-    """Resolve an address, `robot` (its first address) or `host:NAME` to an address. Raises `BadWordError`."""
+def asking_host(text: str, policy: Policy) -> Address:
+    """Resolve an address or the name of one host to an address. Raises `BadWordError`."""
     try:
-        return find_hosts(text, policy)[0]
+        return find_host(text, policy)
     except BadWordError as error:
         for word, option in (("robot", "--robot ADDRESS"), ("host:", "--enrolled NAME=ADDRESS")):
             if text.startswith(word):

@@ -17,7 +17,7 @@ from appliance.cli.policy.policy_impact import PolicyImpact, impact_of
 from appliance.cli.policy.policy_input import (
     Enrolled,
     Robot,
-    find_host,
+    asking_host,
     known_of,
     policy_in_force,
     read_text,
@@ -142,7 +142,12 @@ def explain_request(
     appliance: Appliance,
     file: OptionalFile = None,
     *,
-    host: Annotated[str, typer.Option(help="The requesting host: an address, robot, or host:NAME")],
+    host: Annotated[
+        str,
+        typer.Option(
+            help="The requesting host: an address, or its name: robot, a group of one host, host:NAME"
+        ),
+    ],
     node: Annotated[
         str, typer.Option(help="The requesting node's name (caller_id), if the request needs one")
     ] = "",
@@ -179,7 +184,7 @@ def explain_request(
     policy = compiled(appliance, file, robot, enrolled)
     category, name = chosen[0]
     try:
-        request = Request(find_host(host, policy), node, category, check_resource(category, name))
+        request = Request(asking_host(host, policy), node, category, check_resource(category, name))
     except BadWordError as error:
         raise usage_error(str(error)) from error
     if needs_node(request) and not node:

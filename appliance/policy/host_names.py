@@ -1,0 +1,132 @@
+"""Names of hosts: `robot`, the groups of the policy, and enrolled hosts. Pure; no other module resolves such a name.
+
+Invariants:
+
+1. A name means every network of its group, at any depth, and the address of the enrolled host of this name. `host:NAME`
+   means the enrolled host only.
+2. The label of an address is the name of the smallest network that contains it: of an enrolled host before `robot`, and
+   of `robot` before the group with the fewest networks. A network of all addresses gives no label.
+"""
+
+import ipaddress
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from appliance.base.validation_messages import meant
+from appliance.policy.groups import ROBOT
+from appliance.policy.host_sets import Network, canonical_address, canonical_network
+from appliance.policy.ini_reader import read
+from appliance.policy.model import Address
+from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.sections import GROUPS
+
+_HOST = "host:"
+_MOST_NAMED = 20
+_EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
+
+
+class UnknownHostError(ValueError):
+    """No host or group has this name; the message names the nearest one."""
+
+
+@dataclass(frozen=True)
+class HostNames:
+    """The groups of a policy in force (`robot` is one), and the addresses of enrolled hosts."""
+
+    groups: Mapping[str, tuple[Network, ...]]
+    enrolled: Mapping[str, Address]
+
+    @classmethod
+    def of(cls, text: str, enrolled: Mapping[str, Address], robot: Iterable[Network]) -> "HostNames":
+        """Return the names in the text of a valid policy."""
+        rows = {
+            entry.key.text: [word.text for word in entry.values]
+            for section in read(text, Findings("policy"))
+            if section.name.text.casefold() == GROUPS.casefold()
+            for entry in section.entries
+        }
+        groups = {ROBOT: tuple(robot)}
+        for name in rows:
+            _define(name, rows, groups, enrolled)
+        return cls(groups, enrolled)
+
+    def networks(self, text: str) -> tuple[Network, ...]:
+        """Return the networks that an address, a network or a name means. Raises `UnknownHostError`."""
+        try:
+            return (canonical_network(ipaddress.ip_network(text)),)
+        except ValueError:
+            name = text.removeprefix(_HOST)
+        found = dict.fromkeys(self.groups.get(text, ()))
+        if name in self.enrolled:
+            found[_network_of(self.enrolled[name])] = None
+        if not found:
+            raise UnknownHostError(self._unknown(text, name))
+        return tuple(found)
+
+    def _unknown(self, text: str, name: str) -> str:
+        if text in self.groups:
+            return f"the address of {text} is not known"
+        if name != text:
+            return f"no host {quoted(name)} is enrolled{meant(name, self.enrolled)}"
+        known = [*self.groups, *self.enrolled]
+        guess = meant(text, known) or f"; the names are {', '.join(known[:_MOST_NAMED])}"
+        return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
+
+    def labels(self) -> list[tuple[Network, str]]:
+        """Return networks with their names: the first one that contains an address has its label."""
+        rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]
+        rows += [
+            (0 if name == ROBOT else len(some), one, name)
+            for name, some in self.groups.items()
+            for one in some
+        ]
+        rows = [row for row in rows if row[1] not in _EVERY]
+        return [
+            (network, name)
+            for _size, network, name in sorted(rows, key=lambda row: (-row[1].prefixlen, row[0]))
+        ]
+
+
+def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
+    """Return the label of an address, from `HostNames.labels`; empty if it has none, or is not an address."""
+    try:
+        found = canonical_address(ipaddress.ip_address(address))
+    except ValueError:
+        return ""
+    return next((name for network, name in labels if found in network), "")
+
+
+def _define(
+    name: str,
+    rows: Mapping[str, list[str]],
+    groups: dict[str, tuple[Network, ...]],
+    enrolled: Mapping[str, Address],
+) -> tuple[Network, ...]:
+    """Return the networks of a group, after those that it names; an invalid word has none."""
+    if name not in groups:
+        groups[name] = ()  # a valid policy has no cycle
+        found: dict[Network, None] = {}
+        for word in rows[name]:
+            found |= dict.fromkeys(
+                _define(word, rows, groups, enrolled)
+                if word in rows or word in groups
+                else _meant_by(word, enrolled)
+            )
+        groups[name] = tuple(found)
+    return groups[name]
+
+
+def _meant_by(word: str, enrolled: Mapping[str, Address]) -> tuple[Network, ...]:
+    if word == "*":
+        return _EVERY
+    if word.startswith(_HOST):
+        address = enrolled.get(word.removeprefix(_HOST))
+        return () if address is None else (_network_of(address),)
+    try:
+        return (canonical_network(ipaddress.ip_network(word)),)
+    except ValueError:
+        return ()
+
+
+def _network_of(address: Address) -> Network:
+    return canonical_network(ipaddress.ip_network(canonical_address(address)))

@@ -1,0 +1,72 @@
+"""Names of hosts mean the same addresses everywhere, and an address has one label."""
+
+from ipaddress import ip_address, ip_network
+
+import pytest
+
+from appliance.policy.host_names import HostNames, UnknownHostError, label_of
+
+TEXT = """
+[Groups]
+tablet = 10.77.0.66
+guests = 10.77.0.0/24 visitor
+visitor = host:laptop
+all = *
+[Nodes]
+default = all
+"""
+NAMES = HostNames.of(
+    TEXT,
+    {"laptop": ip_address("10.113.0.5"), "tablet": ip_address("10.113.0.9")},
+    [ip_network("10.88.0.10/32")],
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "networks"),
+    [
+        ("10.0.0.1", "10.0.0.1/32"),
+        ("::ffff:10.0.0.1", "10.0.0.1/32"),
+        ("10.0.0.0/8", "10.0.0.0/8"),
+        ("robot", "10.88.0.10/32"),
+        ("guests", "10.77.0.0/24 10.113.0.5/32"),
+        ("laptop", "10.113.0.5/32"),
+        ("tablet", "10.77.0.66/32 10.113.0.9/32"),
+        ("host:tablet", "10.113.0.9/32"),
+    ],
+)
+def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
+    """A group has its networks at any depth; an enrolled host of the same name counts as well."""
+    assert " ".join(map(str, NAMES.networks(text))) == networks
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tabled", "did you mean .?tablet"),
+        ("host:labtop", "laptop"),
+        ("nobody", "names are robot, tablet"),
+        ("", "not an"),
+    ],
+)
+def test_an_unknown_name_is_an_error(text: str, said: str) -> None:
+    """It names the nearest name, or those that there are."""
+    with pytest.raises(UnknownHostError, match=said):
+        NAMES.networks(text)
+
+
+def test_an_address_has_the_narrowest_label() -> None:
+    """An enrolled host comes before a group of this address, and no label comes from `*`."""
+    labels = NAMES.labels()
+    addresses = (
+        "10.77.0.66",
+        "10.77.0.3",
+        "::ffff:10.113.0.5",
+        "10.88.0.10",
+        "10.113.0.9",
+        "192.0.2.1",
+        "local",
+    )
+    assert [label_of(one, labels) for one in addresses] == [
+        "tablet", "guests", "laptop", "robot", "tablet", "", "",
+    ]  # fmt: skip
