@@ -2,8 +2,8 @@
 
 Invariants:
 
-1. The files are part of the program, need no token and contain no secret. Only the site's notice, and the time after
-   which the page locks, are settings. The page requests its content from `/v1` with its reader's token.
+1. The files are part of the program, need no token and contain no secret. Only the site's notice, the robot's name, and
+   the time after which the page locks, are settings. The page requests its content from `/v1` with its reader's token.
 2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the file
    system.
 3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
@@ -84,7 +84,11 @@ def routes(settings: Settings) -> APIRouter:
     page = served[_PAGE] = _file(
         _stating(
             _ADDRESS.sub(named, texts[_PAGE]),
-            {"lock-seconds": f"{settings.api_lock_seconds:g}", "notice": settings.api_notice},
+            {
+                "lock-seconds": f"{settings.api_lock_seconds:g}",
+                "notice": settings.api_notice,
+                "robot": settings.name,
+            },
         ).encode(),
         served[_PAGE].media_type,
     )

@@ -113,7 +113,7 @@ def _samples(body: Measures) -> dict[str, _Samples]:
     policy, audit, monitors, clock = status.policy, status.audit, status.monitors, status.clock
     relayed, recorder = body.relayed, status.recorder
     return {
-        "rosrv_info": [((status.version,), 1)],
+        "rosrv_info": [((status.version, status.name), 1)],
         "rosrv_start_time_seconds": [((), status.since)],
         "rosrv_decisions_total": [
             ((category, outcome), count) for category, outcome, count in body.decisions

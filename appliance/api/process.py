@@ -97,7 +97,7 @@ class _Api:
             doorkeeper=self._doorkeeper,
             journal=self._journal,
             names=[
-                *self._settings.api_names,
+                *self._settings.rest_names,
                 *filter(None, [self._settings.ipsec.endpoint]),  # the address for hosts that enrol themselves
                 socket.gethostname(),
             ],
@@ -153,7 +153,7 @@ class _Api:
 
     def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
         address = self._settings.api_address
-        names = [*self._settings.api_names]
+        names = self._settings.rest_names
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
             names.append(address[0])
         return self._settings.state / "api", names, clock.utc_now()

@@ -152,6 +152,8 @@ class StatusScreen:
 def _grid(body: Status) -> Table:
     audit = body.audit
     grid = Table.grid(padding=(0, 2))
+    if body.name:
+        grid.add_row("robot", body.name)
     grid.add_row("appliance", f"{body.version} at {body.master}, for {age(body.since)}")
     isolation = Text(_isolation(body), style=_YELLOW if body.isolation == "none" else _GREEN)
     grid.add_row("isolation", isolation)

@@ -238,7 +238,7 @@ class Syslog:
     )
     facility: int = key(default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`")
     host_name: str | None = key(
-        default=None, description="sender name in messages; default: the machine's name"
+        default=None, description="sender name in messages; default: `name`, or the machine's name"
     )
     ca: Path | None = key(
         default=None,
@@ -582,6 +582,12 @@ def _mediation_fits(mediation: str, info: Any) -> str:
 class Settings:
     """All settings."""
 
+    name: str = key(
+        default="",
+        pattern=r"^([A-Za-z0-9][A-Za-z0-9.-]{0,62})?$",
+        description="the robot's name: in the console, the status, the metrics, the names of exported files, and REST's"
+        " certificate; also the sender in syslog",
+    )
     policy: Path = key(
         default=Path("policies/default.ini"), description="the access policy; read again on reload"
     )
@@ -694,6 +700,11 @@ class Settings:
     availability: Availability = Availability()
     api_limits: ApiLimits = ApiLimits()
     fleet: Fleet = Fleet()
+
+    @property
+    def rest_names(self) -> list[str]:
+        """Return the names of REST that the configuration gives."""
+        return [*self.api_names, *filter(None, [self.name])]
 
     def __post_init__(self) -> None:
         to, collector = self.audit.syslog.to, self.fleet.collector

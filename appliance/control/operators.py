@@ -121,6 +121,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         standby=standby.state,
         bundles=bundles.status,
         handled=handled.marked,
+        name=base.settings.name,
     )
     orders = StandbyOrders(standby, trail)
     administration = Administration(

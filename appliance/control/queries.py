@@ -80,6 +80,7 @@ class Queries:
     standby: Callable[[], StandbyState | None]
     bundles: Callable[[], BundlesState | None]
     handled: Callable[[Status], Status]
+    name: str = ""
     started: float = field(default_factory=wall)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
@@ -181,6 +182,7 @@ class Queries:
             if not node.own
         }
         return Status(
+            name=self.name,
             version=appliance.__version__,
             since=self.started,
             master=self.surroundings.master,

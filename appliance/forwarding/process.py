@@ -117,7 +117,7 @@ def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
         Formatter(
             facility=wanted.facility,
             longest=longest,
-            host_name=wanted.host_name,
+            host_name=wanted.host_name or settings.name or None,
         ),
         chosen=wanted.send,
     )

@@ -41,7 +41,7 @@ def _histogram(name: str, help: str, *labels: str, bounds: tuple[float, ...] = B
 
 
 METRICS = (
-    _gauge("rosrv_info", "1, with the version that runs", "version"),
+    _gauge("rosrv_info", "1, with the version that runs, and the robot's name", "version", "name"),
     _gauge("rosrv_start_time_seconds", "when RVMaster started, seconds since the epoch"),
     _counter("rosrv_decisions_total", "decisions: allow, deny or would deny", "category", "outcome"),
     _histogram("rosrv_decision_seconds", "time from a request's arrival to its decision"),

@@ -257,6 +257,7 @@ class Status(msgspec.Struct, frozen=True):
     switched_off: Annotated[list[SwitchedOff], doc("what an operator switched off")] = []
     blocks: BlocksState = BlocksState(0, None)
     last_minute: MinuteState = MinuteState(0, {})
+    name: Annotated[str, doc("the robot's name (`name` in appliance.yaml); empty: none")] = ""
     standby: Annotated[StandbyState | None, doc("null: this appliance is not one of two")] = None
     bundles: Annotated[BundlesState | None, doc("null: no bundles of a fleet are configured")] = None
     handled_alarms: Annotated[

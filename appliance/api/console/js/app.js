@@ -5,9 +5,10 @@ import { html, useEffect } from "./html.js";
 import { start, stop } from "./live.js";
 import { Nav } from "./nav.js";
 import { startNotable, stopNotable } from "./notable.js";
+import { useNames } from "./parts/host.js";
 import { Toasts, clearToasts } from "./parts/toast.js";
 import { place } from "./router.js";
-import { session } from "./session.js";
+import { entitle, session } from "./session.js";
 import { useShortcuts } from "./shortcuts.js";
 import { useStore } from "./store.js";
 import { Audit } from "./audit/view.js";
@@ -48,9 +49,10 @@ function Shell({ standby }) {
   }, [standby]);
   useEffect(() => {
     if (standby) return;
-    document.title = `${view[0].toUpperCase()}${view.slice(1)} · ROSRV`;
+    entitle(`${view[0].toUpperCase()}${view.slice(1)}`);
     scrollTo(0, 0);
   }, [view, standby]);
+  useNames();
   const help = useShortcuts();
   const View = SHOWN[/** @type {keyof typeof SHOWN} */ (view)];
   const skip = (/** @type {Event} */ event) => {

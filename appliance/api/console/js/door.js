@@ -8,7 +8,7 @@ import { Failure, Notice } from "./parts/notice.js";
 import { Check, Field } from "./parts/field.js";
 import { Problem } from "./problem.js";
 import { ask } from "./rest.js";
-import { end, kept, open, session, stated, UNUSED } from "./session.js";
+import { end, entitle, kept, open, ROBOT, session, stated, UNUSED } from "./session.js";
 import { useStore } from "./store.js";
 
 const FIRST_PAUSE = 1000; // milliseconds
@@ -90,14 +90,14 @@ function Waiting({ error }) {
 }
 
 function Brand() {
-  return html`<div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">ROSRV</h1><div class="brand-sub">Console of this appliance</div></div></div>`;
+  return html`<div class="brand"><${Mark} size=${40} /><div><h1 class="brand-name">${ROBOT || "ROSRV"}</h1><div class="brand-sub">${ROBOT ? "Console of this robot's ROSRV appliance" : "Console of this appliance"}</div></div></div>`;
 }
 
 /** The sign-in page of a locked session, above everything else, including dialogs. */
 export function Lock() {
   const ref = useRef(/** @type {HTMLDialogElement | null} */ (null));
   useEffect(() => {
-    document.title = "Locked · ROSRV";
+    entitle("Locked");
     ref.current?.showModal();
   }, []);
   const stay = (/** @type {Event} */ event) => event.preventDefault();

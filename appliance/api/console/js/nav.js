@@ -5,7 +5,7 @@ import { live } from "./live.js";
 import { Given } from "./parts/given.js";
 import { Icon, Mark } from "./parts/icon.js";
 import { Link, place, VIEWS } from "./router.js";
-import { end, session } from "./session.js";
+import { end, ROBOT, session } from "./session.js";
 import { Pulse } from "./standing.js";
 import { listKeys } from "./shortcuts.js";
 import { useStore } from "./store.js";
@@ -19,7 +19,7 @@ export function Nav() {
   const version = useStore(live, (one) => one.status?.version ?? "");
   const { current } = useStore(session);
   return html`<header class="side">
-    <div class="brand"><${Mark} /><div><div class="brand-name">ROSRV</div><div class="brand-sub">${version ? `Appliance ${version}` : "Appliance"}</div></div></div>
+    <div class="brand"><${Mark} /><div><div class="brand-name">${ROBOT || "ROSRV"}</div><div class="brand-sub">${[ROBOT ? "ROSRV" : "Appliance", version].filter(Boolean).join(" ")}</div></div></div>
     <nav class="nav" aria-label="Views"><ul>${VIEWS.map((name, index) => html`<li key=${name}>
       <${Link} to=${`/console/${name}`} class="fades" aria-current=${name === view ? "page" : undefined} aria-keyshortcuts=${String(index + 1)}>
         <${Icon} name=${name} /><span>${TITLES[/** @type {keyof typeof TITLES} */ (name)]}</span>

@@ -4,6 +4,7 @@ import { html, useEffect, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { count, counted } from "../numbers.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Failure } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { get } from "../rest.js";
@@ -23,7 +24,7 @@ export function DeniedHosts({ since, until, mark, title = "" }) {
   if (!value?.hosts.length) return null;
   const filter = Object.fromEntries(Object.entries({ decision: "deny", since, until }).filter(([, one]) => one));
   return html`<div class="table-wrap"><table class="table stacked denied-hosts" aria-label="Denials by host"><thead><tr><th>Host</th><th class="number">Denials${title}</th><th>Most often</th><th>Last</th></tr></thead>
-    <tbody>${value.hosts.map((/** @type {any} */ one) => html`<tr key=${one.host}><td class="first"><${Link} to=${auditPath({ ...filter, host: one.host })}><${Given} value=${one.host} mono /></${Link}>
+    <tbody>${value.hosts.map((/** @type {any} */ one) => html`<tr key=${one.host}><td class="first"><${Link} to=${auditPath({ ...filter, host: one.host })}><${Host} value=${one.host} /></${Link}>
         <div class="muted small">${one.callers.length ? html`<${Given} value=${one.callers.map((/** @type {any} */ caller) => caller.name).join(", ")} most=${80} mono />${one.more_callers ? ` and ${count(one.more_callers)} more` : ""}` : "no name"}</div></td>
       <td class="number" data-label="Denials">${count(one.count)}</td>
       <td data-label="Most often"><div>${one.reasons.map((/** @type {any} */ reason) => html`<div key=${reason.name} class="small"><span title=${plain(reason.name, 300)}><${Given} value=${reason.name.replace(FOLDER, " ")} most=${120} /></span> <span class="muted">${counted(reason.count, "time")}</span></div>`)}

@@ -43,7 +43,7 @@ export function Filters({ filter, record }) {
       <button class="button" aria-expanded=${String(more)} onClick=${() => setMore(!more)}><${Icon} name="filter" size=${16} />Filters</button>
     </div>
     ${more && html`<div class="form-grid">
-      ${field("host", { placeholder: "10.0.0.*", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
+      ${field("host", { placeholder: "10.0.0.*, or a name", mono: true })}${field("caller_id", { placeholder: "/node", mono: true })}${field("resource", { placeholder: "/cmd_*", mono: true })}
       ${field("rule", { placeholder: "Publishers, or a key", mono: true })}${field("category", { placeholder: "publish, command, monitor" })}${field("event", { placeholder: "decision, message dropped" })}${field("who", { placeholder: "name of a token, or operator" })}
       ${field("looks", { options: LOOKS })}${field("severity", { options: SEVERITIES })}${field("until", { placeholder: "10m, or 2026-11-20T08:00", mono: true })}
     </div>`}

@@ -9,7 +9,7 @@ import { Icon } from "../parts/icon.js";
 import { Failure, Notice } from "../parts/notice.js";
 import { failed } from "../parts/toast.js";
 import { get, queryText, send } from "../rest.js";
-import { may } from "../session.js";
+import { fileName, may } from "../session.js";
 import { askedOf } from "./records.js";
 
 export function Verify() {
@@ -37,14 +37,14 @@ function Verdict(/** @type {{value: any}} */ { value }) {
 
 /** @param {{filter: Record<string, string>}} given */
 export function Export({ filter }) {
-  return html`<${Button} onClick=${() => take(`/v1/audit/export${queryText(askedOf(filter))}`, `rosrv-audit-${now()}.ndjson`)}
+  return html`<${Button} onClick=${() => take(`/v1/audit/export${queryText(askedOf(filter))}`, fileName("audit", `${now()}.ndjson`))}
     title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
 }
 
 /** An evidence bundle of the filtered period. @param {{filter: Record<string, string>}} given */
 export function Evidence({ filter: { since, until } }) {
   return html`<${Button} role=${may("investigator") ? "investigator" : "operator"} disabled=${!since} why="Choose a start time first"
-    aria-keyshortcuts="e" onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, `rosrv-evidence-${now()}.zip`)}
+    aria-keyshortcuts="e" onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, fileName("evidence", `${now()}.zip`))}
     title="Everything in this period, with the policy and specifications in force, as a signed bundle"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
 }
 

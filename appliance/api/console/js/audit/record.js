@@ -6,6 +6,7 @@ import { html, useEffect, useRef, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { Badge, Outcome, requested } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
@@ -49,7 +50,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     <div class="stack-tight"><div class="row"><${Outcome} record=${record} /><strong><${Given} value=${record.event} /></strong><span class="muted"><${Moment} at=${record.time} /></span></div>
       <p class="record-reason"><${Given} value=${record.reason} most=${1000} none="no reason given" /></p></div>
     <dl class="facts">
-      <dt>Node</dt><dd><${Given} value=${record.caller_id} mono most=${300} /></dd><dt>Host</dt><dd><${Given} value=${record.host} mono /></dd>
+      <dt>Node</dt><dd><${Given} value=${record.caller_id} mono most=${300} /></dd><dt>Host</dt><dd><${Host} value=${record.host} /></dd>
       <dt>Category</dt><dd><${Given} value=${record.category} /></dd><dt>Resource</dt><dd><${Given} value=${record.resource} mono most=${300} /></dd>
       <dt>Severity</dt><dd><${Badge} word=${record.severity} /></dd>
       ${record.duration_us !== null && html`<dt>Decided in</dt><dd>${record.duration_us} µs</dd>`}

@@ -68,7 +68,7 @@ export function byHostAndKind(rows) {
       known.set(key, own);
       return [own];
     }
-    Object.assign(newer, { records: [...newer.records, ...row.records], first: row.first, count: newer.count + row.count });
+    Object.assign(newer, { records: [...newer.records, ...row.records], first: row.first, count: newer.count + row.count, value: newer.value || row.value });
     return [];
   });
 }

@@ -17,9 +17,10 @@ const RANGE = 64;
 /**
  * @param {import("./model.js").Model} model @param {Set<string>} opened keys of groups
  * @param {"namespace" | "host"} by what a group has in common @param {number} most things of a kind that are drawn without groups
+ * @param {(address: string) => string} [shown] the text of a host
  * @returns {{items: Map<string, Shown>, lines: Map<string, any>}}
  */
-export function collapse(model, opened, by, most) {
+export function collapse(model, opened, by, most, shown = (address) => address) {
   /** @type {Map<string, Shown>} */
   const items = new Map();
   const place = new Map();
@@ -29,7 +30,7 @@ export function collapse(model, opened, by, most) {
     const whole = by === "namespace" && all.length <= most;
     const root = whole ? { key: "", label: "", items: all, parts: all.map(leaf) } : grow(all.map((one) => ({ one, path: path(one) })), `g${kind}`, "", 1);
     for (const { branch, within } of cut(root, opened)) {
-      const group = branch.parts.length ? groupOf(branch, kind, by === "host" ? branch.label.slice(1) : branch.label) : null;
+      const group = branch.parts.length ? groupOf(branch, kind, by === "host" ? branch.label.slice(1).replace(/^[^/ ]+/, shown) : branch.label) : null;
       const twin = group && items.get(group.key.replace(/^g[a-z]+/, "gnode"));
       const item = twin ? together(twin, group) : group ?? branch.items[0];
       items.set(item.key, { ...item, within });

@@ -5,6 +5,7 @@ import { Moment } from "../moments.js";
 import { bytes, count, counted, rate } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Rule } from "../parts/rule.js";
 import { Link } from "../router.js";
@@ -27,7 +28,7 @@ function part(/** @type {any} */ item, /** @type {(key: string) => void} */ choo
   if (item.owners) return html`<p>This host was denied ${counted(item.denied, "time")} under names of nodes of <${Given} value=${item.owners.join(", ")} most=${200} mono />.</p>`;
   if (!row) return html`<p class="muted"><${Given} value=${item.sub} /></p>`;
   if (item.kind === "node")
-    return html`<dl class="facts"><dt>Host</dt><dd><${Given} value=${row.host} mono /></dd><dt>State</dt><dd><${Badge} word=${row.state} /></dd></dl>
+    return html`<dl class="facts"><dt>Host</dt><dd><${Host} value=${row.host} /></dd><dt>State</dt><dd><${Badge} word=${row.state} /></dd></dl>
       <${Names} title="Publishes" names=${row.publishes} letter="t" choose=${choose} /><${Names} title="Subscribes" names=${row.subscribes} letter="t" choose=${choose} /><${Names} title="Offers" names=${row.offers} letter="s" choose=${choose} />`;
   const path = html`<dt>Path</dt><dd>${row.mediated ? html`<${Badge} word="mediated" tone="note" /> through the relay` : html`<${Badge} word="direct" /> bypasses the appliance`}</dd>`;
   if (item.kind === "service")
@@ -65,7 +66,7 @@ function Attempt(/** @type {{records: any[]}} */ { records }) {
   const first = records[0];
   return html`<div class="stack-tight"><div class="row"><${Badge} word=${first.decision} /><span class="muted small">${counted(records.length, "time")}, last <${Moment} at=${first.time} /></span></div>
       <p><${Given} value=${first.reason} most=${500} /></p></div>
-    <dl class="facts"><dt>Who</dt><dd><${Given} value=${first.caller_id} mono none="no name" /></dd><dt>Host</dt><dd><${Given} value=${first.host} mono /></dd><dt>Wanted</dt><dd>${first.category} <${Given} value=${first.resource} mono /></dd>
+    <dl class="facts"><dt>Who</dt><dd><${Given} value=${first.caller_id} mono none="no name" /></dd><dt>Host</dt><dd><${Host} value=${first.host} /></dd><dt>Wanted</dt><dd>${first.category} <${Given} value=${first.resource} mono /></dd>
       <dt>Rule</dt><dd><${Rule} rule=${first.rule} revision=${first.revision} /></dd></dl>
     <div class="row"><${Link} class="button" to=${`/console/audit/${first.id}`}>Open the record</${Link}>
       <${Link} class="button" to=${explainPath(first)}>Explain</${Link}></div>

@@ -22,14 +22,17 @@ export const MASTER = "m/";
 const QUIET = new Set(["/rosout", "/rosout_agg", "/clock", "/statistics", "/diagnostics"]);
 const ATTEMPTS = 60;
 
-/** @param {any} graph @param {any[]} denials @param {{services: boolean, quiet: boolean, denied: boolean}} wanted @returns {Model} */
-export function modelOf(graph, denials, wanted) {
+/**
+ * @param {any} graph @param {any[]} denials @param {{services: boolean, quiet: boolean, denied: boolean}} wanted
+ * @param {(address: string) => string} [shown] the text of a host @returns {Model}
+ */
+export function modelOf(graph, denials, wanted, shown = (address) => address) {
   /** @type {Model} */
   const model = { items: new Map(), lines: new Map() };
-  for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: node.host, host: node.host, lost: node.state === "lost", row: node });
+  for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: shown(node.host), host: node.host, lost: node.state === "lost", row: node });
   for (const topic of graph.topics) if (!(wanted.quiet && QUIET.has(topic.name))) topicOf(model, topic);
   if (wanted.services) for (const service of graph.services) if (!(wanted.quiet && /\/(get_loggers|set_logger_level)$/.test(service.name))) serviceOf(model, service);
-  if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt);
+  if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt, shown);
   return model;
 }
 
@@ -81,7 +84,7 @@ function serviceOf(/** @type {Model} */ model, /** @type {any} */ service) {
   for (const one of service.connections) flow(model, `n${one.to}`, key, service.mediated, service.messages_per_second);
 }
 
-function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt) {
+function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt, /** @type {(address: string) => string} */ shown) {
   const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
   const owner = known && known.host !== undefined && known.host !== host ? known.host : null;
@@ -91,7 +94,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   // If the host now has the resource, the denial was brief (a late call) and not an attempt to show.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   const times = attempt.records.reduce((sum, one) => sum + (one.equality?.times ?? 1), 0);
-  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, times });
+  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, times }, shown);
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
@@ -103,15 +106,15 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
 }
 
 /** Add a denied host, or one more of its attempts. */
-function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, times: number}} */ { host, caller, owner, times }) {
+function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, times: number}} */ { host, caller, owner, times }, /** @type {(address: string) => string} */ shown) {
   const before = model.items.get(key);
   const denied = (before?.denied ?? 0) + times;
   if (owner === null) {
-    put(model, { key, kind: "party", name: caller || "no name", sub: `${host} · ${counted(denied, "denial")}`, brief: counted(denied, "denial"), host, caller, denied });
+    put(model, { key, kind: "party", name: caller || "no name", sub: `${shown(host)} · ${counted(denied, "denial")}`, brief: counted(denied, "denial"), host, caller, denied });
     return;
   }
   const owners = [...new Set([...(before?.owners ?? []), owner])];
-  put(model, { key, kind: "party", name: host || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, brief: "uses others' names", host, denied, owners });
+  put(model, { key, kind: "party", name: shown(host) || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, brief: "uses others' names", host, denied, owners });
 }
 
 function put(/** @type {Model} */ model, /** @type {Item} */ item) {

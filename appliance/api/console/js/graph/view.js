@@ -5,6 +5,7 @@ import { live } from "../live.js";
 import { notable } from "../notable.js";
 import { counted } from "../numbers.js";
 import { Check } from "../parts/field.js";
+import { useShown } from "../parts/host.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
 import { useStore } from "../store.js";
 import { afresh, arrange, loadLayout } from "./arrange.js";
@@ -34,11 +35,12 @@ export function GraphView() {
   useEffect(() => {
     loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
   }, []);
+  const shownHost = useShown();
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
-  const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
+  const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted, shownHost), search) : null), [graph, recent, wanted, search, shownHost]);
   const ready = model !== null && layout.loaded && denials !== null;
-  const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MOST) : null), [model, opened, by, ready]);
-  const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST) : shown), [shown]);
+  const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MOST, shownHost) : null), [model, opened, by, ready]);
+  const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST, shownHost) : shown), [shown]);
   const { spots, arranged, frame } = useSpots(shown, closed, round, `${search}|${JSON.stringify(wanted)}|${by}`, FRAME());
   const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}

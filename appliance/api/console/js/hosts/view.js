@@ -7,6 +7,7 @@ import { bytes, counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
 import { done, failed } from "../parts/toast.js";
@@ -72,7 +73,7 @@ function HostTable(/** @type {{hosts: any[], open: (what: any) => void}} */ { ho
 }
 
 function MachineTable(/** @type {{machines: any[]}} */ { machines }) {
-  return html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td class="first"><${Given} value=${one.address} mono /></td><td class="number" data-label="Nodes">${one.nodes}</td><td data-label="Ports"><${Ports} ports=${one.ports} /></td><td><div class="row row-end"><${Block} small host=${one.address}>Block…</${Block}></div></td></tr>`)}</tbody></table></div>`;
+  return html`<div class="table-wrap"><table class="table stacked"><thead><tr><th>Machine</th><th class="number">Nodes</th><th>Ports of its nodes</th><th><span class="sr-only">Actions</span></th></tr></thead><tbody>${machines.map((one) => html`<tr key=${one.address}><td class="first"><${Host} value=${one.address} /></td><td class="number" data-label="Nodes">${one.nodes}</td><td data-label="Ports"><${Ports} ports=${one.ports} /></td><td><div class="row row-end"><${Block} small host=${one.address}>Block…</${Block}></div></td></tr>`)}</tbody></table></div>`;
 }
 
 /** The last check's result: whether other machines can reach the ports of the host's nodes. */

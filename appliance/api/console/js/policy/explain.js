@@ -35,7 +35,7 @@ export function Explain({ query, pick }) {
     explain();
   };
   return html`<div class="panel-body stack"><form class="stack" onSubmit=${submit}>
-      <div class="form-grid"><${Field} label="Host" mono value=${question.host} set=${set("host")} hint="an address, or robot" required />
+      <div class="form-grid"><${Field} label="Host" mono value=${question.host} set=${set("host")} hint="an address, or the name of a host" required />
         <${Field} label="Node" mono value=${question.node} set=${set("node")} placeholder="/joystick" hint="the name it gives" /></div>
       <div class="form-grid"><${Field} label="Wants to" value=${question.category} set=${set("category")} options=${CATEGORIES} />
         <${Field} label="What" mono value=${question.resource} set=${set("resource")} placeholder="/cmd_vel" required /></div>

@@ -5,6 +5,7 @@ import { clock, lasting, Moment } from "../moments.js";
 import { bytes, counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading, Notice } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
@@ -93,7 +94,7 @@ function Events(/** @type {any} */ { line, chosen, pick, row }) {
 function Event(/** @type {{event: any}} */ { event }) {
   return html`<section class="panel" aria-labelledby="chosen"><div class="panel-head"><h2 id="chosen"><${Given} value=${event.event} /></h2><${Badge} word=${event.decision ?? event.severity} /><span class="end"><${Link} class="button small" to=${`/console/audit/${event.record}`}>Audit record</${Link}></span></div>
     <div class="panel-body stack-tight"><p class="record-reason"><${Given} value=${event.reason} most=${600} none="no reason given" /></p>
-    <dl class="facts"><dt>Node</dt><dd><${Given} value=${event.caller_id} mono most=${200} /></dd><dt>Host</dt><dd><${Given} value=${event.host} mono /></dd><dt>About</dt><dd><${Given} value=${event.resource} mono most=${200} /></dd><dt>When</dt><dd><${Moment} at=${iso(event.time)} /></dd></dl></div></section>`;
+    <dl class="facts"><dt>Node</dt><dd><${Given} value=${event.caller_id} mono most=${200} /></dd><dt>Host</dt><dd><${Host} value=${event.host} /></dd><dt>About</dt><dd><${Given} value=${event.resource} mono most=${200} /></dd><dt>When</dt><dd><${Moment} at=${iso(event.time)} /></dd></dl></div></section>`;
 }
 
 /** The keys j and k move through the events, starting at the selected time. */

@@ -10,7 +10,7 @@ import { Icon } from "../parts/icon.js";
 import { done, failed } from "../parts/toast.js";
 import { ask, get, queryText } from "../rest.js";
 import { Link } from "../router.js";
-import { may } from "../session.js";
+import { fileName, may } from "../session.js";
 import { iso } from "./times.js";
 
 /** @param {{row: any, small?: boolean}} given `row`: as `/v1/recordings` has it */
@@ -19,9 +19,9 @@ export function Taking({ row, small = false }) {
   const icon = !small && html`<${Icon} name="down" size=${16} />`;
   const reads = may("investigator");
   const evidence = reads ? `${path}/evidence` : `/v1/evidence${queryText({ since: iso(row.began), until: iso(row.ended) })}`;
-  return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; the audit log records the download" onClick=${() => take(`${path}/bag`, `rosrv-${row.id}.bag`)}>${icon}Bag</${Button}>
-    <${Button} small=${small} role="investigator" title="For Foxglove; the audit log records the download" onClick=${() => take(`${path}/bag?format=mcap`, `rosrv-${row.id}.mcap`)}>${icon}MCAP</${Button}>
-    <${Button} small=${small} role=${reads ? "investigator" : "operator"} aria-keyshortcuts=${small ? undefined : "e"} title=${`Everything in its period, with the policy and specifications in force, as a signed bundle${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
+  return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; the audit log records the download" onClick=${() => take(`${path}/bag`, fileName("", `${row.id}.bag`))}>${icon}Bag</${Button}>
+    <${Button} small=${small} role="investigator" title="For Foxglove; the audit log records the download" onClick=${() => take(`${path}/bag?format=mcap`, fileName("", `${row.id}.mcap`))}>${icon}MCAP</${Button}>
+    <${Button} small=${small} role=${reads ? "investigator" : "operator"} aria-keyshortcuts=${small ? undefined : "e"} title=${`Everything in its period, with the policy and specifications in force, as a signed bundle${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, fileName("evidence", `${row.id}.zip`))}>${icon}Evidence</${Button}>`;
 }
 
 /** @param {{row: any, small?: boolean, gone: () => void}} given `gone`: what follows when it is removed */

@@ -9,6 +9,7 @@ import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
 import { Field } from "../parts/field.js";
 import { Given } from "../parts/given.js";
+import { Host } from "../parts/host.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
@@ -77,7 +78,7 @@ function Alike(/** @type {{rows: any[], again: () => void}} */ { rows, again }) 
 function Why({ why, to, count, more = 0 }) {
   const name = why.monitor || why.resource ? html`${why.monitor && html`<strong><${Given} value=${why.monitor} most=${60} /></strong>`}${why.monitor && why.resource && " on "}${why.resource && html`<${Given} value=${why.resource} most=${80} mono />`}` : html`<${Given} value=${why.text} most=${120} />`;
   return html`<div class="row"><${Badge} word=${why.what} tone=${kindOf(why.what).tone} />${to ? html`<${Link} to=${to}>${name}</${Link}>` : html`<span>${name}</span>`}
-      ${(why.caller_id || why.host) && html`<span class="muted">by <${Given} value=${why.caller_id} most=${60} mono none="no name" /> of <${Given} value=${why.host} mono none="no address" /></span>`}${count}</div>
+      ${(why.caller_id || why.host) && html`<span class="muted">by <${Given} value=${why.caller_id} most=${60} mono none="no name" /> of <${Host} value=${why.host} none="no address" /></span>`}${count}</div>
       ${(why.monitor || why.resource) && html`<div class="muted"><${Given} value=${why.text} most=${160} />${more > 0 && html` <span class="small">and ${counted(more, "more", "more")}</span>`}</div>`}`;
 }
 

@@ -6,7 +6,7 @@ import { Mark } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { get } from "../rest.js";
-import { end } from "../session.js";
+import { end, entitle } from "../session.js";
 import { useStore } from "../store.js";
 import { Pair } from "./pair.js";
 import { passive } from "./passive.js";
@@ -17,7 +17,7 @@ export function StandbyPage() {
   const { active } = useStore(passive);
   const { value, error, again } = useResource((signal) => get("/v1/standby", {}, signal), []);
   useEffect(() => {
-    document.title = "Standby · ROSRV";
+    entitle("Standby");
     const timer = setInterval(again, EVERY);
     return () => clearInterval(timer);
   }, []);
