@@ -35,11 +35,11 @@ export function Filters({ filter, record }) {
   };
   const field = (/** @type {string} */ name, /** @type {any} */ extra) => html`<${Field} label=${LABELS[/** @type {keyof typeof LABELS} */ (name)]} value=${filter[name] ?? ""} set=${set(name)} ...${extra} />`;
   const custom = filter.since && !SINCE.some(([word]) => word === filter.since) ? /** @type {[string, string][]} */ ([[filter.since, filter.since]]) : [];
-  return html`<div class="filters" role="search" aria-label="Audit log">
+  return html`<div class=${`filters${more ? " all" : ""}`} role="search" aria-label="Audit log">
     <div class="filters-few">
       <div class="filters-text"><${Icon} name="search" size=${16} /><input class="input" type="search" data-search placeholder="Search in names, reasons and details" aria-label="Text" value=${filter.text ?? ""} onInput=${(/** @type {any} */ event) => set("text")(event.target.value)} /></div>
-      <select class="input" aria-label="Decision" value=${filter.decision ?? ""} onInput=${(/** @type {any} */ event) => set("decision")(event.target.value)}>${DECISIONS.map(([word, shown]) => html`<option value=${word} selected=${word === (filter.decision ?? "")}>${shown}</option>`)}</select>
-      <select class="input" aria-label="Since" value=${filter.since ?? ""} onInput=${(/** @type {any} */ event) => set("since")(event.target.value)}>${[...SINCE, ...custom].map(([word, shown]) => html`<option value=${word} selected=${word === (filter.since ?? "")}>${shown}</option>`)}</select>
+      <select class=${`input${filter.decision ? " set" : ""}`} aria-label="Decision" value=${filter.decision ?? ""} onInput=${(/** @type {any} */ event) => set("decision")(event.target.value)}>${DECISIONS.map(([word, shown]) => html`<option value=${word} selected=${word === (filter.decision ?? "")}>${shown}</option>`)}</select>
+      <select class=${`input${filter.since ? " set" : ""}`} aria-label="Since" value=${filter.since ?? ""} onInput=${(/** @type {any} */ event) => set("since")(event.target.value)}>${[...SINCE, ...custom].map(([word, shown]) => html`<option value=${word} selected=${word === (filter.since ?? "")}>${shown}</option>`)}</select>
       <button class="button" aria-expanded=${String(more)} onClick=${() => setMore(!more)}><${Icon} name="filter" size=${16} />Filters</button>
     </div>
     ${more && html`<div class="form-grid">

@@ -31,7 +31,7 @@ export function Audit() {
   };
   useSteps(rows.flatMap((row) => (opened(row) ? row.records.map((one) => [one]) : [[shownOf(row), ...row.records]])), chosen, filter);
   useReturn(chosen);
-  return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${rows.length < records.length ? ` in ${counted(rows.length, "row")}` : ""}${cursor ? ", more below" : ""}`}</span>
+  return html`<div class="head audit-head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${rows.length < records.length ? ` in ${counted(rows.length, "row")}` : ""}${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">
         <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
         <${Verify} /><${Export} filter=${filter} /><${Evidence} filter=${filter} /></div></div>

@@ -32,7 +32,7 @@ const MOST_BANDS = 4;
 const READABLE = 0.75; // a layout of at least this zoom is not folded
 const FOLD = 1.25; // how much larger the drawing must become for a band more
 const NARROW_COLUMNS = 3; // of items without lines
-const BETWEEN = 44; // distance of the two columns in a narrow frame, for the lines
+const BETWEEN = 76; // distance of the two columns in a narrow frame, for the lines
 const TALLEST = 12; // most parts of an opened group in one column
 const LITTLE = 0.25; // fraction of new items above which the whole layout is computed again
 

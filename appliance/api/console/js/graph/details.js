@@ -75,10 +75,10 @@ function Attempt(/** @type {{records: any[]}} */ { records }) {
 
 function Refusals(/** @type {{item: any, denials: any[]}} */ { item, denials }) {
   const own = denials.filter((one) =>
-    item.kind === "party" ? one.host === item.host && (item.owners !== undefined || (one.caller_id ?? null) === (item.caller ?? null))
+    item.kind === "party" ? one.host === item.host
     : item.kind === "node" ? one.caller_id === item.name && one.host === item.host : one.resource === item.name).slice(0, 8);
   if (!own.length) return null;
-  return html`<div><h3>Recently denied</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />${item.owners && html` <span class="muted">as</span> <${Given} value=${one.caller_id} mono />`}
+  return html`<div><h3>Recently denied</h3><ul class="plain-list">${own.map((one) => html`<li key=${one.id}><${Link} to=${`/console/audit/${one.id}`}><${Moment} at=${one.time} /></${Link}> <span class="muted">${one.category}</span> <${Given} value=${item.kind === "topic" ? one.caller_id : one.resource} mono />${item.callers?.length > 1 && html` <span class="muted">as</span> <${Given} value=${one.caller_id} mono />`}
     <div class="small"><${Rule} rule=${one.rule} revision=${one.revision} /></div></li>`)}</ul></div>`;
 }
 

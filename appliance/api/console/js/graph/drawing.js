@@ -7,6 +7,7 @@ import { plain } from "../words.js";
 import { extent } from "./arrange.js";
 
 const MARGIN = 24;
+const NARROW_MARGIN = 8;
 const CLOSEST = 2.5;
 const FARTHEST = 0.27; // at this zoom a box is as high as its name, which is never drawn smaller than readable
 const NARROW_LEAST = 0.5; // a telephone shows names rather than everything
@@ -67,7 +68,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged, narrow 
     <svg role="group" aria-label="Graph of nodes and topics" onClick=${(/** @type {any} */ event) => event.target === event.currentTarget && choose(null)}>
       <defs><${Tip} id="tip-flow" /><${Tip} id="tip-mediated" /><${Tip} id="tip-denied" /><${Tip} id="tip-would" /></defs>
       <g transform=${`scale(${look.zoom}) translate(${-look.x} ${-look.y})`}>
-        ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} narrow=${narrow} />`)}
+        ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} narrow=${narrow} zoom=${look.zoom} />`)}
         ${[...items.values()].map((item) => html`<${Box} key=${item.key} item=${item} spot=${spots.get(item.key)} chosen=${chosen === item.key} faint=${near !== null && !near.has(item.key)} zoom=${look.zoom} choose=${choose} />`)}
       </g></svg>
     <div class="drawing-tools">
@@ -109,7 +110,7 @@ function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
     <title>${said}</title></g>`;
 }
 
-function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) {
+function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow, zoom }) {
   const from = spots.get(line.from);
   const to = spots.get(line.to);
   if (!from || !to) return null;
@@ -118,7 +119,7 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
   const touched = near === null || own || line.from === chosen || line.to === chosen;
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
   const shape = html`<path class=${`line ${kind}${line.kind === "flow" && line.rate > 0 ? " flowing" : ""}${touched ? "" : " faint"}${own ? " chosen" : ""}`} d=${path} marker-end=${`url(#tip-${kind})`} />`;
-  if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && (line.from !== chosen || !chosen.startsWith("t/")) && html`<text class="line-rate" x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
+  if (line.kind !== "denied") return html`<g>${shape}${touched && near !== null && line.rate > 0 && (line.from !== chosen || !chosen.startsWith("t/")) && html`<text class="line-rate" font-size=${SUB * Math.max(1, 1 / zoom)} x=${(from.x + to.x) / 2} y=${(from.y + to.y) / 2 - 5} text-anchor="middle">${rate(line.rate)}/s</text>`}</g>`;
   const times = line.denials.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + (one.equality?.times ?? 1), 0);
   const said = `denied: ${plain(line.from.replace(/^x?@?|^./, ""), 60)} to ${plain(line.to.slice(1), 60)}, ${counted(times, "time")}`;
   const pick = (/** @type {any} */ event) => {
@@ -194,11 +195,12 @@ function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { 
 }
 
 function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box, /** @type {boolean} */ narrow) {
-  const zoom = Math.min(1.15, (box.clientWidth - 2 * MARGIN) / all.w, (box.clientHeight - 2 * MARGIN) / all.h);
-  const least = narrow ? Math.min(NARROW_LEAST, (box.clientWidth - MARGIN) / all.w) : FARTHEST;
+  const margin = narrow ? NARROW_MARGIN : MARGIN;
+  const zoom = Math.min(1.15, (box.clientWidth - 2 * margin) / all.w, (box.clientHeight - 2 * margin) / all.h);
+  const least = narrow ? Math.min(NARROW_LEAST, (box.clientWidth - margin) / all.w) : FARTHEST;
   const readable = Math.max(zoom, least); // the user pans to see the rest
   const [w, h] = [box.clientWidth / readable, box.clientHeight / readable];
-  return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - MARGIN / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - MARGIN / readable };
+  return { zoom: readable, x: all.w < w ? all.x - (w - all.w) / 2 : all.x - margin / readable, y: all.h < h ? all.y - (h - all.h) / 2 : all.y - margin / readable };
 }
 
 function zoomed(/** @type {Look} */ now, /** @type {number} */ factor, /** @type {number} */ px, /** @type {number} */ py) {

@@ -2,14 +2,14 @@
  * The graph's items and lines, from `/v1/graph` and the denials of the audit log.
  *
  * A key is a letter and a name (`n/talker`, `t/chatter`, `s/set_mode`). The key of a denied caller that is not in the
- * graph is `x`, the caller's name, and its host. A host that was denied under the name of another host's node is one
- * item with the host's address, and its lines lead to those nodes. The model has no layout.
+ * graph is `x@` and its host: a denied host is one item, under however many names. If a name is that of another host's
+ * node, a line leads to this node. The model has no layout.
  */
 
 /**
  * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
- *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, brief?: string, caller?: string | null, denied?: number, owners?: string[]}} Item
- *   `brief`: in few words what `sub` is; of a denied host: the `caller` that it gave (none for a host with `owners`: the hosts whose nodes' names it used), and how often it was `denied`
+ *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, brief?: string, callers?: string[], denied?: number, owners?: string[]}} Item
+ *   `brief`: in few words what `sub` is; of a denied host: the `callers` that it gave, `owners`: the hosts whose nodes' names it used, and how often it was `denied`
  * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
  *   denials?: any[], would?: boolean}} Line
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
@@ -88,13 +88,13 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
   const owner = known && known.host !== undefined && known.host !== host ? known.host : null;
-  const from = owner !== null ? `x@${host}` : known && known.host === host ? known.key : `x${caller ?? ""}@${host}`;
+  const from = known && known.host === host ? known.key : `x@${host}`;
   const target = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
   const to = owner !== null && !model.items.has(target) && known ? known.key : target;
   // If the host now has the resource, the denial was brief (a late call) and not an attempt to show.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   const times = attempt.records.reduce((sum, one) => sum + (one.equality?.times ?? 1), 0);
-  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, times }, shown);
+  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, more: times }, shown);
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
@@ -106,15 +106,16 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
 }
 
 /** Add a denied host, or one more of its attempts. */
-function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, times: number}} */ { host, caller, owner, times }, /** @type {(address: string) => string} */ shown) {
+function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, more: number}} */ { host, caller, owner, more }, /** @type {(address: string) => string} */ shown) {
   const before = model.items.get(key);
-  const denied = (before?.denied ?? 0) + times;
-  if (owner === null) {
-    put(model, { key, kind: "party", name: caller || "no name", sub: `${shown(host)} · ${counted(denied, "denial")}`, brief: counted(denied, "denial"), host, caller, denied });
-    return;
-  }
-  const owners = [...new Set([...(before?.owners ?? []), owner])];
-  put(model, { key, kind: "party", name: shown(host) || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : owners[0]}`, brief: "uses others' names", host, denied, owners });
+  const denied = (before?.denied ?? 0) + more;
+  const callers = [...new Set([...(before?.callers ?? []), ...(caller ? [caller] : [])])];
+  const owners = [...new Set([...(before?.owners ?? []), ...(owner === null ? [] : [owner])])];
+  const times = counted(denied, "denial");
+  const item = { key, kind: /** @type {const} */ ("party"), host, callers, denied, owners: owners.length ? owners : undefined };
+  if (owners.length) put(model, { ...item, name: shown(host) || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : shown(owners[0])}`, brief: "uses others' names" });
+  else if (callers.length > 1) put(model, { ...item, name: shown(host) || "no address", sub: `${counted(callers.length, "name")} · ${times}`, brief: times });
+  else put(model, { ...item, name: callers[0] ?? "no name", sub: `${shown(host)} · ${times}`, brief: times });
 }
 
 function put(/** @type {Model} */ model, /** @type {Item} */ item) {

@@ -30,6 +30,7 @@ export function GraphView() {
   const [by, setBy] = useState(/** @type {"namespace" | "host"} */ ("namespace"));
   const [chosen, setChosen] = useState(/** @type {string | null} */ (null));
   const [form, setForm] = useState("drawing");
+  const [more, setMore] = useState(false); // in a narrow frame, the options are shown on request
   const [round, setRound] = useState(0);
   const [layout, setLayout] = useState({ loaded: false, error: /** @type {any} */ (null) });
   useEffect(() => {
@@ -43,7 +44,7 @@ export function GraphView() {
   const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST, shownHost) : shown), [shown]);
   const { spots, arranged, frame } = useSpots(shown, closed, round, `${search}|${JSON.stringify(wanted)}|${by}`, FRAME());
   const present = (graph?.nodes ?? []).filter((/** @type {any} */ one) => one.state !== "lost");
-  const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
+  const head = html`<div class="head graph-head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(present.length, "node")}${present.length < graph.nodes.length ? ` (${graph.nodes.length - present.length} lost)` : ""}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
   if (layout.error) return html`${head}<${Failure} error=${layout.error} retry=${() => location.reload()} />`;
@@ -67,13 +68,14 @@ export function GraphView() {
     <div class=${`graph-grid${item || line ? " with-details" : ""}`}>
       <section class="panel graph-panel" aria-label="Graph">
         <div class="panel-head"><input class="input graph-search" type="search" data-search placeholder="Search nodes, topics, types, hosts" aria-label="Search the graph" value=${search} onInput=${(/** @type {any} */ event) => setSearch(event.target.value)} onKeyDown=${(/** @type {any} */ event) => event.key === "Enter" && choose(found(model, search))} />
-          <${Check} label="Denied" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
+          <button class="button graph-more" aria-expanded=${String(more)} onClick=${() => setMore(!more)}>Options</button>
+          <div class=${`graph-options${more ? " open" : ""}`}><${Check} label="Denied" on=${wanted.denied} set=${(denied) => setWanted({ ...wanted, denied })} />
           <${Check} label="Services" on=${wanted.services} set=${(services) => setWanted({ ...wanted, services })} />
           <${Check} label="Without logging" on=${wanted.quiet} set=${(quiet) => setWanted({ ...wanted, quiet })} />
           <select class="input graph-fold" aria-label="Groups" value=${by} onInput=${(/** @type {any} */ event) => fold(event.target.value)}>
             <option value="namespace" selected=${by === "namespace"}>Groups by namespace</option><option value="host" selected=${by === "host"}>Groups by host</option></select>
           <span class="end">${opened.size > 0 && html`<button class="button small" onClick=${() => setOpened(new Set())}>Close groups</button>`}
-            ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Compute the layout again">Arrange</button>`}</span></div>
+            ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Compute the layout again">Arrange</button>`}</span></div></div>
         ${form === "list" ? html`<${TopicList} topics=${topics} denials=${recent} choose=${choose} chosen=${chosen} />`
           : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
           : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} narrow=${frame.narrow} /><${Legend} />`}

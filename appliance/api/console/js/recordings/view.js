@@ -65,7 +65,7 @@ export function alike(rows) {
 
 function Making(/** @type {{one: any}} */ { one }) {
   return html`<tr><td class="first why"><${Why} why=${one.trigger} /></td><td data-label="Began"><${Moment} at=${one.began / 1e9} /></td>
-    <td colspan="3" data-label="Ends">at <${Moment} at=${one.ends / 1e9} />, or later if more happens</td><td data-label="State"><${Badge} word="being made" tone="note" /></td><td></td></tr>`;
+    <td colspan="3" data-label="Lasts"><span>until <${Moment} at=${one.ends / 1e9} />, or later if more happens</span></td><td data-label="State"><${Badge} word="being made" tone="note" /></td><td></td></tr>`;
 }
 
 function Alike(/** @type {{rows: any[], again: () => void}} */ { rows, again }) {
