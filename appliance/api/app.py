@@ -1,5 +1,7 @@
 """Build the REST application: its routes, the answers to errors, and the contract (OpenAPI)."""
 
+import asyncio
+
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
@@ -23,6 +25,7 @@ from appliance.api import (
     recording_routes,
 )
 from appliance.api.contract import contract_of
+from appliance.api.contract_page import PATH, page_of
 from appliance.api.control import ControlAwayError
 from appliance.api.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.services import Services
@@ -77,7 +80,13 @@ def build_app(services: Services) -> FastAPI:
         """Return the contract of this interface (OpenAPI 3.1)."""
         return JSONResponse(app.openapi())
 
+    async def page() -> Response:
+        """Return the contract as a page."""
+        text = await asyncio.to_thread(page_of, app.openapi())
+        return Response(text, headers=console.HEADERS, media_type="text/html")
+
     app.add_api_route("/v1/openapi.json", contract, include_in_schema=False)
+    app.add_api_route(PATH, page, methods=["GET", "HEAD"], include_in_schema=False)
     return app
 
 
@@ -126,7 +135,12 @@ async def _of_http(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)  # noqa: S101  registered for it
     match error.status_code:
         case 404:
-            problem = ProblemError(404, "unknown-path", "there is no such path")
+            problem = ProblemError(
+                404,
+                "unknown-path",
+                f"there is no such path; {PATH} lists the paths",
+                headers={"Link": f'<{PATH}>; rel="service-doc"'},
+            )
         case 405:
             allowed = {"Allow": ", ".join(sorted(_methods(request)))}
             problem = ProblemError(

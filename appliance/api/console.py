@@ -35,7 +35,7 @@ _ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
 _GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
 _LEVEL = 9  # of gzip; the files are compressed once
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
-_HEADERS = {
+HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self';"
         " font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none';"
@@ -115,7 +115,7 @@ def routes(settings: Settings) -> APIRouter:
 def _answer(request: Request, found: _File) -> Response:
     packed = found.packed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
     etag = f'"{found.digest}{"-gzip" if packed else ""}"'
-    headers = {**_HEADERS, "ETag": etag, "Vary": "Accept-Encoding"}
+    headers = {**HEADERS, "ETag": etag, "Vary": "Accept-Encoding"}
     if found.lasting:
         headers["Cache-Control"] = "public, max-age=31536000, immutable"
     if request.headers.get("if-none-match") == etag:

@@ -35,7 +35,7 @@ from appliance.signing.request_signing import HEADER
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 PUBLIC = frozenset({
-    "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json",
+    "/healthz", "/readyz", "/v1/healthz", "/v1/readyz", "/v1/openapi.json", "/v1/openapi.html",
     "/v1/enrol", "/v1/revocations", "/v1/authority",
 })  # fmt: skip
 BEARER = "rosrv.bearer"  # the key of the bearer in a request's scope

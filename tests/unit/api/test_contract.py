@@ -9,6 +9,8 @@ import pytest
 from fastapi import FastAPI
 
 from appliance.api.contract import EXAMPLES, WORDS, is_described
+from appliance.api.contract_page import PATH
+from appliance.api.request_gate import PUBLIC
 from tests.support.asgi import requested
 from tests.unit.api.test_operation_routes import BY_HAND
 
@@ -184,3 +186,16 @@ def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> N
 
 def _unread(text: str) -> str:
     return re.sub(r"\??\.[a-z]\w*", "", text)
+
+
+def test_the_page_has_each_call(app: FastAPI, contract: dict[str, Any]) -> None:
+    """Without a token, people read every call of the contract, also after a path that does not exist."""
+    lost = requested(app, "GET", "/v1/nothing")
+    assert lost.status_code == 404
+    assert '</v1/openapi.html>; rel="service-doc"' in lost.headers["link"]
+    page = requested(app, "GET", "/v1/openapi.html")
+    assert "<script" not in page.text
+    assert PATH in PUBLIC
+    shown = re.findall(r"<h3><a href=\S+<code>(\w+) (\S+)</code>", page.text)
+    calls = [(method.upper(), path) for path, some in contract["paths"].items() for method in some]
+    assert sorted(shown) == sorted(calls)
