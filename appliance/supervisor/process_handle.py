@@ -25,6 +25,7 @@ from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullEr
 from appliance.channel.messages import Lifeline, LinkOpened, Message, Ping, Walled
 from appliance.network.hang_detection import ProcessActivity
 from appliance.supervisor.child_entry import LaunchPlan
+from appliance.supervisor.program_output import ProgramOutput
 
 # A start is mostly loading, and a killed process would load everything again. So a process that progresses gets more
 # time.
@@ -86,12 +87,16 @@ class ProcessHandle:
                 msgspec.json.encode(plan).decode(),
             ],
             stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE if self.is_program else None,
+            bufsize=0,
             cwd="/",
             env=_environment(plan.home),
             pass_fds=(plan.lifeline, *([plan.lender] if plan.lender is not None else [])),
             start_new_session=True,
         )
         self.pid = self._process.pid
+        if self._process.stderr is not None:
+            ProgramOutput(role, self._process.stderr, self._loop)
         self._progress = ProcessActivity(self.pid)
         try:
             self._pidfd = os.pidfd_open(self.pid)

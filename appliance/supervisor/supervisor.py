@@ -141,6 +141,7 @@ class Supervisor:
         self._reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
         self._process_died = asyncio.Event()
+        self._lacking: set[tuple[str, ...]] = set()
         self.failure: str | None = None
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
@@ -327,10 +328,10 @@ class Supervisor:
             self._violated(process, "reported its sandbox twice")
             return
         process.sandbox = sandbox
-        if sandbox.lacks:
-            log.warning(
-                "sandbox is incomplete", role=process.role, lacks=[_printable(lack) for lack in sandbox.lacks]
-            )
+        lacks = tuple(_printable(lack) for lack in sandbox.lacks)
+        if lacks and lacks not in self._lacking:  # on one kernel all processes lack the same
+            self._lacking.add(lacks)
+            log.warning("sandbox is incomplete: rosrv status", role=process.role, lacks=list(lacks))
         self._tell_processes()
 
     def _cannot_serve(self, process: ProcessHandle, reason: str, output: Sequence[str]) -> None:

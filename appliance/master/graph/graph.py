@@ -165,7 +165,7 @@ class RosGraph:
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
             DropCalls(incarnation),
-            _record("node lost", why, incarnation, severity=Severity.NOTICE),
+            _record("node lost", why, incarnation, severity=_SEVERITY_OF_LOSS[incarnation.own]),
         ]
 
     def returned(self, incarnation: Incarnation) -> Effects:
@@ -416,6 +416,9 @@ def revocation(
         rule=decision.rule,
         more={name: text for name, text in about.items() if text and call},
     )
+
+
+_SEVERITY_OF_LOSS = {False: Severity.NOTICE, True: Severity.INFO}  # rosout is lost at each start
 
 
 def _record(
