@@ -156,6 +156,7 @@ VERBS: dict[str, Verb | Group] = {
         "Push the audit log to a collector of many robots.",
         {"join": Verb("fleet_verbs:join"), "leave": Verb("fleet_verbs:leave")},
     ),
+    "certificate": Verb("certificate_verb:certificate"),
     "backup": Verb("backup:backup"),
     "restore": Verb("backup:restore"),
     "purge": Verb("backup:purge"),

@@ -145,7 +145,7 @@ class RestClient:
                 )
             why = "has expired" if "expired" in text else "is not trusted"
             return (
-                f"{self.url}: its certificate {why}: copy STATE/api/certificate.pem from its machine and give "
+                f"{self.url}: its certificate {why}: print it there (rosrv certificate) and give "
                 "it with --api-ca FILE"
             )
         if "SSL" in text:

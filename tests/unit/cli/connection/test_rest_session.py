@@ -53,7 +53,7 @@ CERTIFICATES = {"right": {}, "other": {}, "elsewhere": {"address": "10.9.9.9"}, 
 @pytest.mark.parametrize(
     ("served", "trusted", "said"),
     [
-        ("right", None, "is not trusted: copy STATE/api/certificate.pem"),
+        ("right", None, "is not trusted: print it there (rosrv certificate)"),
         ("right", "other", "is not trusted"),
         ("elsewhere", "elsewhere", "is not for this name or address"),
         ("old", "old", "has expired"),
