@@ -25,7 +25,7 @@ RUN python3 -m venv /opt/rosrv \
  && /opt/rosrv/bin/pip uninstall --quiet --yes pip setuptools \
  # Of the packages' programs and tests nothing is needed; what debuggers want of their libraries neither.
  && find /opt/rosrv/bin -mindepth 1 ! -name 'python*' -delete \
- && find /opt/rosrv/lib -type d -name tests -prune -exec rm -rf {} + \
+ && find /opt/rosrv/lib -type d \( -name tests -o -name test_data \) -prune -exec rm -rf {} + \
  && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} + \
  && find /opt/rosrv/lib -name direct_url.json -delete
 # The relay's compiled module, with the locked Cython, which stays here.

@@ -102,8 +102,15 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     settings = root / "etc/rosrv"
     settings.mkdir(parents=True)
     shutil.copyfile(HERE / "appliance.yaml", settings / "appliance.yaml")
-    for folder in ("policies", "monitors", "ipsec"):
-        _copy(ROOT / folder, settings / folder)
+    # The monitors and policies of the LandShark and of compose.yaml are examples, in usr/share/rosrv.
+    (settings / "monitors").mkdir()
+    (settings / "policies").mkdir()
+    for name in ("default.ini", "default.ini.tests.yaml"):
+        shutil.copy(ROOT / "policies" / name, settings / "policies")
+    _copy(ROOT / "ipsec", settings / "ipsec")
+    dropin = root / "usr/lib/systemd/system/strongswan.service.d"
+    dropin.mkdir(parents=True)
+    shutil.copyfile(HERE / "strongswan.service.conf", dropin / "rosrv.conf")
     date = formatdate(moment)
     write_pages(root / "usr/share/man/man1", " ".join(date.split()[1:4]))
     _documentation(root / "usr/share/doc/rosrv")
@@ -129,6 +136,9 @@ def _documentation(target: Path) -> None:
     _copy(ROOT / "docs", target)
     for name in ("README.md", "SECURITY.md"):
         shutil.copyfile(ROOT / name, target / name)
+    (target / "examples").mkdir()
+    for name in ("monitors", "policies"):
+        (target / "examples" / name).symlink_to(f"../../../rosrv/{name}")
 
 
 def _copy(folder: Path, target: Path, *without: str) -> None:

@@ -117,10 +117,13 @@ def _install_iptables(tree: Path, version: str, architecture: Architecture, lock
     )
 
 
+_TESTS = ("tests", "test_data")
+
+
 def _leave_out(tree: Path) -> None:
-    """Remove programs and tests of the packages."""
+    """Remove programs, tests and data of tests of the packages."""
     shutil.rmtree(tree / "bin", ignore_errors=True)
-    for tests in [path for path in tree.rglob("tests") if path.is_dir()]:
+    for tests in [path for path in tree.rglob("*") if path.name in _TESTS and path.is_dir()]:
         shutil.rmtree(tests, ignore_errors=True)
     for name in (".lock", ".gitignore"):
         (tree / name).unlink(missing_ok=True)

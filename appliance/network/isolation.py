@@ -221,7 +221,8 @@ class Isolation:
         if used:
             raise NetworkError(
                 f"a program of the host uses UDP {', '.join(map(str, sorted(used)))}, needed by the appliance's"
-                " tunnels: stop it (a strongSwan of the host?), or run the appliance in a container"
+                " tunnels: stop it (strongSwan's own service: systemctl mask --now strongswan), or run the appliance"
+                " in a container"
             )
         self._install(rules)
 
