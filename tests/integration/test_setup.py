@@ -55,6 +55,17 @@ def test_another_failure_of_apt_ends_it(tmp_path: Path) -> None:
     assert (tmp_path / "calls").read_text().splitlines() == ["update -qq"]
 
 
+def test_it_does_not_begin_without_space(tmp_path: Path) -> None:
+    """A full folder of temporary files is reported before anything is fetched, with the variable that changes it."""
+    (tmp_path / "df").write_text("#!/bin/sh\necho Avail; echo ' 12'\n")
+    (tmp_path / "df").chmod(0o755)
+    done = run_setup(tmp_path, busy=0, said="")
+    assert done.returncode == 1
+    assert "has 12 MB free" in done.stderr
+    assert "TMPDIR=/var/tmp" in done.stderr
+    assert not (tmp_path / "calls").exists()
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """Return a checkout whose environment has fake programs; `calls` lists how uv was called."""

@@ -17,7 +17,7 @@ from appliance.cli.selftest.selftest_findings import SelftestFinding, fail, ok, 
 from appliance.configuration.settings import Settings
 from appliance.network import interfaces
 from appliance.network.esp import TUN, choose_esp
-from appliance.network.firewall.backend import FirewallError
+from appliance.network.firewall.backend import BackendMissingError, FirewallError
 from appliance.network.firewall.backend_check import prove
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
@@ -143,7 +143,10 @@ def _veth(namespace: Namespace) -> Iterator[SelftestFinding]:
 
 
 def _firewall(settings: Settings, namespace: Namespace) -> Iterator[SelftestFinding]:
-    refused = []
+    refused, advice = (
+        [],
+        "load nf_tables, or ip_tables with xt_owner; `isolation: none` goes without a firewall",
+    )
     for backend in (NftBackend(namespace), IptablesBackend(namespace)):
         if settings.firewall.backend not in ("auto", backend.name):
             continue
@@ -151,10 +154,11 @@ def _firewall(settings: Settings, namespace: Namespace) -> Iterator[SelftestFind
             prove(backend, namespace)
         except FirewallError as error:
             refused.append(f"{backend.name}: {error}")
+            if isinstance(error, BackendMissingError):
+                advice = f"load nf_tables, or: {error}"
         else:
             yield ok("firewall", f"{backend.name}: a test rule rejected another user and accepted this one")
             return
-    advice = "load nf_tables, or ip_tables with xt_owner; `isolation: none` goes without a firewall"
     yield fail("firewall", "; ".join(refused), advice)
 
 

@@ -386,10 +386,14 @@ def _library() -> Any:
     try:
         with warnings.catch_warnings(action="ignore"):  # its sources are for an older Python
             import iptc  # noqa: PLC0415 - loading it looks for the C libraries, which a machine may lack
+    except ModuleNotFoundError as error:
+        raise BackendMissingError(
+            "the firewall back end iptables needs Python's package python-iptables (module iptc): run scripts/setup in"
+            " a checkout, or install the wheel with its extra [iptables]"
+        ) from error
     except Exception as error:  # the library raises plain `Exception` if a C library is missing
         raise BackendMissingError(
-            f"the firewall back end iptables needs libiptc and xtables: "
-            f"sudo apt install iptables; a wheel, its extra [iptables] ({error})"
+            f"the firewall back end iptables needs libiptc and xtables: sudo apt install iptables ({error})"
         ) from error
     return iptc
 

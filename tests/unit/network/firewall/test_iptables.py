@@ -1,5 +1,10 @@
 """Tests of the iptables back end, without a kernel."""
 
+import sys
+
+import pytest
+
+from appliance.network.firewall.backend import BackendMissingError
 from appliance.network.firewall.firewall_rules import (
     Chain,
     Interface,
@@ -9,7 +14,7 @@ from appliance.network.firewall.firewall_rules import (
     RateLimit,
     inner_port,
 )
-from appliance.network.firewall.iptables import HeaderMatch, RenderedRule, render_rule
+from appliance.network.firewall.iptables import HeaderMatch, RenderedRule, _library, render_rule
 
 SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 
@@ -76,3 +81,10 @@ def test_ports_of_udp_are_matched_as_udp() -> None:
     rendered = render_rule(rule)[0]
     assert rendered.header.protocol == "udp"
     assert rendered.matches[0] == ("udp", (("dport", "500:501"),))
+
+
+def test_a_missing_module_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a checkout, `scripts/setup --run` leaves out iptc: the advice is not the Debian package, which is there."""
+    monkeypatch.setitem(sys.modules, "iptc", None)
+    with pytest.raises(BackendMissingError, match=r"iptc\): run scripts/setup in a checkout"):
+        _library()
