@@ -35,7 +35,7 @@ from appliance.recorder.bag_reader import BagReader, MessagePosition
 from appliance.recorder.bag_writer import INDEX_ENTRY
 from appliance.recorder.recording import LOG, RECORDS
 from appliance.recorder.triggers import kinds_of
-from roswire.message_view import UpstreamReader
+from roswire.message_view import PublisherReader
 
 COLUMNS, MOST_COLUMNS = 200, 1000
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 25
@@ -265,12 +265,12 @@ def messages_around(
             place = _last_until(reader, place, wanted)
         before = reader.before(place, wanted, neighbours)
         later = (found for found in reader.messages(wanted, place.time) if found[0] >= place)
-        readers: dict[int, UpstreamReader] = {}
+        readers: dict[int, PublisherReader] = {}
         messages = []
         for found, number in [*before, *islice(later, neighbours + 1)]:
             header = reader.connections[number]
             if number not in readers:
-                readers[number] = UpstreamReader(header)
+                readers[number] = PublisherReader(header)
             size, data = reader.body(found, _MOST_BYTES)
             fields, why = readers[number].read(data)
             messages.append(

@@ -69,10 +69,10 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        from roswire.message_view import UpstreamReader  # noqa: PLC0415  only for a topic that is looked into
+        from roswire.message_view import PublisherReader  # noqa: PLC0415  only for a topic that is looked into
 
-        self._made_for = UpstreamReader
-        self._reader = UpstreamReader({})
+        self._made_for = PublisherReader
+        self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
         """Return the type, the fields, and why only the first bytes are shown (empty if the message was parsed)."""

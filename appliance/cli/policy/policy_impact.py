@@ -36,9 +36,18 @@ def impact_of(
     known = known_of(robot, enrolled, PolicyContext.of(asdict(appliance.ask(PolicyWanted()).given())))
     try:
         policy = judge(read_text(file), str(file), known, read_signature(file)).accepted()
+        beside = cases_beside(file)
+        if beside.exists() and str(beside.absolute()) != known.cases_file:
+            own = replace(known, cases_file=str(beside), cases=read_text(beside), site_keys=())
+            judge(policy.text, str(file), own).accepted()
     except PolicyError as error:
         return PolicyImpact(error.findings, [])
     return PolicyImpact(list(policy.warnings), endings(policy, live_now(appliance)))
+
+
+def cases_beside(file: Path) -> Path:
+    """Return the file of the test cases of a policy."""
+    return file.with_name(file.name + ".tests.yaml")
 
 
 def _by_dry_run(appliance: Appliance, file: Path) -> PolicyImpact:

@@ -13,7 +13,7 @@ import typer
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, by_host, say_json
-from appliance.cli.policy.policy_impact import PolicyImpact, impact_of
+from appliance.cli.policy.policy_impact import PolicyImpact, cases_beside, impact_of
 from appliance.cli.policy.policy_input import (
     Enrolled,
     Robot,
@@ -49,7 +49,8 @@ OptionalFile = Annotated[
 def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: Enrolled = None) -> None:
     """List all errors and warnings with line and column. Exit status 1 if there is an error.
 
-    With --state or --api, use the running appliance's enrolled hosts, and list the live connections that would end.
+    The test cases beside the file (FILE.tests.yaml) run too, as at a reload; a failed case is an error. With --state or
+    --api, use the running appliance's enrolled hosts, and list the live connections that would end.
 
     Example: rosrv policy check policies/landshark.ini --state /var/lib/rosrv
     """
@@ -108,7 +109,7 @@ def _impact(
         except NotRunningError as error:
             typer.echo(f"rosrv policy: {error}; checked without it", err=True)
     try:
-        return PolicyImpact(list(_judge(file, robot, enrolled).policy.warnings), [])
+        return PolicyImpact(list(_judge(file, robot, enrolled, cases_beside(file)).accepted().warnings), [])
     except PolicyError as error:
         return PolicyImpact(error.findings, [])
 
@@ -241,7 +242,7 @@ def test(
 
     Example: rosrv policy test policies/landshark.ini
     """
-    beside = cases or file.with_name(file.name + ".tests.yaml")
+    beside = cases or cases_beside(file)
     results = _judge_or_exit(file, robot, enrolled, beside).results
     if not results:  # a file of cases has at least one
         read_text(beside)

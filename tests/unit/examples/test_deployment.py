@@ -6,6 +6,7 @@ from typing import Any
 import yaml
 
 from appliance.configuration.config_sources import resolve
+from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.policy_compiler import compile_policy
 
 ROOT = Path(__file__).parents[3]
@@ -55,3 +56,14 @@ def test_cloud_init_checks_the_package() -> None:
     ]
     assert order == sorted(order)
     assert f'"{"0" * 64}  /var/cache/rosrv.deb"' in steps[order[1]]
+
+
+def test_the_lines_of_the_demonstration_can_be_removed() -> None:
+    """The policy of compose.yaml passes its tests with and without the simulated robot's topics."""
+    file = ROOT / "policies/containers.ini"
+    cases = file.with_name("containers.ini.tests.yaml").read_text()
+    own = [line for line in file.read_text().splitlines() if "# demo" not in line]
+    without = "\n".join(own).replace(" tablet", "")
+    assert "landshark" not in without
+    for text in (file.read_text(), without):
+        judge(text, "containers.ini", PolicyContext(cases_file="cases", cases=cases)).accepted()
