@@ -22,7 +22,8 @@ The firewall translates one fixed address to the holder, and rejects all other t
 holder with TCP resets, also in established connections. An idle connection sends nothing that could be rejected.
 Therefore the witness sends each such local socket one segment outside its window. The socket answers with an
 acknowledgement, and the firewall rejects that with the reset that the socket accepts. Tunnels, ping, resets and
-requests to the witness pass. The rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
+requests to the witness pass. With nft, a request without the tag of its sender's key is dropped in the kernel. The
+rules are for IPv4: give the appliances no IPv6 address that the robot reaches.
 
 A robot has one witness. Its other computers, and other machines that use the fixed address, are followers: they ask the
 witness (`look`, which changes nothing) and write the same firewall rules.
@@ -31,6 +32,7 @@ witness (`look`, which changes nothing) and write the same firewall rules.
 import argparse
 import contextlib
 import fcntl
+import functools
 import hashlib
 import hmac
 import ipaddress
@@ -65,6 +67,7 @@ MARK = 0x72777431  # of the witness's own segments, which the connection tracker
 SETTINGS = "/etc/rosrv/witness.json"
 BOOT_ID = "/proc/sys/kernel/random/boot_id"
 _MAC = hashlib.sha256().digest_size
+_TAG = 4  # bytes
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,31}\Z")
 _TUNNEL_PORTS = (500, 4500)
 _FREEBIND, _SO_MARK = (
@@ -123,25 +126,33 @@ follower, `follows_as` is its name, `followers` has only itself, and the applian
 # ---- Datagrams
 
 
+@functools.lru_cache(maxsize=64)
+def tag_of(key: bytes) -> bytes:
+    """Return the first bytes of all datagrams with this key, so that most forged ones cost no authentication."""
+    return hmac.new(key, b"rosrv lease tag 1\0", hashlib.sha256).digest()[:_TAG]
+
+
 def seal(purpose: bytes, name: str, key: bytes, body: Dict[str, Any]) -> bytes:
-    """Return a datagram to or from the appliance `name`: its name, the authentication code, the body as JSON."""
+    """Return a datagram to or from the appliance `name`: tag, name, authentication code, and the body as JSON."""
     label = name.encode("ascii")
     text = json.dumps(body, sort_keys=True, separators=(",", ":")).encode("ascii")
-    head = bytes([len(label)]) + label
+    head = tag_of(key) + bytes([len(label)]) + label
     return head + hmac.new(key, purpose + head + text, hashlib.sha256).digest() + text
 
 
 def name_in(datagram: bytes) -> str:
     """Return the name of the appliance in a datagram, which is not authenticated yet; empty if it has none."""
-    if not 1 + _MAC < len(datagram) <= LONGEST:
+    if not _TAG + 1 + _MAC < len(datagram) <= LONGEST:
         return ""
-    name = datagram[1 : 1 + datagram[0]].decode("ascii", "replace")
+    name = datagram[_TAG + 1 : _TAG + 1 + datagram[_TAG]].decode("ascii", "replace")
     return name if _NAME.match(name) else ""
 
 
 def unseal(purpose: bytes, key: bytes, datagram: bytes) -> Optional[Dict[str, Any]]:
-    """Return the body of a datagram with a name, or None if its authentication code is wrong."""
-    end = 1 + datagram[0]
+    """Return the body of a datagram with a name, or None if its tag or its authentication code is wrong."""
+    if datagram[:_TAG] != tag_of(key):
+        return None
+    end = _TAG + 1 + datagram[_TAG]
     code, text = datagram[end : end + _MAC], datagram[end + _MAC :]
     expected = hmac.new(key, purpose + datagram[:end] + text, hashlib.sha256).digest()
     if not hmac.compare_digest(code, expected):
@@ -652,6 +663,12 @@ def nft_rules(settings: WitnessSettings, admitted: str) -> str:
     followers = [settings.followers[name].address for name in sorted(settings.followers)]
     addresses = ", ".join([settings.appliances[name].address for name in names] + followers)
     requests = ["udp dport %d ip saddr != { %s } drop" % (settings.listen[1], addresses)]
+    requests += [
+        "ip saddr %s udp dport %d @th,64,32 != 0x%s drop"
+        % (peer.address, settings.listen[1], tag_of(peer.key).hex())
+        for _name, peer in sorted({**settings.appliances, **settings.followers}.items())
+        if peer.key  # a follower has no keys of the appliances
+    ]
     leaving += [
         "ip daddr %s ip protocol tcp reject with tcp reset" % settings.fixed,
         "ip daddr %s drop" % settings.fixed,
