@@ -1,13 +1,18 @@
 """The pages: each is listed, their links lead to pages and headings, and generated pages are current."""
 
 import re
+from dataclasses import is_dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any, get_type_hints
 
 import pytest
+from rosrv_fleet.cli import app as fleet_app
 
 from appliance.channel.admin import OPERATIONS
+from appliance.configuration.settings import Settings
 from distribution import command_line_page, settings_page
+from rosmop.tool.command import app as rosmop_app
 from tests.support.command import commands
 from tests.support.page_steps import steps
 
@@ -20,6 +25,7 @@ WITH_LINKS = [
 _CODE = re.compile(r"```.*?```|`[^`\n]+`|^ {4,}\S.*$", re.DOTALL | re.MULTILINE)
 _CALL = re.compile(r"(?:^|[`(]|\$ |sudo |bin/|appliance |&& )rosrv ([a-z][^\n`|…]*)", re.MULTILINE)
 
+_VARIABLE = re.compile(r"\bROSRV_[A-Z]+(?:_+[A-Z]+)*")
 _ADVICE = re.compile(r"\brosrv ([a-z][a-z-]*(?: [^\n`|…\"'<;()]*)?)")
 
 
@@ -114,6 +120,69 @@ def test_options_that_the_product_names_exist() -> None:
             gone += [f"{file.name}: {call}"] if name is not None and given - options[name] else []
     assert gone == []
     assert seen > 50
+
+
+OTHERS = {
+    "--device": "docker run", "--global": "pipx", "--pip-args": "pipx",
+    "--runtime-env-agent-port": "ray",
+}  # fmt: skip
+"""Options of other programs that pages name alone."""
+
+
+def test_options_that_pages_name_alone_exist() -> None:
+    """`--option` without its command belongs to a command of the product, a program of this repository, or `OTHERS`."""
+    options = {
+        one for _, verb in commands() for each in verb.params for one in (*each.opts, *each.secondary_opts)
+    }
+    for program in (fleet_app, rosmop_app):
+        for _, command, context in command_line_page.commands(("",), program):
+            options |= {
+                one for each in command.get_params(context) for one in (*each.opts, *each.secondary_opts)
+            }
+    named = {name for page in WITH_LINKS[:-1] for name in re.findall(r"`(--[a-z][a-z-]*)", page.read_text())}
+    folders = ("appliance/standby", "benchmarks", "tests/support", "tests/world")
+    scripts = "".join(file.read_text() for one in folders for file in (ROOT / one).rglob("*.py"))
+    missing = {name for name in named - options if f'"{name}"' not in scripts}
+    assert missing == OTHERS.keys()
+
+
+def test_commands_of_the_collector_on_pages_exist() -> None:
+    """Each `rosrv-fleet` and `rosmop` command in the code of a page exists with the options that the page gives it."""
+    options = {
+        " ".join(words): {one for each in command.get_params(context) for one in (*each.opts, "--help")}
+        for name, program in (("rosrv-fleet", fleet_app), ("rosmop", rosmop_app))
+        for words, command, context in command_line_page.commands((name,), program)
+    }
+    calls = [
+        call
+        for page in WITH_LINKS[:-1]
+        for code in _CODE.findall(page.read_text())
+        for call in re.findall(r"\b((?:rosrv-fleet|rosmop) [a-z][^\n`|…]*)", code)
+    ]
+    assert [call for call in calls if not _exists(call, options)] == []
+    assert len(calls) > 50
+
+
+def test_variables_that_the_product_names_exist() -> None:
+    """Each `ROSRV_…` of pages, console, examples and compose files is a setting, or a program reads it."""
+    folders = ("appliance", "fleet", "rosmop", "scripts")
+    sources = [file for one in folders for kind in ("py", "sh") for file in (ROOT / one).rglob(f"*.{kind}")]
+    compose = [*ROOT.glob("compose*.yaml"), *(ROOT / "fleet").glob("*.y*ml")]
+    read = set(_VARIABLE.findall("".join(file.read_text() for file in (*sources, *compose))))
+    naming = [*WITH_LINKS[:-1], *compose, *(ROOT / "appliance/api/console/js").rglob("*.js")]
+    naming += (ROOT / "examples").rglob("*.y*ml")
+    named = set(_VARIABLE.findall("".join(file.read_text() for file in naming)))
+    assert {name for name in named - read if not _is_setting(name)} == set()
+    assert len(named) > 15
+
+
+def _is_setting(variable: str) -> bool:
+    section: Any = Settings
+    for part in variable.removeprefix("ROSRV_").lower().split("__"):
+        if not is_dataclass(section) or part not in get_type_hints(section):
+            return False
+        section = get_type_hints(section)[part]
+    return True
 
 
 def _exists(call: str, options: dict[str, set[str]]) -> bool:
