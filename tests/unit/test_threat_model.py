@@ -24,17 +24,19 @@ def test_a_test_that_was_removed_is_missed(tmp_path: Path) -> None:
         "def test_there(): ...\n@pytest.mark.skip('later')\ndef test_off(): ...\n"
         "@pytest.mark.xfail\nasync def test_fails(): ...\n"
     )
-    there = "`unit/test_a.py` `unit/test_a.py::test_there`"
+    (tmp_path / "unit/b.txt").write_text("# A promise\n> kept\n")
+    there = "`unit/test_a.py` `unit/test_a.py::test_there` `unit/b.txt: A promise`"
     gone = [
         "unit/test_a.py::test_gone", "unit/test_a.py::test_off", "unit/test_a.py::test_fails", "unit/test_b.py",
         "proofs/test_c.py::test_there", "unit/test_a.py::test_there[one]", "test_there",
+        "unit/b.txt: Another promise",
     ]  # fmt: skip
     assert missing(" | ".join([there, *(f"`{one}`" for one in gone)]), tmp_path) == gone
 
 
 def named(text: str) -> list[str]:
-    """Return the tests that a page names."""
-    return re.findall(r"`([^`\s]*test_[^`\s]*)`", text)
+    """Return the tests that a page names: functions, and the transcripts with a title in a file."""
+    return re.findall(r"`([^`\s]*test_[^`\s]*|[^`\s]+\.txt: [^`]+)`", text)
 
 
 def missing(text: str, tests: Path) -> list[str]:
@@ -43,6 +45,9 @@ def missing(text: str, tests: Path) -> list[str]:
 
 
 def _runs(tests: Path, path: str, name: str) -> bool:
+    path, _, title = path.partition(": ")
+    if title:
+        return f"\n# {title}\n" in f"\n{(tests / path).read_text()}"
     file = tests.parent / path if path.startswith("rosmop/") else tests / path
     if not path.endswith(".py") or not file.is_file():
         return False

@@ -184,6 +184,12 @@ def strike(robot: RobotAtWork, number: signal.Signals, *roles: str) -> None:
         os.kill(pid, number)
 
 
+@pytest.mark.parametrize("role", ["control", "relay", "rosmaster", "rosout"])
+def test_killed(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
+    strike(robot, signal.SIGKILL, role)
+    unharmed(f"{role} killed")
+
+
 @pytest.mark.parametrize("role", ["control", "relay", "rosmaster"])
 def test_killed_twice(robot: RobotAtWork, unharmed: Callable[[str], None], role: str) -> None:
     first = processes(robot)[role]
