@@ -197,6 +197,8 @@ class HiddenMaster:
         return [-1, f"parameter [{key}] is not set", 0] if was is None else [1, f"parameter {key} deleted", 0]
 
     def _search(self, caller_id: str, key: str) -> Answer:
+        if not caller_id:
+            return [0, "Internal failure: namespace must be global", 0]
         first = key.strip("/").split("/")[0]
         above = [] if key.startswith("/") else caller_id.strip("/").split("/")
         for depth in range(len(above), -1, -1):
