@@ -119,22 +119,6 @@ def test_watched_parameter(ros: RosSession) -> None:
     cpp.wait_for(event="done", do="delete")
 
 
-@pytest.mark.parametrize(
-    "value",
-    [True, -7, 2.5, "text with ünïcode & <xml>", "", [1, "two", 3.0], {"a": {"b": [True]}}, []],
-    ids=repr,
-)
-def test_parameter_values(ros: RosSession, value: object) -> None:
-    node = ros.parameters("rospy")
-    for told in ({"do": "set", "key": "/value", "value": value}, {"do": "get", "key": "/value"}):
-        node.send(json.dumps(told))
-    assert node.wait_for(event="done", do="get")["value"] == value
-    node.send(json.dumps({"do": "delete", "key": "/value"}))
-    node.wait_for(event="done", do="delete")
-    node.send(json.dumps({"do": "has", "key": "/value"}))
-    assert node.wait_for(event="done", do="has")["value"] is False
-
-
 def test_nodes_on_two_hosts(site: Site, ros: RosSession) -> None:
     elsewhere = ros.on(site.ocu)
     here, there = ros.listener("rospy", "/down"), elsewhere.listener("roscpp", "/up")

@@ -15,10 +15,14 @@ from tests.support.site import Site
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 LAUNCH = """\
 <launch>
+  <arg name="text" default="from the launch file"/>
   <param name="/launched" value="yes"/>
+  <rosparam ns="configured">{limits: {left: 1.5, right: [1, 2]}, names: [a, b]}</rosparam>
   <group ns="pair">
-    <node pkg="pair" type="talker" name="voice" args="chatter" output="screen"/>
-    <node pkg="pair" type="listener" name="ear" args="chatter" output="screen"/>
+    <node pkg="pair" type="talker" name="voice" args="chatter --text '$(arg text)'" output="screen"/>
+    <node pkg="pair" type="listener" name="$(anon ear)" args="heard" output="screen">
+      <remap from="heard" to="chatter"/>
+    </node>
   </group>
 </launch>
 """
@@ -180,15 +184,21 @@ def package_of_two_nodes(workspace: Path) -> Path:
 
 @pytest.mark.real
 def test_roslaunch(ros: RosSession, tmp_path: Path) -> None:
+    """Arguments, parameters, namespaces, remappings and anonymous names work, and both nodes end when interrupted."""
     file = package_of_two_nodes(tmp_path / "workspace")
-    launch = ros.start(["roslaunch", "--wait", str(file)], ROS_PACKAGE_PATH=str(tmp_path / "workspace"))
-    assert launch.wait_for(event="received")["publisher"] == "/pair/voice"
-    assert {"/pair/voice", "/pair/ear"} <= set(ros.run("rosnode", "list").stdout.split())
+    command = ["roslaunch", "--wait", str(file), "text:=told"]
+    launch = ros.start(command, ROS_PACKAGE_PATH=str(tmp_path / "workspace"))
+    launch.wait_for(lambda event: event.get("data", "").startswith("told "), publisher="/pair/voice")
+    nodes = ros.run("rosnode", "list").stdout.split()
+    assert [name.partition("_")[0] for name in nodes] == ["/pair/ear", "/pair/voice", "/rosout"]
     assert yaml.safe_load(ros.run("rosparam", "get", "/launched").stdout) == "yes"
+    configured = {"limits": {"left": 1.5, "right": [1, 2]}, "names": ["a", "b"]}
+    assert yaml.safe_load(ros.run("rosparam", "get", "/configured").stdout) == configured
     launch.stop(with_signal=signal.SIGINT, timeout=30)
     assert len(launch.seen(event="ended")) == 2
-    assert not {"/pair/voice", "/pair/ear"} & set(ros.run("rosnode", "list").stdout.split())
+    assert ros.run("rosnode", "list").stdout.split() == ["/rosout"]
     ros.run("rosparam", "delete", "/launched")
+    ros.run("rosparam", "delete", "/configured")
 
 
 def test_tools_run_on_another_host(site: Site, ros: RosSession) -> None:

@@ -1,15 +1,12 @@
 """Behind the appliance, robots can do more than talk and listen, as behind a plain master."""
 
 import itertools
-import signal
 import time
-from pathlib import Path
 
 import pytest
-import yaml
 
 from tests.integration.conformance.nodes import order, roscpp_node, rospy_node
-from tests.support.nodes import HERE, PYTHON, Client, RosSession, numbers, roscpp_program, without_gap
+from tests.support.nodes import Client, RosSession, numbers, without_gap
 from tests.support.processes import LIMIT, Process
 from tests.support.waiting import eventually
 
@@ -163,65 +160,3 @@ def test_wrong_type_is_not_connected(ros: RosSession) -> None:
     ear.wait_for_count(3, event="received")
     assert {event["publisher"] for event in ear.seen(event="received")} == {"/right"}
     assert wrong.running
-
-
-LAUNCH = """\
-<launch>
-  <arg name="text" default="from the launch file"/>
-  <param name="/configured/by" value="roslaunch"/>
-  <rosparam ns="configured">{{limits: {{left: 1.5, right: [1, 2]}}, names: [a, b]}}</rosparam>
-  <group ns="left">
-    <node pkg="robot" type="rospy_talker" name="voice" args="chatter --text '$(arg text)'" respawn="true"/>
-    <remap from="chatter" to="/left/chatter"/>
-    <node pkg="robot" type="roscpp_listener" name="ear" args="chatter" output="screen"/>
-  </group>
-  <node pkg="robot" type="roscpp_talker" name="voice" args="chatter --text outside"/>
-  <node pkg="robot" type="rospy_listener" name="$(anon ear)" args="heard" output="screen">
-    <remap from="heard" to="chatter"/>
-  </node>
-</launch>
-"""
-
-
-def robot_package(workspace: Path) -> Path:
-    """Make a package `robot` and return its path.
-
-    The package has talkers and listeners of both client libraries, and a launch file.
-    """
-    package = workspace / "robot"
-    package.mkdir(parents=True)
-    (package / "package.xml").write_text(
-        '<package format="2"><name>robot</name><version>1.0.0</version><description>Nodes</description>'
-        '<maintainer email="nobody@example.org">Nobody</maintainer><license>Apache-2.0</license></package>'
-    )
-    for program in ("talker", "listener"):
-        (package / f"roscpp_{program}").symlink_to(roscpp_program(program))
-        script = package / f"rospy_{program}"
-        script.write_text(f'#!/bin/sh\nexec {PYTHON} {HERE}/rospy_nodes/{program}.py "$@"\n')
-        script.chmod(0o755)
-    launch = package / "robot.launch"
-    launch.write_text(LAUNCH.replace("{{", "{").replace("}}", "}"))
-    return launch
-
-
-def test_launch_file(ros: RosSession, tmp_path: Path) -> None:
-    """roslaunch works with arguments, parameters, namespaces, remappings, anonymous names, respawn, and a clean end."""
-    file = robot_package(tmp_path / "workspace")
-    launch = ros.start(
-        ["roslaunch", "--wait", str(file), "text:=told"], ROS_PACKAGE_PATH=str(tmp_path / "workspace")
-    )
-    launch.wait_for(lambda event: event.get("data", "").startswith("told "), publisher="/left/voice")
-    launch.wait_for(lambda event: event.get("data", "").startswith("outside "), publisher="/voice")
-    assert yaml.safe_load(ros.run("rosparam", "get", "/configured").stdout) == {
-        "by": "roslaunch",
-        "limits": {"left": 1.5, "right": [1, 2]},
-        "names": ["a", "b"],
-    }
-    nodes = ros.run("rosnode", "list").stdout.split()
-    assert {"/left/voice", "/left/ear", "/voice", "/rosout"} <= set(nodes)
-    assert any(name.startswith("/ear_") for name in nodes)
-    assert "killed" in ros.run("rosnode", "kill", "/left/voice").stdout
-    launch.wait_for(publisher="/left/voice", event="received", since=launch.mark())
-    launch.stop(with_signal=signal.SIGINT, timeout=30)
-    assert ros.run("rosnode", "list").stdout.split() == ["/rosout"]
-    ros.run("rosparam", "delete", "/configured")

@@ -116,19 +116,6 @@ def test_calls(calm: Field) -> None:
     assert flood.count > 0
 
 
-def test_calls_whose_answers_are_not_read(calm: Field) -> None:
-    data = request("getParam", "/flooder", "/") * 200
-    held = [calm.connect() for _ in range(100)]
-    for one in held:
-        one.setblocking(False)
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                one.send(data)
-    assert bystander(calm) < allowed(SLOW)
-    for one in held:
-        one.close()
-
-
 def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
     silence = threading.Event()
     with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
@@ -146,17 +133,6 @@ def test_calls_of_a_node_that_never_answers(calm: Field) -> None:
         for one in held:
             one.close()
         silence.set()
-
-
-def test_values_for_a_node_that_never_answers(calm: Field) -> None:
-    silence = threading.Event()
-    with Impostor(calm.attacker, lambda _connection, _request: silence.wait(20)) as node:
-        assert calm.rogue("subscribeParam", "/hoarder", node.uri, "/hoard")[0] == 1
-        for number in range(30):  # together more than GROWTH
-            assert calm.rogue("setParam", "/setter", "/hoard", {"k": "x" * 7_000_000, "n": number})[0] == 1
-        assert bystander(calm) < allowed(SLOW)
-        silence.set()
-    assert calm.rogue("deleteParam", "/setter", "/hoard")[0] == 1
 
 
 def test_queried_names_do_not_accumulate(calm: Field) -> None:

@@ -20,9 +20,9 @@ from appliance.policy.model import Decision
 from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.rpc.xmlrpc_client import CallFailedError
-from appliance.telemetry.metrics import Meter
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import Value, build_call, parse_response
+from tests.support.control_parts import Records
 from tests.support.examples import examples
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put
@@ -53,34 +53,17 @@ write /arm/max = adm
 """
 
 
-class Records:
+class Trail(Records):
     """The trail: decisions as (call, key or resource, decision), events by name."""
 
     def __init__(self) -> None:
-        self.strict = False
-        self.obstacle: str | None = None
-        self.debt = ""
-        self.meter = Meter()
+        super().__init__()
         self.decisions: list[tuple[str, str, Decision]] = []
-        self.events: list[str] = []
-
-    def shut_out(self, _host: str) -> str:
-        return ""
-
-    def owing(self, _host: str) -> str:
-        return self.debt
-
-    async def still_owing(self, _host: str) -> str:
-        return self.debt
 
     def decided(
         self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
     ) -> str:
         self.decisions.append((method, about.get("key", resource), decision))
-        return "id"
-
-    def happened(self, event: str, _reason: str, **_more: Any) -> str:
-        self.events.append(event)
         return "id"
 
 
@@ -90,7 +73,7 @@ class Site:
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
         self.policy = compile_policy(self.policy_text, file="test.ini")
-        self.trail = Records()
+        self.trail = Trail()
         self.registry = Registry()
         self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
         self.there = mirror(copy.deepcopy(tree or {}))
@@ -307,7 +290,7 @@ async def test_the_answers_of_a_multicall_are_bounded_together() -> None:
     assert [one[0][0] for one in answers[:10]] == [1] * 10
     assert all("more than 1000000 bytes; 90 more parts" in one["faultString"] for one in answers[10:])
     assert len(site.arrived) == 10
-    assert site.trail.events == ["limit exceeded"]
+    assert [event for event, _resource in site.trail.events] == ["limit exceeded"]
     usual = await site.ask(OPERATOR, "system.multicall", [part("getParam", "/arm/speed")] * 100)
     assert [one[0][0] for one in usual] == [1] * 100
 

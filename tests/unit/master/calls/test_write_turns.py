@@ -1,4 +1,4 @@
-"""Writes of a key wait for writes of its ancestors and descendants, and for no others."""
+"""Writes of a key wait for writes of its ancestors and descendants, registering calls for calls of their name."""
 
 import asyncio
 from collections.abc import Sequence
@@ -81,3 +81,32 @@ async def test_a_cancelled_write_delays_no_other() -> None:
     await asyncio.gather(first, waiting, last, return_exceptions=True)
     assert order == ["/a in", "/a/b/c in", "/a/b/c out"]
     assert len(turns) == 0
+
+
+async def test_registering_calls_of_a_name_are_served_in_order_of_arrival() -> None:
+    """Calls of other names, even of names below it, do not wait; a failed call leaves nothing behind."""
+    names, order = KeyTurns(), list[str]()
+    first, at_once = asyncio.Event(), asyncio.Event()
+    at_once.set()
+
+    async def register(name: str, mark: str, go: asyncio.Event) -> None:
+        async with names.of_name(name) as later:
+            order.append(f"{mark} in{' later' if later else ''}")
+            await go.wait()
+            order.append(f"{mark} out")
+            if mark == "failing":
+                raise ValueError
+
+    calls = [
+        ("/a", "first", first),
+        ("/a", "failing", at_once),
+        ("/a", "last", at_once),
+        ("/a/b", "other", at_once),
+    ]
+    tasks = [asyncio.create_task(register(*call)) for call in calls]
+    await tasks[3]
+    assert order == ["first in", "other in", "other out"]
+    first.set()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert order[3:] == ["first out", "failing in later", "failing out", "last in later", "last out"]
+    assert len(names) == 0
