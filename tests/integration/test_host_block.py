@@ -10,7 +10,6 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession
 from tests.support.processes import Process
-from tests.support.waiting import eventually
 
 TABLET = "10.77.0.66"
 SOME = 15
@@ -88,28 +87,3 @@ def test_a_blocked_host_is_silent_until_it_is_unblocked(appliance: Appliance, ro
     assert "4 registrations returned" in appliance.rosrv("host", "unblock", TABLET).stdout
     robot.hears("/stranger")
     assert "/chatter" in robot.tablet.run("rostopic", "list").stdout
-
-
-def test_a_block_survives_a_crash_right_after_its_order(appliance: Appliance, robot: Robot) -> None:
-    appliance.rosrv("host", "block", TABLET)
-    appliance.kill("control")
-    assert robot.heard() == {"/friend"}
-    appliance.stop()
-    appliance.start()
-    assert robot.heard() == {"/friend"}
-    assert [row.address for row in appliance.ask(HostBlocks()).blocks] == [TABLET]
-    appliance.rosrv("host", "unblock", TABLET)
-    robot.hears("/stranger")
-
-
-def test_a_block_ends_on_time_also_while_the_appliance_is_off(appliance: Appliance, robot: Robot) -> None:
-    appliance.rosrv("host", "block", TABLET, "--for", "2s")
-    appliance.recorded("--event", "host block ended")
-    robot.hears("/stranger")
-    appliance.rosrv("host", "block", TABLET, "--for", "3s")
-    appliance.stop()
-    appliance.start()
-    eventually(lambda: not appliance.ask(HostBlocks()).blocks, "the block is over")
-    robot.hears("/stranger")
-    robot.tablet.talker("roscpp", "/chatter", name="late_stranger")
-    robot.hears("/late_stranger")

@@ -5,13 +5,12 @@ import json
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import OPEN_POLICY, Appliance
-from tests.support.nodes import PYTHON, ROOT, Client, RosSession, has_ros, numbers, without_gap
+from tests.support.nodes import Client, RosSession, has_ros, numbers, without_gap
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
 
@@ -54,11 +53,6 @@ def monitor(appliance: Appliance, name: str) -> dict[str, object]:
     lines = appliance.rosrv("monitor", "list", "--json").stdout.splitlines()
     rows: list[dict[str, object]] = [json.loads(line) for line in lines]
     return next(row for row in rows if row["name"] == name)
-
-
-def dropped_by(appliance: Appliance, name: str, count: int) -> bool:
-    """Whether a monitor has dropped exactly `count` messages."""
-    return monitor(appliance, name)["drops"] == count
 
 
 @pytest.mark.real
@@ -324,80 +318,6 @@ def test_requests_are_refused_and_responses_changed(
         assert refused["detail"]["monitor"] == f"gate_{to}"
 
 
-LANDSHARK = f"""
-import sys
-sys.path.insert(0, {str(ROOT / "examples" / "landshark" / "nodes")!r})
-import rospy
-from landshark_messages import paintball_trigger
-from report import report
-from sensor_msgs.msg import JointState
-Trigger = paintball_trigger()
-rospy.init_node(sys.argv[1])
-"""
-GUN = (
-    LANDSHARK
-    + """
-def aimed(message):
-    report("aimed", tilt=message.position[1])
-rospy.Subscriber("/landshark_control/trigger", Trigger, lambda m: report("shot"))
-rospy.Subscriber("/landshark/joint_states", JointState, aimed)
-report("ready")
-rospy.spin()
-"""
-)
-OPERATOR = (
-    LANDSHARK
-    + """
-aim = rospy.Publisher("/landshark/joint_states", JointState, queue_size=10)
-fire = rospy.Publisher("/landshark_control/trigger", Trigger, queue_size=10)
-while not (aim.get_num_connections() and fire.get_num_connections()):
-    rospy.sleep(0.05)
-report("ready")
-for line in sys.stdin:
-    if line == "fire\\n":
-        fire.publish(Trigger())
-        continue
-    for _ in range(5):
-        aim.publish(JointState(name=["pan", "turret_tilt"], position=[0.0, float(line)]))
-        rospy.sleep(0.1)
-"""
-)
-
-
-@pytest.mark.parametrize("relay", ["all", "monitored"])
-def test_the_safe_trigger_of_the_thesis_as_shipped(tmp_path: Path, relay: str) -> None:
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    options = (
-        "--monitors",
-        str(ROOT / "monitors"),
-        "--enable",
-        "safeTrigger",
-        "--api",
-        "off",
-        "--relay",
-        relay,
-    )
-    with Appliance(options=options) as appliance, RosSession(appliance.master_uri, tmp_path) as ros:
-        assert monitor(appliance, "safeTrigger")["enabled"] is True
-        assert monitor(appliance, "safeZone")["enabled"] is False
-        assert appliance.status()["relaying"] == relay
-        assert ("NO BOUNDARY" in appliance.rosrv("status", check=False).stdout) is (relay == "monitored")
-        assert ("relaying monitored: NO BOUNDARY" in appliance.story()) is (relay == "monitored")
-        gun = ros.start([PYTHON, "-c", GUN, "gun"], label="gun")
-        operator = ros.start([PYTHON, "-c", OPERATOR, "operator"], label="operator")
-        for process in (gun, operator):
-            process.wait_for(event="ready")
-        for tilt, shots, drops in ((0.2, 1, 0), (-0.6, 1, 1), (0.1, 2, 1)):
-            operator.send(str(tilt))
-            gun.wait_for(event="aimed", tilt=tilt)  # the two topics are two connections: either may be faster
-            operator.send("fire")
-            gun.wait_for_count(shots, event="shot")
-            dropping = partial(dropped_by, appliance, "safeTrigger", drops)
-            eventually(dropping, "the trigger at the robot itself is dropped")
-        dropped = appliance.recorded(event="message dropped", resource="/landshark_control/trigger")
-        assert dropped[0]["detail"]["monitor"] == "safeTrigger"
-
-
 def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
     """Test `publish_as`, `hide_publisher` and `on_fault` of appliance.yaml."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -419,21 +339,3 @@ def test_settings_of_the_monitors_publisher(tmp_path: Path) -> None:
         assert all(text.startswith("hello" if "9" in text else "checked") for text in heard)
         assert appliance.recorded(event="monitor fault")[-1]["detail"]["values"] == {"zero": 0}
         assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout
-
-
-def test_each_goal_of_an_action_is_monitored_separately(appliance: Appliance, ros: RosSession) -> None:
-    """The shipped `goals.rv` reports a repeated id; for the goals of actionlib itself there is no record."""
-    appliance.rosrv("monitor", "load", str(ROOT / "monitors" / "goals.rv"))
-    goal = "{goal_id: {id: twin}, goal: {goal: 1}}"
-    twins = ros.start(["rostopic", "pub", "-r", "5", "/count/goal", "actionlib/TestActionGoal", goal])
-    verdicts = appliance.recorded(event="monitor verdict", resource="/count/goal")
-    told = next(one for one in verdicts if "binding" in one["detail"])  # the others are sums for one second
-    assert (told["detail"]["category"], told["detail"]["binding"]) == ("twice", {"id": "twin"})
-    assert told["reason"] == "property 1 of goals (fsm) with id = twin: twice"
-    said = "another goal has the id twin, which is not answered yet"
-    assert all(one["reason"].endswith(said) for one in appliance.recorded(event="monitor log"))
-    twins.stop()
-    ros.node("rospy", "action", "server", name="counter")
-    client = ros.node("rospy", "action", "client", name="asker")
-    assert client.wait_for(event="result")["result"] == 3
-    assert all("twin" in one["reason"] for one in appliance.recorded(event="monitor verdict"))

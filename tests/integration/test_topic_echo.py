@@ -41,13 +41,6 @@ def test_echo_shows_the_subscribers_messages_and_is_recorded(
     appliance.rosrv("monitor", "remove", "censor")
 
 
-def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:
-    ros.talker("rospy", "/map", "--latch", "--count", "1", name="server")
-    ros.listener("rospy", "/map", name="reader").wait_for(event="received")  # now the relay has it
-    done = appliance.rosrv("topic", "echo", "/map", "-n", "3", "--seconds", "1", "--json", check=False)
-    assert (done.returncode, len(done.stdout.splitlines())) == (1, 1)
-
-
 def test_over_rest_it_is_for_operators(appliance: Appliance, ros: RosSession) -> None:
     """A viewer is refused; the answer names type, publishers and subscribers; limits and unknown topics are errors."""
     ros.talker("rospy", "/chatter", name="voice").wait_for(event="ready")
