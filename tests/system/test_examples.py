@@ -44,17 +44,8 @@ def tried(tree: Path, *command: str, **environment: str) -> subprocess.Completed
         exec chroot "$tree" "$@"
     """
     inside = [
-        "unshare",
-        "--mount",
-        "--propagation",
-        "private",
-        "sh",
-        "-euc",
-        script,
-        "sh",
-        str(tree),
-        str(ROOT),
-    ]
+        "unshare", "--mount", "--propagation", "private", "sh", "-euc", script, "sh", str(tree), str(ROOT),
+    ]  # fmt: skip
     return subprocess.run(
         [*inside, *command],
         capture_output=True,

@@ -47,15 +47,11 @@ class Way:
 
 
 WAYS: Final = {
-    "an open folder": Way(mode=0o755),
-    "the home of root": Way(),
-    "the home of a sudo user": Way(owner=USER),
-    "umask 077": Way(mode=0o755, umask=0o077),
-    "umask 027": Way(mode=0o755, umask=0o027),
-    "a name with spaces": Way(name="my robots/the appliance"),
-    "a symbolic link": Way(by_link=True),
+    "an open folder": Way(mode=0o755), "the home of root": Way(), "the home of a sudo user": Way(owner=USER),
+    "umask 077": Way(mode=0o755, umask=0o077), "umask 027": Way(mode=0o755, umask=0o027),
+    "a name with spaces": Way(name="my robots/the appliance"), "a symbolic link": Way(by_link=True),
     "all at once": Way(owner=USER, umask=0o077, name="my robots/the appliance", by_link=True),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -70,14 +66,9 @@ class Checkout:
 
     def run(self, *arguments: str, seconds: float = 2 * LIMIT) -> "subprocess.CompletedProcess[str]":
         return subprocess.run(
-            self.command(*arguments),
-            cwd=self.path,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=seconds,
-            check=False,
-        )
+            self.command(*arguments), cwd=self.path, env=self.environment, capture_output=True, text=True,
+            timeout=seconds, check=False,
+        )  # fmt: skip
 
     @property
     def environment(self) -> dict[str, str]:

@@ -58,13 +58,9 @@ class Cluster:
             f"--runtime-env-agent-port={AGENT}", f"--temp-dir={self.folder}",
         ]  # fmt: skip
         command = [
-            str(BIN / "ray"),
-            "start",
-            "--num-cpus=1",
-            "--object-store-memory=100000000",
-            "--disable-usage-stats",
+            str(BIN / "ray"), "start", "--num-cpus=1", "--object-store-memory=100000000", "--disable-usage-stats",
             "--node-ip-address=127.0.0.1",
-        ]
+        ]  # fmt: skip
         command += head if node == 0 else [f"--address=127.0.0.1:{PORT}"]
         done = subprocess.run(
             command, env=self.environment(node), capture_output=True, text=True, timeout=PATIENCE, check=False

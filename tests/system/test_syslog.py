@@ -181,12 +181,8 @@ def test_the_forwarder_reaches_its_receiver_only(lab: Lab, folder: Path, backend
         there.wait_for_text("listening")
         also.wait_for_text("listening")
         places = [
-            (KEEPER, 6514),
-            (KEEPER, 7777),
-            ("10.83.0.66", 7777),
-            ("127.0.0.1", 11311),
-            ("127.0.0.1", 12311),
-        ]
+            (KEEPER, 6514), (KEEPER, 7777), ("10.83.0.66", 7777), ("127.0.0.1", 11311), ("127.0.0.1", 12311),
+        ]  # fmt: skip
         seen = {place: machine.run(partial(_as_user, FORWARDER, *place)) for place in places}
         assert seen.pop((KEEPER, 6514)) == "connected"
         assert set(seen.values()) <= {"TimeoutError", "ConnectionRefusedError"}, seen

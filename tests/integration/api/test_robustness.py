@@ -94,17 +94,11 @@ def test_rest_outlives_control(appliance: Appliance) -> None:
 def test_a_flood_of_rest_does_not_affect_rvmaster(appliance: Appliance) -> None:
     rest, control = appliance.rest(), process_row(appliance, "control")
     program = (
-        "import socket, sys, time\n"
-        "end = time.monotonic() + 4\n"
-        "held = []\n"
-        "while time.monotonic() < end:\n"
-        "    try:\n"
-        "        one = socket.create_connection(('127.0.0.1', int(sys.argv[1])), 1)\n"
+        "import socket, sys, time\n" "end = time.monotonic() + 4\n" "held = []\n" "while time.monotonic() < end:\n"
+        "    try:\n" "        one = socket.create_connection(('127.0.0.1', int(sys.argv[1])), 1)\n"
         "        one.sendall(b'POST /v1/policy HTTP/1.1\\r\\nHost: ::1\\r\\nContent-Length: 9\\r\\n\\r\\n[Nodes]')\n"
-        "        held = [*held[-200:], one]\n"
-        "    except OSError:\n"
-        "        pass\n"
-    )
+        "        held = [*held[-200:], one]\n" "    except OSError:\n" "        pass\n"
+    )  # fmt: skip
     floods = [subprocess.Popen([sys.executable, "-c", program, str(rest.url.port)]) for _ in range(2)]
     try:
         times = []

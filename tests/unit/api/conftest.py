@@ -24,11 +24,7 @@ def app() -> FastAPI:
     control, journal = ControlLink(lambda _tokens: None, lambda: None), Journal(lambda _call: None)
     return build_app(
         Services(
-            Settings(),
-            control,
-            TokenAuthenticator(1, lambda _token: None),
-            journal,
-            asyncio.Event(),
+            Settings(), control, TokenAuthenticator(1, lambda _token: None), journal, asyncio.Event(),
             SampleHistory(nothing),
         )
-    )
+    )  # fmt: skip

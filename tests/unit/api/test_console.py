@@ -71,18 +71,10 @@ def test_the_headers_close_the_page(client: Client) -> None:
             part.strip().partition(" ")[::2] for part in headers["content-security-policy"].split(";")
         )
         assert policy == {
-            "default-src": "'none'",
-            "script-src": "'self'",
-            "style-src": "'self'",
-            "img-src": "'self' data:",
-            "connect-src": "'self'",
-            "font-src": "'self'",
-            "base-uri": "'none'",
-            "form-action": "'none'",
-            "frame-ancestors": "'none'",
-            "require-trusted-types-for": "'script'",
-            "trusted-types": "'none'",
-        }
+            "default-src": "'none'", "script-src": "'self'", "style-src": "'self'", "img-src": "'self' data:",
+            "connect-src": "'self'", "font-src": "'self'", "base-uri": "'none'", "form-action": "'none'",
+            "frame-ancestors": "'none'", "require-trusted-types-for": "'script'", "trusted-types": "'none'",
+        }  # fmt: skip
         assert headers["cross-origin-opener-policy"] == "same-origin"
         assert headers["x-frame-options"] == "DENY"
 
@@ -121,16 +113,10 @@ def test_the_files_of_the_page_are_cached_for_good_and_compressed(client: Client
 @pytest.mark.parametrize(
     "path",
     [
-        "../console.py",
-        "..%2Fconsole.py",
-        "%2e%2e/console.py",
-        "js/../../console.py",
-        "/etc/passwd",
-        "js",
-        "",
+        "../console.py", "..%2Fconsole.py", "%2e%2e/console.py", "js/../../console.py", "/etc/passwd", "js", "",
         "JS/main.js",
     ],
-)
+)  # fmt: skip
 def test_only_the_consoles_files_are_served(client: Client, path: str) -> None:
     assert client.get(f"/console/static/{path}").status_code == 404
 

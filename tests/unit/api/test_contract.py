@@ -19,14 +19,8 @@ CONSOLE = Path(__file__).parents[3] / "appliance" / "api" / "console" / "js"
 _UNITS = ("seconds", "days")
 _IN_NAME = (*_UNITS, "_us", "_per_second", "_seconds")
 _IN_WORDS = (
-    *_UNITS,
-    "microseconds",
-    "milliseconds",
-    "nanoseconds",
-    "RFC 3339",
-    "unit",
-    "until the certificate ends",
-)
+    *_UNITS, "microseconds", "milliseconds", "nanoseconds", "RFC 3339", "unit", "until the certificate ends",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

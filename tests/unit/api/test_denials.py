@@ -28,14 +28,8 @@ CLOSED = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\n/x = 10.0.0.1\n[Parameters]
 def known(text: str = CLOSED) -> PolicyKnown:
     unknown = dict.fromkeys(get_type_hints(PolicyKnown))
     given = {
-        "text": text,
-        "file": "p.ini",
-        "revision": 3,
-        "hosts": {},
-        "robot": [],
-        "site_keys": [],
-        "blocks": {},
-    }
+        "text": text, "file": "p.ini", "revision": 3, "hosts": {}, "robot": [], "site_keys": [], "blocks": {},
+    }  # fmt: skip
     return PolicyKnown(**(unknown | given | {"cases_file": ""}))  # type: ignore[arg-type]  # what it is judged by
 
 

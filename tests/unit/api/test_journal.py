@@ -10,14 +10,8 @@ from appliance.channel.messages.api import RestCalled
 
 def answered(journal: Journal, **changes: Any) -> None:
     fields: dict[str, Any] = {
-        "host": "h",
-        "who": "w",
-        "method": "GET",
-        "path": "/p",
-        "status": 200,
-        "reason": "",
-        "duration_us": 7,
-    }
+        "host": "h", "who": "w", "method": "GET", "path": "/p", "status": 200, "reason": "", "duration_us": 7,
+    }  # fmt: skip
     journal.answered(**fields | changes)
 
 

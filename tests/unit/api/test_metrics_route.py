@@ -210,7 +210,7 @@ def test_two_appliances_are_measured() -> None:
         "witness_trouble": 1,
         "both_active": 1,
         "takeovers_total": 4,
-    }
+    }  # fmt: skip
 
 
 def test_a_standby_has_its_own_metrics() -> None:

@@ -37,13 +37,9 @@ def _outer() -> _Outer:
 
 def test_each_time_has_its_text_beside_it() -> None:
     assert in_full(_outer()) == {
-        "since": 1_795_155_646.1,
-        "since_utc": "2026-11-20T06:20:46.100000000Z",
-        "rows": [_INNER],
-        "named": {"a": _INNER, "b": None},
-        "pair": [3, _INNER],
-        "text": "since",
-    }
+        "since": 1_795_155_646.1, "since_utc": "2026-11-20T06:20:46.100000000Z", "rows": [_INNER],
+        "named": {"a": _INNER, "b": None}, "pair": [3, _INNER], "text": "since",
+    }  # fmt: skip
 
 
 def test_the_schema_describes_the_texts() -> None:

@@ -29,12 +29,8 @@ def test_a_monitor_is_described() -> None:
     b = compiler.described(again, "b")
     (said,) = a.events
     assert (said.name, said.topic, said.type, said.part, said.every) == (
-        "said",
-        "/chatter",
-        "std_msgs/String",
-        None,
-        None,
-    )
+        "said", "/chatter", "std_msgs/String", None, None,
+    )  # fmt: skip
     tick, asked = b.events
     assert (tick.topic, tick.every) == (None, 0.5)
     assert (asked.topic, asked.type, asked.part) == ("/set", "std_srvs/SetBool", "request")

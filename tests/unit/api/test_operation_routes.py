@@ -248,15 +248,11 @@ def test_control_itself_denies_what_the_api_should_have_denied(request_type: typ
 
 REJECTIONS = (
     (RevisionChangedError(7, 8), 412, "changed-meanwhile"),
-    (MonitorsChangedError("other", "3.1"), 412, "changed-meanwhile"),
-    (UnknownThingError("none"), 404, "unknown"),
-    (SenselessError("odd"), 422, "bad-input"),
-    (TokenRefusedError("wrong"), 422, "refused"),
-    (HostForbiddenError("no"), 403, "not-for-this-role"),
-    (WithdrawnError(), 503, "busy"),
-    (StoreError("full"), 503, "not-available"),
-    (RuntimeError("a secret detail"), 503, "not-available"),
-)
+    (MonitorsChangedError("other", "3.1"), 412, "changed-meanwhile"), (UnknownThingError("none"), 404, "unknown"),
+    (SenselessError("odd"), 422, "bad-input"), (TokenRefusedError("wrong"), 422, "refused"),
+    (HostForbiddenError("no"), 403, "not-for-this-role"), (WithdrawnError(), 503, "busy"),
+    (StoreError("full"), 503, "not-available"), (RuntimeError("a secret detail"), 503, "not-available"),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("request_", REQUESTS[::9], ids=IDS[::9])

@@ -38,8 +38,7 @@ def test_a_healthy_appliance_has_none() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "kind", "severity", "about"),
     [
-        ("probe", "11312 answers", "probe", "alarm", "system"),
-        ("relay", "away", "relay", "alarm", "system"),
+        ("probe", "11312 answers", "probe", "alarm", "system"), ("relay", "away", "relay", "alarm", "system"),
         ("rosmaster", "being rebuilt", "rosmaster", "warning", "system"),
         ("audit.failed", "disk full", "audit-failed", "alarm", "audit"),
         ("relay", "1 of 2 are away", "relay", "alarm", "system"),
@@ -59,10 +58,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("recorder", {"running": False}, "recorder", "warning", "system"),
         ("standby", PAIR | {"other": {"trouble_seconds": 60.0}}, "standby-away", "warning", "system"),
         (
-            "standby",
-            PAIR | {"other": {"connected": True, "trouble_seconds": 60.0}},
-            "standby-behind",
-            "warning",
+            "standby", PAIR | {"other": {"connected": True, "trouble_seconds": 60.0}}, "standby-behind", "warning",
             "system",
         ),
         ("standby", PAIR | {"witness": {"answered_seconds": 5.0}}, "witness-silent", "warning", "system"),
@@ -97,7 +93,7 @@ def test_a_healthy_appliance_has_none() -> None:
             "system",
         ),
     ],
-)
+)  # fmt: skip
 def test_each_condition_is_an_alarm(path: str, value: object, kind: str, severity: str, about: str) -> None:
     (alarm,) = open_alarms(changed(path, value))
     assert (alarm.kind, alarm.severity, alarm.about) == (kind, severity, about)
@@ -149,11 +145,7 @@ def test_drops_and_many_denials_of_the_last_minute_are_warnings() -> None:
 
 @pytest.mark.parametrize(
     "state",
-    [
-        PAIR,
-        PAIR | {"other": {"trouble_seconds": 59.0}},
-        PAIR | {"witness": {"answered_seconds": 4.9, "holder": ""}},
-    ],
-)
+    [PAIR, PAIR | {"other": {"trouble_seconds": 59.0}}, PAIR | {"witness": {"answered_seconds": 4.9, "holder": ""}}],
+)  # fmt: skip
 def test_two_appliances_that_work_have_no_alarm(state: dict[str, Any]) -> None:
     assert open_alarms(changed("standby", state)) == []

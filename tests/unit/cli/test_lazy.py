@@ -67,13 +67,8 @@ def test_the_completion_script_is_valid_bash(tmp_path: Path) -> None:
     )
     env["_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"] = "1"
     done = subprocess.run(
-        ["bash", "--norc", "-c", script],
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        cwd=tmp_path,
+        ["bash", "--norc", "-c", script], env=env, capture_output=True, text=True, timeout=60, cwd=tmp_path,
         check=False,
-    )
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "monitor" in done.stdout.splitlines()[-1]

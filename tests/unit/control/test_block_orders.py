@@ -75,30 +75,16 @@ class Control(ControlParts):
         self.blocks = host_blocks.BlockTable(self.state, clock)
         self.remotes: dict[str, str] = {}
         self.policies = Policies(
-            state / "policy.ini",
-            self.state,
-            cast(Any, self.records),
-            robot=[ipaddress.ip_network(ROBOT)],
-            hosts=dict,
-            blocks=lambda: self.blocks.reasons,
-            live=list,
-            changed=self.changed,
-            carried_out=at_once,
+            state / "policy.ini", self.state, cast(Any, self.records), robot=[ipaddress.ip_network(ROBOT)],
+            hosts=dict, blocks=lambda: self.blocks.reasons, live=list, changed=self.changed, carried_out=at_once,
             site_keys=(),
-        )
+        )  # fmt: skip
         self.policies.start(restarted=False)
         self.current = self.policies.current
         self.orders = BlockOrders(
-            self.blocks,
-            self.policies,
-            self.state,
-            cast(Any, self.records),
-            live=self.revocation.live,
-            connected=lambda: connected,
-            enrolled=self.enrolled,
-            remotes=lambda: self.remotes,
-            carried_out=at_once,
-        )
+            self.blocks, self.policies, self.state, cast(Any, self.records), live=self.revocation.live,
+            connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes, carried_out=at_once,
+        )  # fmt: skip
 
     def keep(self, task: asyncio.Task[None]) -> None:
         self._not_ours.add(task)
@@ -233,14 +219,7 @@ async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
             await made.settle()
             assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
             assert await made.blocked() == [OTHER]
-            assert (
-                made.records.events[-2:].count(("host block ended", None)) == 1
-                or (
-                    "host block ended",
-                    None,
-                )
-                in made.records.events
-            )
+            assert ("host block ended", None) in made.records.events
 
 
 async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:
@@ -305,17 +284,11 @@ async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> Non
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("127.0.0.1", "own address"),
-        ("127.1.2.3", "own address"),
-        ("::1", "own address"),
-        ("::ffff:127.0.0.1", "own address"),
-        ("0.0.0.0", "cannot be"),
-        ("::", "cannot be"),
-        ("255.255.255.255", "cannot be"),
-        ("224.0.0.1", "cannot be"),
-        ("ff02::1", "cannot be"),
+        ("127.0.0.1", "own address"), ("127.1.2.3", "own address"), ("::1", "own address"),
+        ("::ffff:127.0.0.1", "own address"), ("0.0.0.0", "cannot be"), ("::", "cannot be"),
+        ("255.255.255.255", "cannot be"), ("224.0.0.1", "cannot be"), ("ff02::1", "cannot be"),
     ],
-)
+)  # fmt: skip
 async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str, reason: str) -> None:
     async with control(tmp_path, Clock()) as made:
         with pytest.raises(HostRefusedError, match=reason):

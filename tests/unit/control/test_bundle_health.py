@@ -25,24 +25,14 @@ _NONE = RobotHealth(0, frozenset(), frozenset())
 @pytest.mark.parametrize(
     ("denied", "why"),
     [
-        ({"10.0.0.66": 40}, ""),
-        ({"10.0.0.66": 1_000_000, "": 1_000_000}, ""),
+        ({"10.0.0.66": 40}, ""), ({"10.0.0.66": 1_000_000, "": 1_000_000}, ""),
         ({f"10.0.0.{number}": 40 for number in range(1, 255)}, ""),
         ({f"10.1.0.{number}": 40 for number in range(1, 4)}, ""),
-        ({f"10.1.0.{number}": 40 for number in range(1, 5)}, "12 denials"),
-        ({ROBOT: 10}, ""),
+        ({f"10.1.0.{number}": 40 for number in range(1, 5)}, "12 denials"), ({ROBOT: 10}, ""),
         ({ROBOT: 11}, "11 denials"),
     ],
-    ids=[
-        "guest",
-        "guest and unknown hosts",
-        "one network",
-        "three hosts",
-        "four hosts",
-        "calm robot",
-        "robot",
-    ],
-)
+    ids=["guest", "guest and unknown hosts", "one network", "three hosts", "four hosts", "calm robot", "robot"],
+)  # fmt: skip
 def test_only_the_robot_or_several_hosts_spoil_a_trial(denied: dict[str, int], why: str) -> None:
     health = _NONE._replace(denials=counted_denials(denied, _POLICY))
     assert health.worse_than(_NONE).startswith(why)

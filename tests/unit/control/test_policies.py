@@ -69,17 +69,9 @@ class Appliance:
         store = StateStore(self.state, failed=fail, kind=InlineDatabase)
         self.records = Records()
         policies = Policies(
-            self.file,
-            store,
-            cast(Any, self.records),
-            robot=(),
-            hosts=hosts,
-            blocks=blocks,
-            live=live,
-            changed=changed,
-            carried_out=at_once,
-            site_keys=site_keys,
-        )
+            self.file, store, cast(Any, self.records), robot=(), hosts=hosts, blocks=blocks, live=live,
+            changed=changed, carried_out=at_once, site_keys=site_keys,
+        )  # fmt: skip
         policies.start(restarted=restarted)
         try:
             yield policies
@@ -349,12 +341,8 @@ async def test_the_loop_does_not_wait_for_the_disk(tmp_path: Path, monkeypatch: 
         assert (await policies.reload(PolicyReload(confirm_within=1.0), "operator")).revision == 4
         await until(policies, 5)
         assert [row.revision for row in (await policies.revisions(PolicyRevisions())).revisions] == [
-            5,
-            4,
-            3,
-            2,
-            1,
-        ]
+            5, 4, 3, 2, 1,
+        ]  # fmt: skip
         assert (await policies.text(PolicyWanted(2))).text == OTHER
         assert len(asked) >= 4
         assert loop_thread not in asked

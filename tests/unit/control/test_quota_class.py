@@ -35,13 +35,8 @@ def test_recordings_are_charged_by_the_policys_names() -> None:
     )
     hosts = ("172.17.0.1", "127.0.0.1", "10.0.0.9", "10.1.2.3", "10.9.9.9", "")
     assert [charged_to(policy, host) for host in hosts] == [
-        ROBOT,
-        ROBOT,
-        "10.0.0.9",
-        "10.1.0.0/16",
-        UNKNOWN,
-        APPLIANCE,
-    ]
+        ROBOT, ROBOT, "10.0.0.9", "10.1.0.0/16", UNKNOWN, APPLIANCE,
+    ]  # fmt: skip
 
 
 def test_a_blocked_host_is_unknown() -> None:

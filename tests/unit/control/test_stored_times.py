@@ -175,16 +175,13 @@ DATES = {
     "host.revoked": "shown to people",
     "host_certificate.made": "shown to people",
     "host_certificate.next_expires": "the end of a certificate, which is a date",
-    "host_ports.checked": "shown to people",
-    "enrolment_token.created": "shown to people",
-    "enrolment_token.days": "a length",
-    "revoked_certificate.moment": "a date of the list of revoked certificates",
+    "host_ports.checked": "shown to people", "enrolment_token.created": "shown to people",
+    "enrolment_token.days": "a length", "revoked_certificate.moment": "a date of the list of revoked certificates",
     "revocation.moment": "a date of the list of revoked certificates",
-    "revocation.expires": "the end of a certificate, which is a date",
-    "host_block.since": "shown to people",
+    "revocation.expires": "the end of a certificate, which is a date", "host_block.since": "shown to people",
     "authority.signed": "a date of the list of revoked certificates",
     "appliance.expires": "the end of a certificate, which is a date",
-}
+}  # fmt: skip
 
 
 async def test_every_stored_time_is_moved_or_a_date() -> None:

@@ -90,18 +90,12 @@ def test_a_checkpoint_of_its_own_log_is_not_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("written", "forged"),
     [
-        ('"sequence":', '"sequence":1'),
-        ('"number":', '"number":1'),
-        ('"number":', '"number":99999999999999999999'),
-        ('"number":', '"number":-'),
-        ('"log":"', '"log":"x'),
-        ('"hash":"', '"hash":"0'),
-        ('"signature":"', '"signature":"00'),
-        ('"signature":"', '"signature":"x'),
-        ('"key":"', '"key":"00'),
-        ("{", "["),
+        ('"sequence":', '"sequence":1'), ('"number":', '"number":1'),
+        ('"number":', '"number":99999999999999999999'), ('"number":', '"number":-'), ('"log":"', '"log":"x'),
+        ('"hash":"', '"hash":"0'), ('"signature":"', '"signature":"00'), ('"signature":"', '"signature":"x'),
+        ('"key":"', '"key":"00'), ("{", "["),
     ],
-)
+)  # fmt: skip
 def test_a_lying_appliance_gets_no_checkpoint_named(tmp_path: Path, written: str, forged: str) -> None:
     async def story(a: Member, b: Member) -> None:
         text = (await sealed_by_b(a, b)).as_json()

@@ -33,14 +33,9 @@ def run(text: str) -> list[CaseResult]:
 
 def test_cases_pass_and_fail_with_their_place() -> None:
     results = run(
-        "cases:\n"
-        "  - host: 10.0.0.5\n"
-        "    node: /joystick\n"
-        "    allow: [publish /cmd]\n"
-        "    deny:\n"
-        "      - publish /cmd\n"
-        "      - use-node /other\n"
-    )
+        "cases:\n" "  - host: 10.0.0.5\n" "    node: /joystick\n" "    allow: [publish /cmd]\n" "    deny:\n"
+        "      - publish /cmd\n" "      - use-node /other\n"
+    )  # fmt: skip
     assert [(r.line, r.column, r.passed) for r in results] == [(4, 13, True), (6, 9, False), (7, 9, True)]
     assert str(results[1]).startswith("p.ini.tests.yaml:6:9: expected deny: 10.0.0.5 may publish /cmd")
 

@@ -148,20 +148,12 @@ def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) ->
 @pytest.mark.parametrize(
     ("key", "name", "matches"),
     [
-        ("/arm", "/arm", True),
-        ("/arm", "/arm2", False),
-        ("/arm/*", "/arm", False),
-        ("/arm/*", "/arm/x", True),
-        ("/arm/*", "/arm/x/y", False),
-        ("/arm/**", "/arm", True),
-        ("/arm/**", "/arm/x/y", True),
-        ("/arm/**", "/arm2", False),
-        ("/arm*", "/arm", True),
-        ("/arm*", "/arm2", True),
-        ("/arm*", "/arm/x", False),
+        ("/arm", "/arm", True), ("/arm", "/arm2", False), ("/arm/*", "/arm", False), ("/arm/*", "/arm/x", True),
+        ("/arm/*", "/arm/x/y", False), ("/arm/**", "/arm", True), ("/arm/**", "/arm/x/y", True),
+        ("/arm/**", "/arm2", False), ("/arm*", "/arm", True), ("/arm*", "/arm2", True), ("/arm*", "/arm/x", False),
         ("/**", "/x/y", True),
     ],
-)
+)  # fmt: skip
 def test_the_naive_decider_reads_keys_as_documented(key: str, name: str, matches: bool) -> None:
     """The naive decider agrees with the forms of keys in docs/policy.md."""
     assert key_matches(key, name) is matches

@@ -113,19 +113,14 @@ def test_a_file_beyond_the_limit_is_refused_with_the_limit() -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "x\n" * (MAXIMUM_CHARACTERS // 2),
-        "[Nodes]\n/a = " + "zz " * (MAXIMUM_CHARACTERS // 3 - 10),
-        "[Groups]\n"
-        + "".join(f"g{n} = g{n + 1}\n" for n in range(60_000))
-        + "g60000 = ::1\n[Nodes]\ndefault = g0\n",
+        "x\n" * (MAXIMUM_CHARACTERS // 2), "[Nodes]\n/a = " + "zz " * (MAXIMUM_CHARACTERS // 3 - 10), "[Groups]\n"
+        + "".join(f"g{n} = g{n + 1}\n" for n in range(60_000)) + "g60000 = ::1\n[Nodes]\ndefault = g0\n",
         "[Nodes]\n" + "".join(f"/*/a{n}* = *\n" for n in range(20_000)),
-        "[Nodes]\n" + "".join(f"/{'a/' * 400}b{n} = *\n" for n in range(2_000)),
-        "[Groups]\n"
-        + "".join(f"g{n} = 10.{n >> 8}.{n & 255}.1\n" for n in range(20_000))
-        + "[Nodes]\n/a = gg",
+        "[Nodes]\n" + "".join(f"/{'a/' * 400}b{n} = *\n" for n in range(2_000)), "[Groups]\n"
+        + "".join(f"g{n} = 10.{n >> 8}.{n & 255}.1\n" for n in range(20_000)) + "[Nodes]\n/a = gg",
     ],
     ids=["garbage", "undefined", "chain", "stars", "deep", "many groups"],
-)
+)  # fmt: skip
 def test_hostile_file_is_judged_in_bounded_time(text: str) -> None:
     start = time.process_time()
     try:

@@ -59,17 +59,8 @@ _NEAR = st.builds(
     st.integers(29, 32),
 )
 _FAR = st.sampled_from(
-    [
-        "0.0.0.0/0",
-        "0.0.0.0/1",
-        "255.255.255.254/31",
-        "::/0",
-        "::1",
-        "::/127",
-        "::ffff:10.0.0.0/125",
-        "8000::/1",
-    ]
-)
+    ["0.0.0.0/0", "0.0.0.0/1", "255.255.255.254/31", "::/0", "::1", "::/127", "::ffff:10.0.0.0/125", "8000::/1"]
+)  # fmt: skip
 _NETWORKS = _NEAR | _NEAR | _FAR
 _WORDS = _NETWORKS | _NETWORKS | st.sampled_from(["*", "robot", "host:a", "one", "two"])
 _VALUES = st.lists(_WORDS, max_size=4, unique=True).map(" ".join)
@@ -81,13 +72,9 @@ _KEYS = {
     "Parameters": ["read default", "read /t", "write /t/b"],
 }
 _ACTIONS = [
-    (Category.PUBLISH, "/t"),
-    (Category.NODE, "/n"),
-    (Category.COMMAND, "getParam"),
-    (Category.CALL, "/t"),
-    (Category.READ, "/t"),
-    (Category.WRITE, "/t"),
-]
+    (Category.PUBLISH, "/t"), (Category.NODE, "/n"), (Category.COMMAND, "getParam"), (Category.CALL, "/t"),
+    (Category.READ, "/t"), (Category.WRITE, "/t"),
+]  # fmt: skip
 
 
 @st.composite

@@ -53,19 +53,11 @@ C = "c() { event said() /third std_msgs/String '{}' { } }"
 USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
 S = "s() { int n; event said() /cmd std_msgs/String '{}' { n++; if (n > 9) { return; } } }"
 TEXTS = {
-    "s": S,
-    "s2": S.replace("9", "8"),
-    "a": A,
-    "a2": A.replace("{", "{ int n;", 1),
-    "b": B,
-    "c": C,
-    "u": USER,
-    "v": USER.replace("u()", "v()"),
-    "c-user": C.replace("{ }", "{ shared = 2; }"),
+    "s": S, "s2": S.replace("9", "8"), "a": A, "a2": A.replace("{", "{ int n;", 1), "b": B, "c": C, "u": USER,
+    "v": USER.replace("u()", "v()"), "c-user": C.replace("{ }", "{ shared = 2; }"),
     "c-and-d": USER.replace("u()", "c()") + "\nd() { event said() /x std_msgs/String '{}' { } }",
-    "c-unknown": "c() { event e() /x nobody/Knows '{}' { } }",
-    "nonsense": "nonsense",
-}
+    "c-unknown": "c() { event e() /x nobody/Knows '{}' { } }", "nonsense": "nonsense",
+}  # fmt: skip
 
 
 async def here(sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
@@ -187,18 +179,14 @@ class Taking:
 
 
 _ORDERS: dict[str, tuple[str, type[Any], dict[str, Any]]] = {
-    "load": ("load", admin.MonitorLoad, {}),
-    "try": ("attempt", admin.MonitorTry, {}),
-    "reload": ("reload", admin.MonitorReload, {}),
-    "remove": ("remove", admin.MonitorRemove, {}),
-    "rollback": ("roll_back", admin.MonitorRollback, {}),
-    "confirm": ("confirm", admin.MonitorConfirm, {}),
+    "load": ("load", admin.MonitorLoad, {}), "try": ("attempt", admin.MonitorTry, {}),
+    "reload": ("reload", admin.MonitorReload, {}), "remove": ("remove", admin.MonitorRemove, {}),
+    "rollback": ("roll_back", admin.MonitorRollback, {}), "confirm": ("confirm", admin.MonitorConfirm, {}),
     "enable": ("switch", admin.MonitorSwitch, {"enabled": True}),
     "disable": ("switch", admin.MonitorSwitch, {"enabled": False}),
     "shadow": ("shadow", admin.MonitorShadow, {"shadow": True}),
-    "promote": ("shadow", admin.MonitorShadow, {"shadow": False}),
-    "resume": ("resume", admin.MonitorResume, {}),
-}
+    "promote": ("shadow", admin.MonitorShadow, {"shadow": False}), "resume": ("resume", admin.MonitorResume, {}),
+}  # fmt: skip
 _FLAGS = {"shadow", "force", "prune", "hold"}
 
 

@@ -138,14 +138,10 @@ def test_a_move_to_another_relay_that_holds_a_topic_needs_consent() -> None:
 @pytest.mark.parametrize(
     ("text", "how"),
     [
-        (DEADMAN, {}),
-        (f"// {DEADMAN}".replace("// ", "// a comment\n"), {}),
-        (f"begin {CHANGED}", {}),
-        (CHANGED, {"live": {}}),
-        (CHANGED, {"acting": []}),
-        (CHANGED.replace("return", "stopped = true"), {}),
+        (DEADMAN, {}), (f"// {DEADMAN}".replace("// ", "// a comment\n"), {}), (f"begin {CHANGED}", {}),
+        (CHANGED, {"live": {}}), (CHANGED, {"acting": []}), (CHANGED.replace("return", "stopped = true"), {}),
         (CHANGED, {"before": DEADMAN.replace("deadman", "other")}),
     ],
-)
+)  # fmt: skip
 def test_a_change_that_holds_nothing_needs_no_consent(text: str, how: dict[str, Any]) -> None:
     assert held(text, **how) == ([], [])

@@ -50,14 +50,9 @@ class Fleet:
 
     def __init__(self, trail: AuditTrail) -> None:
         self.rollout = Rollout(
-            Allocation(2),
-            trail,
-            "drop",
-            lambda checked: dict.fromkeys(checked.monitors, True),
-            self,
-            slices=1000,
+            Allocation(2), trail, "drop", lambda checked: dict.fromkeys(checked.monitors, True), self, slices=1000,
             parts=parts_here,
-        )
+        )  # fmt: skip
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()

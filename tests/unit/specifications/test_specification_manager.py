@@ -307,13 +307,9 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
 async def test_interventions_in_shadow_mode_do_not_count_as_drops(desk: Desk) -> None:
     monitors = await desk.monitors()
     told = [
-        messages.MonitorEvent(
-            "shadow drop", "a", "k", "/chatter", 1, "a.said dropped it", {}, b"\x01", size=1
-        ),
-        messages.MonitorEvent(
-            "shadow fault", "a", "k", "/chatter", 2, "a.rv:1:2: division by zero", {"line": 1}
-        ),
-    ]
+        messages.MonitorEvent("shadow drop", "a", "k", "/chatter", 1, "a.said dropped it", {}, b"\x01", size=1),
+        messages.MonitorEvent("shadow fault", "a", "k", "/chatter", 2, "a.rv:1:2: division by zero", {"line": 1}),
+    ]  # fmt: skip
     monitors.received(messages.MonitorsReported(told, 0))
     observed = [fields for event, fields in desk.trail.heard if event == "shadow observed"]
     assert [(fields["shadow"], fields["would"]) for fields in observed] == [(True, "drop"), (True, "fault")]

@@ -118,17 +118,12 @@ def test_equal_records_are_one_row(
         LogEntry(
             number,
             AuditRecord(
-                id="0" * 20,
-                time=(86_000 + number) * 1_000_000_000,
-                event="message dropped",
-                category="monitor",
-                resource="/cmd_vel",
-                reason=f"speed 0.{number}",
-                detail={"monitor": "speedLimit"},
+                id="0" * 20, time=(86_000 + number) * 1_000_000_000, event="message dropped", category="monitor",
+                resource="/cmd_vel", reason=f"speed 0.{number}", detail={"monitor": "speedLimit"},
             ),
         )
         for number in (5, 4, 3)
-    ]
+    ]  # fmt: skip
     print_entries(entries)
     _head, row = _STYLE.sub("", capsys.readouterr().out).splitlines()
     assert " ".join(row.split()) == (

@@ -21,19 +21,12 @@ def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SS
     now = datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
     made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=10))
+        x509.CertificateBuilder() .subject_name(name) .issuer_name(name) .public_key(key.public_key())
+        .serial_number(x509.random_serial_number()) .not_valid_before(now - datetime.timedelta(days=10))
         .not_valid_after(now + datetime.timedelta(days=days))
-        .add_extension(
-            x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False
-        )
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .sign(key, hashes.SHA256())
-    )
+        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True) .sign(key, hashes.SHA256())
+    )  # fmt: skip
     path.write_bytes(made.public_bytes(serialization.Encoding.PEM))
     pair = path.with_suffix(".key")
     pair.write_bytes(

@@ -30,12 +30,8 @@ class Place:
         self.policy, self.state = home / "policy.ini", home / "state"
         self.policy.write_text(RIGHT)
         self.lines = [
-            "policy: policy.ini",
-            "state: state",
-            "listen: 127.0.0.1:0",
-            "rosmaster_port: 0",
-            "api: 127.0.0.1:0",
-        ]
+            "policy: policy.ini", "state: state", "listen: 127.0.0.1:0", "rosmaster_port: 0", "api: 127.0.0.1:0",
+        ]  # fmt: skip
 
     def run(self) -> tuple[int, dict[str, dict[str, Any]]]:
         config = self.home / "appliance.yaml"
@@ -113,17 +109,11 @@ def certificate(state: Path, days: int) -> None:
     now = datetime.datetime.now(datetime.UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
     made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=10))
-        .not_valid_after(
-            now + datetime.timedelta(days=days, hours=1) - datetime.timedelta(hours=2 * (days < 0))
-        )
+        x509.CertificateBuilder() .subject_name(name) .issuer_name(name) .public_key(key.public_key())
+        .serial_number(1) .not_valid_before(now - datetime.timedelta(days=10))
+        .not_valid_after(now + datetime.timedelta(days=days, hours=1) - datetime.timedelta(hours=2 * (days < 0)))
         .sign(key, hashes.SHA256())
-    )
+    )  # fmt: skip
     (state / "api").mkdir(parents=True, exist_ok=True)
     (state / "lock").write_text("")
     (state / "api" / "certificate.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))
