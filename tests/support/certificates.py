@@ -58,6 +58,21 @@ def make_certificates(
     return Certificates(ca, certificate, key)
 
 
+def self_signed(file: Path, address: str, begin: datetime.datetime, end: datetime.datetime) -> Path:
+    """Write a certificate for an address, which is its own authority, and beside it its key; return the key's file."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rosrv")])
+    made = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), begin, end)
+    made = made.add_extension(
+        x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), False
+    )
+    made = made.add_extension(x509.BasicConstraints(ca=True, path_length=0), True)
+    file.write_bytes(made.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM))
+    pair = file.with_suffix(".key")
+    pair.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    return pair
+
+
 def own_certificate_until(end: bytes) -> bytes:
     """Return a certificate (PEM) that is its own authority; `end` is the DER of the end of its validity, any bytes."""
     key = ed25519.Ed25519PrivateKey.generate()

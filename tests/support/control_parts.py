@@ -88,7 +88,7 @@ class Records:
         return self.owing(host)
 
     def decided(
-        self, _caller: Any, _method: str, category: str, resource: str, decision: Decision, **more: Any
+        self, _caller: Any, _method: str, category: str, resource: str, decision: Decision, /, **more: Any
     ) -> str:
         self.events.append(("allow" if decision.allowed else "deny", resource))
         if decision.would_deny:

@@ -4,14 +4,12 @@ import contextlib
 import http.client
 import json
 import os
-import stat
 from pathlib import Path
 
 import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.rest import Rest
-from tests.support.waiting import eventually
 
 
 @pytest.fixture
@@ -78,24 +76,6 @@ def test_a_flood_of_one_host_is_rate_limited(tmp_path: Path) -> None:
         refused = [one for one in answers if one.status == 429]
         assert refused
         assert int(refused[0].headers["retry-after"]) >= 1
-
-
-def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
-    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off"), json=False) as appliance:
-        process = appliance.process
-        assert process is not None
-
-        def said(text: str) -> str:
-            return next((line for line in process.errors if text in line), "")
-
-        eventually(lambda: bool(said("first access token")), "the path of the token is printed")
-        path = Path(said("first access token").rpartition(" ")[2])
-        assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        assert len(process.output().splitlines()) == 1
-        url = said("REST: ").partition(" ")[2]
-        assert said("Console: ") == f"Console: {url}/console/"
-        rest = Rest(url, path.read_text().strip())
-        assert rest.post("/v1/policy/reload", match="*").status == 200
 
 
 def test_the_first_token_is_shown_once(running: Appliance) -> None:

@@ -8,14 +8,12 @@ import sys
 import time
 import xmlrpc.client
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.support.appliance import Appliance
 from tests.support.processes import LIMIT
-from tests.support.requirements import need_root
 from tests.support.rest import Rest
 from tests.support.waiting import allowed, eventually
 
@@ -119,33 +117,6 @@ def answers(rest: Rest) -> bool:
         return rest.get("/healthz").status == 200
     except OSError:
         return False
-
-
-def test_the_api_may_only_read_the_audit_log(appliance: Appliance) -> None:
-    need_root()
-    assert appliance.rest().get("/v1/audit").status == 200
-    lines = Path(f"/proc/{appliance.pids('api')[0]}/status").read_text().splitlines()
-    fields = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
-    user, group = int(fields["Uid"].split()[0]), int(fields["Gid"].split()[0])
-    assert user not in (0, int(appliance.state.joinpath("control").stat().st_uid))
-    assert int(fields["CapEff"], 16) == 0
-
-    def may(flag: str, path: str) -> bool:
-        command = ["/usr/bin/test", flag, str(appliance.state / path)]
-        return subprocess.run(command, user=user, group=group, extra_groups=[], check=False).returncode == 0
-
-    assert may("-r", "control/audit.db")
-    for path in ("control/audit.db", "control/audit.db-wal", "control/audit.db-shm", "control"):
-        assert not may("-w", path), path
-    for path in (
-        "control",
-        "control/state.db",
-        "control/state.db-wal",
-        "signer",
-        "signer/audit.key",
-        "relay",
-    ):
-        assert not may("-r", path), path
 
 
 def test_an_api_that_cannot_serve_does_not_end_the_appliance() -> None:

@@ -93,6 +93,20 @@ def test_one_record_has_its_neighbours(world: RestWorld) -> None:
     assert statuses == [422, 404, 404, 422]
 
 
+@pytest.mark.parametrize(
+    "path", ["monitors/{}", "monitors/{}/picture", "monitors/{}/history", "audit/{}", "hosts/{}"]
+)
+@pytest.mark.parametrize(
+    "name",
+    ["..%2f..%2fetc%2fpasswd", "%00", "a" * 300, "%3Cscript%3E", "'%20OR%201=1%20--", "%ff%fe", "{}", "%0d%0aX:%20y"],
+)  # fmt: skip
+def test_an_invalid_name_in_a_path_finds_nothing(world: RestWorld, path: str, name: str) -> None:
+    answer = world.asked("GET", f"/v1/{path.format(name)}")
+    assert answer.status_code in (404, 422) or answer.json()["happened"] == []
+    assert "html" not in answer.headers["content-type"]
+    assert "x" not in answer.headers
+
+
 def test_an_export_has_one_record_a_line_oldest_first(world: RestWorld) -> None:
     answer = world.asked("GET", "/v1/audit/export?event=decision")
     assert answer.headers["content-type"].startswith("application/x-ndjson")

@@ -27,7 +27,7 @@ from appliance.control.token_orders import TokenRefusedError
 from appliance.hosts.host_table import HostForbiddenError
 from appliance.specifications.specification_manager import MonitorsChangedError
 from appliance.store.writer_thread import StoreError
-from tests.support.rest_world import ROLES, RestWorld, routes_of_api
+from tests.support.rest_world import ROLES, RestWorld, idle_application
 
 FILES = {"a.rv": "text"}
 FIELDS = {"id": "a" * 20, "revision": 3, "topic": "/scan"}
@@ -428,7 +428,7 @@ def routes() -> dict[str, set[str]]:
         f"{method} {re.sub(r':[a-z]+}', '}', str(route.path))}": {
             role for role in roles_of(route.dependant) if role
         }
-        for route in iter_route_contexts(routes_of_api())
+        for route in iter_route_contexts(idle_application().routes)
         for method in route.methods or ()
         if not is_console(str(route.path))
     }

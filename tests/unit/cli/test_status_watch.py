@@ -28,7 +28,6 @@ from tests.support.waiting import eventually
 pytestmark = pytest.mark.nightly
 
 _LIMIT_SECONDS = 60
-_ANSI = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 _SERVED = {
     "version": "1.2.3", "since": 1.0, "isolation": "container", "probe": "passed", "rosmaster": "reachable",
     "relay": "connected",
@@ -140,20 +139,6 @@ def test_a_terminated_watch_restores_the_terminal(
     assert shown.ended_by(signal.SIGTERM) == 0
     assert "\x1b[?25h" in shown.shown
     assert "1.2.3" in shown.shown.partition("\x1b[?1049l")[2]
-
-
-def test_a_narrower_terminal_is_redrawn_at_once(
-    serving: Callable[..., FakeAppliance], terminal: Callable[..., Terminal]
-) -> None:
-    serving()
-    shown = terminal(100, 30, "3600")
-    before = shown.until("audit log")
-    shown.resize(40, 20)
-    shown.until("audit log", shown.until("Ctrl-C", before))
-    shown.interrupted()
-    frames = shown.shown.partition("\x1b[?1049l")[0].split("\x1b[H")
-    longest = [max(len(line.strip("\r")) for line in _ANSI.sub("", frame).split("\n")) for frame in frames]
-    assert longest[-1] <= 40 < max(longest)
 
 
 def test_an_appliance_that_is_away_is_awaited(

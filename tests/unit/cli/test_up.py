@@ -29,12 +29,15 @@ class Full(io.StringIO):
 def test_the_first_token_is_in_its_file_before_the_line_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _announce(READY, Settings(state=tmp_path, api="off"), as_json=False)
+    _announce(READY, Settings(state=tmp_path, api="127.0.0.1:8443"), as_json=False)
     kept = tmp_path / "first-token"
     assert (kept.read_text(), stat.S_IMODE(kept.stat().st_mode)) == ("secret\n", 0o600)
     said = capsys.readouterr()
     assert said.out.count("\n") == 1
-    assert str(kept) in said.err
+    assert said.err.endswith(
+        f"Console: https://127.0.0.1:8443/console/\nREST: https://127.0.0.1:8443\n"
+        f"The first access token (admin) is in {kept}\n"
+    )
 
 
 def test_the_policys_warnings_are_printed_at_start(

@@ -13,6 +13,12 @@ from appliance.cli.audit.record_table import print_entries, print_verification
 _STYLE = re.compile(r"\x1b\[[\d;]*m")
 
 
+def show_on_terminal(monkeypatch: pytest.MonkeyPatch, columns: int = 200) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm" if columns > 80 else "dumb")
+    monkeypatch.setenv("COLUMNS", str(columns))
+
+
 @pytest.mark.parametrize(
     ("signed_through", "verdict"),
     [
@@ -36,9 +42,7 @@ def test_a_log_is_complete_only_once_something_is_signed(
 def test_a_table_of_records_has_their_numbers(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "200")
+    show_on_terminal(monkeypatch)
     print_entries([LogEntry(4711, AuditRecord(id="0" * 20, time=0, event="decision", decision="deny"))])
     head, row = _STYLE.sub("", capsys.readouterr().out).splitlines()
     assert (head.split()[0], row.split()[0]) == ("record", "4711")
@@ -47,9 +51,7 @@ def test_a_table_of_records_has_their_numbers(
 def test_a_table_of_records_has_the_author_of_a_change(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "200")
+    show_on_terminal(monkeypatch)
     authors = (
         ("policy loaded", "alice"),
         ("policy loaded", 7),
@@ -67,9 +69,7 @@ def test_a_narrow_terminal_has_the_reason_below(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At 80 columns a column of reasons would be six characters wide; lines continue beside the number."""
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "dumb")
-    monkeypatch.setenv("COLUMNS", "80")
+    show_on_terminal(monkeypatch, 80)
     denied = AuditRecord(
         id="0" * 20, time=0, event="decision", decision="deny", host="10.77.0.66", caller_id="/tablet",
         category="publish", resource="/cmd_vel", reason="10.77.0.66 is not among the hosts that may publish /cmd_vel",
@@ -83,37 +83,10 @@ def test_a_narrow_terminal_has_the_reason_below(
     ]
 
 
-@pytest.mark.parametrize(
-    ("name", "columns", "head"),
-    [
-        ("/base", 140, "record"),
-        ("/base", 130, "4711"),
-        ("/navigation/local_planner/cmd_vel", 140, "4711"),
-        ("/navigation/local_planner/cmd_vel", 190, "record"),
-    ],
-)
-def test_a_table_needs_room_for_its_reasons(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, columns: int, head: str
-) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", str(columns))
-    denied = AuditRecord(
-        id="0" * 20, time=0, event="decision", decision="deny", host="192.168.100.200", caller_id=name,
-        category="publish", resource=name, reason=f"192.168.100.200 is not among the hosts that may publish {name}",
-    )  # fmt: skip
-    print_entries([LogEntry(4711, denied)])
-    shown = _STYLE.sub("", capsys.readouterr().out)
-    assert shown.split()[0] == head
-    assert f"192.168.100.200 {name}  publish {name}" in shown
-
-
 def test_equal_records_are_one_row(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    monkeypatch.setenv("TERM", "xterm")
-    monkeypatch.setenv("COLUMNS", "200")
+    show_on_terminal(monkeypatch)
     entries = [
         LogEntry(
             number,

@@ -1,15 +1,12 @@
 """`--api` only sends to a server with a trusted certificate; `rest.txt` has the rest of `rest_session`."""
 
 import datetime
-import ipaddress
 import ssl
 from pathlib import Path
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 
+from tests.support.certificates import self_signed
 from tests.support.command import rosrv
 from tests.support.fake_appliance import TOKEN, FakeAppliance
 
@@ -17,26 +14,11 @@ pytestmark = pytest.mark.nightly
 
 
 def certificate(path: Path, address: str = "127.0.0.1", days: int = 2) -> ssl.SSLContext:
-    key = ec.generate_private_key(ec.SECP256R1())
+    """Write a self-signed certificate for an address; return the context that serves it."""
     now = datetime.datetime.now(datetime.UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
-    made = (
-        x509.CertificateBuilder() .subject_name(name) .issuer_name(name) .public_key(key.public_key())
-        .serial_number(x509.random_serial_number()) .not_valid_before(now - datetime.timedelta(days=10))
-        .not_valid_after(now + datetime.timedelta(days=days))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address(address))]), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True) .sign(key, hashes.SHA256())
-    )  # fmt: skip
-    path.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    pair = path.with_suffix(".key")
-    pair.write_bytes(
-        path.read_bytes()
-        + key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-    )
+    key = self_signed(path, address, now - datetime.timedelta(days=10), now + datetime.timedelta(days=days))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    context.load_cert_chain(pair)
+    context.load_cert_chain(path, key)
     return context
 
 

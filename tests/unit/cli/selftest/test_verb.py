@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
 from appliance.cli.selftest.selftest_findings import fail, ok, run_check
 from appliance.network.namespaces import namespaces
+from tests.support.certificates import self_signed
 from tests.support.requirements import need_root
 
 RIGHT = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\ndefault = 10.0.0.1\n[Commands]\ndefault = 10.0.0.1\n"
@@ -105,15 +103,9 @@ def test_a_crashing_check_is_a_finding() -> None:
 
 
 def certificate(state: Path, days: int) -> None:
-    key = ec.generate_private_key(ec.SECP256R1())
+    """Write a certificate for REST that ends in this number of days, and an hour."""
     now = datetime.datetime.now(datetime.UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "rosrv")])
-    made = (
-        x509.CertificateBuilder() .subject_name(name) .issuer_name(name) .public_key(key.public_key())
-        .serial_number(1) .not_valid_before(now - datetime.timedelta(days=10))
-        .not_valid_after(now + datetime.timedelta(days=days, hours=1) - datetime.timedelta(hours=2 * (days < 0)))
-        .sign(key, hashes.SHA256())
-    )  # fmt: skip
     (state / "api").mkdir(parents=True, exist_ok=True)
     (state / "lock").write_text("")
-    (state / "api" / "certificate.pem").write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    end = now + datetime.timedelta(days=days, hours=1)
+    self_signed(state / "api" / "certificate.pem", "127.0.0.1", now - datetime.timedelta(days=10), end)

@@ -61,7 +61,7 @@ class Trail(Records):
         self.decisions: list[tuple[str, str, Decision]] = []
 
     def decided(
-        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
+        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, /, **about: Any
     ) -> str:
         self.decisions.append((method, about.get("key", resource), decision))
         return "id"
