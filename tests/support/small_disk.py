@@ -23,3 +23,20 @@ def small_disk(place: Path, size: str, *options: str) -> Iterator[Path]:
         yield place
     finally:
         subprocess.run(["umount", "--lazy", place], check=True)
+
+
+@contextmanager
+def filled(place: Path) -> Iterator[None]:
+    """Leave no free space on the disk of a folder while the block runs."""
+    filler = place / "filler"
+    with filler.open("wb", buffering=0) as file:
+        part = b"x" * (1 << 20)
+        while part:
+            try:
+                part = part if file.write(part) == len(part) else part[:-1]
+            except OSError:
+                part = part[: len(part) // 2]
+    try:
+        yield
+    finally:
+        filler.unlink()

@@ -63,18 +63,26 @@ class StandbySite:
     """The site; a context manager. `a` is in sync at first."""
 
     def __init__(
-        self, lab: Lab, home: Path, *, policy: str = OPEN_POLICY, options: tuple[str, ...] = (), **more: Any
+        self,
+        lab: Lab,
+        home: Path,
+        *,
+        lease_folder: Path | None = None,
+        policy: str = OPEN_POLICY,
+        options: tuple[str, ...] = (),
+        **more: Any,
     ) -> None:
+        """Make the machines. `lease_folder`: where the witness keeps the lease (default: `home`)."""
         self.lab, self.home = lab, home
         self.robot = lab.host("robot", f"{ROBOT}/24")
-        members, settings, follower = memberships(home)
+        members, settings, follower = memberships(lease_folder or home)
         self.settings, self._follower_settings = home / "witness.json", home / "follower.json"
         for path, body in ((self.settings, settings), (self._follower_settings, follower)):
             path.write_text(json.dumps(body))
             path.chmod(0o600)
         shutil.copy(str(witness.__file__), home / "witness.py")
         (home / "boot").write_text(secrets.token_hex(8))
-        self.lease = witness.LeaseFile(str(home / "lease"), ("a", "b"))
+        self.lease = witness.LeaseFile(settings["state"], ("a", "b"))
         self.witness: Process | None = None
         self._follower: Process | None = None
         self.appliances: dict[str, Appliance] = {}
@@ -116,7 +124,7 @@ class StandbySite:
 
     def start_witness(self) -> None:
         """Start the witness; at the first start with a lease of which `a` is in sync."""
-        if not (self.home / "lease").exists():
+        if not Path(self.lease.path).exists():
             self.lease.write(LeaseRecord(1, "", ("a",), ""))
         command = ["nice", "-n", "-10", *self.command("serve")]  # as its unit does
         self.witness = Process(self.robot, command, env=dict(os.environ), label="witness")
