@@ -8,7 +8,7 @@ Invariants:
 4. When the work's budget of processor time is used up, the compiler answers with a refusal, and the process ends
    (status 0), because a thread cannot be stopped. The supervisor starts the next process on demand.
 5. The process ends in the same way when control closes the link, also while it starts or is idle: without a link
-   nobody can ask it, and the supervisor starts no other compiler while it runs.
+   it gets no questions, and the supervisor starts no other compiler while it runs.
 """
 
 import asyncio

@@ -12,7 +12,7 @@ until this appliance has served for a minute: two appliances on busy machines mu
 
 from appliance.standby.witness import EXPIRY
 
-OBSTACLE_SECONDS = EXPIRY  # a log that another process locks for a moment is no obstacle
+OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 _STEADY_SECONDS = 60.0
