@@ -4,10 +4,11 @@ An appliance that holds the lease and does not serve is worse than none: the oth
 lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready after a start.
 
 A control that stood by is ready soon after the activation; it has `START_SECONDS`, as has one that starts again. But a
-lease that comes back after a lapse meets a control that has just begun to start: the other appliance takes over sooner,
-and gets the lease, unless a monitor would hold its topics then, because only this appliance has its state.
-Each time that the lease is given away, all limits are doubled
-until this appliance has served for a minute: two appliances on busy machines must not pass the lease back and forth.
+lease that comes back after a lapse meets a control that has just begun to start. The other appliance takes over sooner,
+so it gets the lease, unless a monitor would then hold its topics, because its state would be lost.
+
+Each time that the lease is given away, all limits are doubled until this appliance has served for a minute: two
+appliances on busy machines must not pass the lease back and forth.
 """
 
 from appliance.standby.witness import EXPIRY
