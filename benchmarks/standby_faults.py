@@ -106,8 +106,8 @@ FAULTS: dict[str, tuple[Fault, float, float, bool]] = {
 """The fault, its least and most seconds, and whether the times are counted from its end."""
 
 
-def faults(kind: str, number: int, load: int, seed: int) -> None:
-    """Print a table of the faults of one kind."""
+def faults(kind: str, number: int, load: int = 0, seed: int = 1) -> int:
+    """Print a table of the faults of one kind; return the number of lost subscriptions."""
     make, least, most, after = FAULTS[kind]
     chance, pauses, lost = random.Random(seed), dict[str, list[float]](), 0
     with (
@@ -136,6 +136,7 @@ def faults(kind: str, number: int, load: int, seed: int) -> None:
             robot.lost_nothing()
     print_pauses(pauses, f"{number} times: {kind}, load {load}")
     print(f"subscriptions lost: {lost}")
+    return lost
 
 
 def _put_nodes_on(robot: StandbyRobot, arm: Host) -> None:

@@ -119,6 +119,7 @@ PAIR_MUTANTS: dict[str, tuple[Any, str, Any]] = {
     "data of an earlier active appliance is accepted": (PassiveControl, "_accepts", lambda *_given: True),
     "an appliance serves longer than its lease": (LeaseWatch, "_left", lambda _watch: 1000.0),
     "an ended lease ends nothing": (LeaseWatch, "ended", lambda _watch: None),
+    "a lapsed lease stops nothing": (LeaseWatch, "lapsed", lambda _watch: None),
     "a promise not to claim is not kept": (
         ApplianceLease, "is_active", lambda lease, now: lease.held is not None and now < lease.valid_until,
     ),
