@@ -56,7 +56,7 @@ def until_able(site: StandbySite) -> None:
 def test_a_standby_that_the_witness_does_not_answer(site: StandbySite) -> None:
     """Both appliances report it, and refuse the order to switch over; the robot notices nothing."""
     until_able(site)
-    with site.without_link(ADDRESSES["b"], ROBOT):
+    with site.without_link((ADDRESSES["b"], ROBOT)):
         for one in site.appliances.values():
             eventually(
                 lambda one=one: one.rosrv("standby", "status", check=False).returncode == 1,  # type: ignore[misc]  # as above

@@ -68,7 +68,7 @@ MUTANTS = {
         lease, " and request.sequence > self._void_sequence", "", 0, ("switchover",)
     ),
     "a switchover ends later promises": Mutant(
-        lease, "and promised.number <= number", "and True", 341, ("switchover", "bad link", "witness link")
+        lease, "and promised.number <= number", "and True", 4230, ("switchover", "bad link", "witness link")
     ),
     "a delayed request counts": Mutant(witness, ' or body["number"] <= self._last[name]', "", 668, _STALE),
 }  # fmt: skip
