@@ -27,6 +27,7 @@ def _lines(document: _Json) -> Iterator[str]:
     title = escape(f"REST of the {info['title']}, version {info['version']}")
     yield f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
     yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    yield '<link rel="icon" href="/console/static/icon.svg" type="image/svg+xml">'
     yield f'<link rel="stylesheet" href="{_STYLE}"></head><body><main><h1>{title}</h1>'
     yield f"<p>{escape(info['description'])}</p>"
     yield f'<p>For programs: <a href="/v1/openapi.json">OpenAPI 3.1</a>. Roles and conventions: {_ROLES}.</p><nav>'
@@ -75,7 +76,7 @@ def _operation(method: str, path: str, operation: _Json, document: _Json) -> Ite
             yield from _content(f"Answer {status}", response.get("content", {}), document)
     others = [
         f"<dt>{status}</dt><dd>{escape(response['description'])}</dd>"
-        for status, response in operation["responses"].items()
+        for status, response in sorted(operation["responses"].items())
         if not status.startswith("2") and status not in _GENERAL
     ]
     if others:

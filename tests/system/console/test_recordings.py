@@ -7,11 +7,11 @@ import zipfile
 from collections.abc import Callable, Iterator
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from appliance.api.contract import EXAMPLES
 from tests.support.appliance import Appliance
-from tests.system.console.reader import Reader
+from tests.system.console.reader import Reader, wait_until
 
 CONFIG = """
 api: 127.0.0.1:0
@@ -55,7 +55,7 @@ def test_an_investigator_takes_a_recording_from_its_record(
 
 def test_recordings_are_listed_by_their_trigger(opened: Callable[..., Reader]) -> None:
     """A row begins with monitor, topic and node; equal ones in a row are one, whose button shows each by keyboard."""
-    shown = copy.deepcopy(EXAMPLES["Recordings"])
+    shown = copy.deepcopy(EXAMPLES["Recordings"]) | {"in_progress": []}
     [recording] = shown["recordings"]
     trigger = recording["triggers"][0] | {"monitor": "censor", "resource": "/rude", "caller_id": "/lout"}
     trigger |= {"host": "10.0.0.9", "equal": "a b"}
@@ -76,4 +76,52 @@ def test_recordings_are_listed_by_their_trigger(opened: Callable[..., Reader]) -
     more.press("Enter")
     expect(more).to_have_attribute("aria-expanded", "true")
     expect(rows).to_have_count(5)
+    assert reader.axe() == []
+
+
+def test_the_messages_of_a_record_that_is_not_listed(
+    opened: Callable[..., Reader], token: Callable[..., str]
+) -> None:
+    """Among more events than are listed, the selected record's own message is read, not another topic's."""
+    [row] = copy.deepcopy(EXAMPLES["Recordings"]["recordings"])
+    line = copy.deepcopy(EXAMPLES["Timeline"]) | {"id": row["id"], "more_events": 700}
+    [trigger] = row["triggers"]
+    line["events"][0]["record"] = "0" * 20  # the list lacks the trigger
+    asked: list[str] = []
+
+    def answer(route: Route) -> None:
+        asked.append(route.request.url)
+        body = (
+            line
+            if "/timeline" in route.request.url
+            else EXAMPLES["RecordedMessages"]
+            if "/messages" in route.request.url
+            else row
+        )
+        route.fulfill(json=body)
+
+    reader = opened(token("investigator", "reads"))
+    reader.page.route(re.compile(f"/v1/recordings/{row['id']}"), answer)
+    page = reader.go(f"recordings/{row['id']}", heading="Recording")
+    page.get_by_role("button", name="Read messages").click()
+    expect(page.get_by_role("list", name="Messages").get_by_role("listitem").first).to_be_visible()
+    assert f"record={trigger['record']}" in next(url for url in asked if "/timeline" in url)
+    assert f"at={trigger['record']}" in next(url for url in asked if "/messages" in url)
+    page.get_by_role("slider").press("ArrowRight")
+    expect(page.get_by_role("list", name="Messages").get_by_role("listitem").first).to_be_visible()
+    wait_until(
+        page,
+        "() => performance.getEntriesByType('resource').some((one) => /messages\\?at=\\d{4}-/.test(one.name))",
+    )
+
+
+def test_a_recording_that_is_being_made_is_listed(opened: Callable[..., Reader]) -> None:
+    """Before the first recording ends, the list has it with its earliest end."""
+    shown = copy.deepcopy(EXAMPLES["Recordings"]) | {"recordings": []}
+    reader = opened()
+    reader.page.route(re.compile("/v1/recordings$"), lambda route: route.fulfill(json=shown))
+    rows = reader.go("recordings").locator("tbody tr")
+    expect(rows).to_have_count(1)
+    for text in ("being made", "or later if more happens"):
+        expect(rows.first).to_contain_text(text)
     assert reader.axe() == []
