@@ -19,6 +19,7 @@ from appliance.api.route_roles import Investigator, Viewer, answered
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import StreamResponse, Work, in_thread, peer_of
+from appliance.audit.log_database import LogUnreadableError
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import (
     RecordedMessages,
@@ -109,6 +110,8 @@ def _add_reading(router: Routes, services: Services) -> None:
                 return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
             except FileNotFoundError:
                 raise _gone(recording.id) from None
+            except LogUnreadableError as error:
+                raise ProblemError(503, "log-unreadable", str(error)) from error
             except ValueError as error:
                 raise ProblemError(422, "bad-input", str(error)) from error
 
@@ -131,7 +134,9 @@ def _add_reading(router: Routes, services: Services) -> None:
         return await read(
             admin.RecordingWanted(recording_id),
             bearer,
-            lambda row, bag: timeline(row, bag, start, end, columns, record=record or ""),
+            lambda row, bag: timeline(
+                row, bag, start, end, columns, record=record or "", log=services.audit_log
+            ),
         )
 
     @router.get("/{recording_id:recording}/messages", responses=_UNKNOWN)

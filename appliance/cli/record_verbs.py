@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
@@ -122,7 +123,11 @@ def show_timeline(
     if isinstance(way, AdminSocket):
         body = appliance.ask_or_exit(admin.RecordingWanted(recording))
         start, end = _moment_given("--since", since), _moment_given("--until", until)
-        found = _read(lambda: timeline(body, _bag(way, body), start, end, columns))
+        found = _read(
+            lambda: timeline(
+                body, _bag(way, body), start, end, columns, log=way.state / "control" / "audit.db"
+            )
+        )
     else:
         query = {"since": since, "until": until, "columns": columns}
         found = _asked(way, f"{recording}/timeline", query, Timeline)
@@ -283,7 +288,7 @@ def _read(what: Callable[[], _T]) -> _T:
         return what()
     except OSError as error:
         raise usage_error(f"{error.filename}: {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, LogUnreadableError) as error:
         raise usage_error(str(error)) from None
 
 

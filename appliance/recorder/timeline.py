@@ -11,15 +11,18 @@ import re
 from collections import defaultdict, deque
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
 
 from appliance.audit.equality import times_of
-from appliance.audit.record import Severity
+from appliance.audit.folding import FoldSettings
+from appliance.audit.query import Filter
+from appliance.audit.record import AuditRecord, Severity
 from appliance.audit.record_format import without_binding
+from appliance.audit.search import export
 from appliance.channel.answers.recording_answers import (
     EventKind,
     EventMarks,
@@ -43,6 +46,7 @@ MOST_TOPICS = 300
 MOST_EVENTS = 500
 _MOST_BYTES = 1 << 20  # bytes read of a message; people are shown far fewer
 _LONGEST_RECORD = 1 << 22
+_MOST_LATER = 20_000  # records after a recording that are searched for repetitions during it
 _SECOND = 1_000_000_000
 _ROUNDED = 1000  # nanoseconds by which a record's rounded time may differ from that of its message
 _RECORD_ID = re.compile("[0-9a-f]{20}")
@@ -108,10 +112,12 @@ def timeline(
     columns: int = COLUMNS,
     *,
     record: str = "",
+    log: Path | None = None,
 ) -> Timeline:
     """Return the timeline from `since` to `until` (nanoseconds since the epoch; None: the recording's start or end).
 
-    It lists the first events, or those around the event of the audit record with the id `record`. Raises `OSError`, and
+    It lists the first events, or those around the event of the audit record with the id `record`. `log` is the audit
+    log, for repetitions that it counted only after the recording's end. Raises `OSError`, `LogUnreadableError`, and
     `ValueError` if the recording has no such time or the bag is invalid.
     """
     start = recording.began if since is None else max(since, recording.began)
@@ -122,7 +128,8 @@ def timeline(
     with BagReader.of(bag) as reader:
         flows, counts = _flows(reader, wanted), defaultdict[str, list[int]](lambda: [0] * columns)
         listed = _Listed(record)
-        for event, first, last in _events(reader, start):
+        later = [] if log is None else _counted_later(log, recording)
+        for event, first, last in _events(chain(_records(reader, start), later)):
             if first <= end:
                 wanted.spread(first, last, event.times, counts[event.kind])
             if event.time <= end:
@@ -188,9 +195,23 @@ def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
     return list(flows.values())
 
 
-def _events(reader: BagReader, since: int) -> Iterator[tuple[RecordedEvent, int, int]]:
-    """Yield the events recorded from `since` on; a record may count several, between a first and a last time."""
-    for said, time in _records(reader, since):
+def _counted_later(log: Path, recording: Recording) -> list[tuple[_Said | AuditRecord, int]]:
+    """Return the records after a recording's end that count repetitions during it. Raises `LogUnreadableError`."""
+    ended = recording.ended
+    written = Filter(since=ended + 1, until=ended + int((FoldSettings().seconds + 1) * _SECOND))
+    found = (entry.record for entry in islice(export(log, written), _MOST_LATER))
+    return [(one, one.time) for one in found if _is_before(one.detail.get("first_time"), ended)]
+
+
+def _is_before(time: object, end: int) -> bool:
+    return isinstance(time, int) and time <= end
+
+
+def _events(
+    records: Iterable[tuple[_Said | AuditRecord, int]],
+) -> Iterator[tuple[RecordedEvent, int, int]]:
+    """Yield the events of records; a record may count several, between a first and a last time."""
+    for said, time in records:
         kind = _kind(said)
         if kind is None:
             continue
@@ -226,7 +247,7 @@ def _records(reader: BagReader, since: int = 0) -> Iterator[tuple[_Said, int]]:
         yield msgspec.json.decode(body[4:], type=_Said), place.time
 
 
-def _kind(said: _Said) -> EventKind | None:
+def _kind(said: _Said | AuditRecord) -> EventKind | None:
     """Return the kind of event that the timeline shows for a record; None if the record is not shown."""
     kinds = kinds_of(said.event, said.decision, said.severity)
     if kinds:

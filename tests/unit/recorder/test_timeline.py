@@ -8,6 +8,8 @@ from typing import Any
 import msgspec
 import pytest
 
+from appliance.audit.record import AuditRecord, Severity
+from appliance.audit.record_format import LogEntry
 from appliance.channel.answers.recording_answers import Recording, Sender, Trigger
 from appliance.recorder.bag_reader import BagReader, MessagePosition
 from appliance.recorder.bag_writer import BagMessage, BagWriter
@@ -225,6 +227,26 @@ def test_counted_events_are_spread_over_their_time(tmp_path: Path) -> None:
         for part in ((edges[0], edges[1] - 1), (edges[1], edges[2] - 1), (edges[2], edges[3]))
     ]
     assert sum(sum(part.marks[0].counts) for part in parts) == 999
+
+
+def test_repetitions_counted_after_the_end_are_in_the_lanes(
+    bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log counts repetitions up to ten seconds later: those during the recording are in the lanes."""
+    ended = RECORDING.ended
+    spans = [(ended - SECOND + 1, ended + SECOND), (ended + 1, ended + SECOND), (None, None)]
+    later = [
+        LogEntry(number, AuditRecord(
+            id=f"{number:020x}", time=ended + 5 * SECOND, event="denials folded", severity=Severity.WARNING,
+            decision="deny", detail={"count": 10, "first_time": first, "last_time": last},
+        ))
+        for number, (first, last) in enumerate(spans)
+    ]  # fmt: skip
+    monkeypatch.setattr("appliance.recorder.timeline.export", lambda _log, _wanted: iter(later))
+    found = timeline(RECORDING, bag, log=bag)
+    [denials] = [mark.counts for mark in found.marks if mark.kind == "denial"]
+    assert sum(denials) == 1 + 5
+    assert len(found.events) == 3
 
 
 @pytest.mark.parametrize("torn", [b"no bag", b"#ROSBAG V2.0\n", None])
