@@ -22,6 +22,8 @@ EVENTS: dict[str, str] = {
     " that was in force before stays in force.",
     "host enrolled": "A host got a certificate and its virtual address; `detail` has both and who requested it.",
     "host renewed": "A host got a new certificate; its previous certificate was revoked.",
+    "host authority replaced": "The authority of hosts has another key (`rosrv host authority rotate`, or its files"
+    " were removed): certificates of the earlier one are not accepted.",
     "host revoked": "A host was excluded: its certificate is revoked, its tunnel closed, its registrations removed.",
     "certificate ends soon": "The certificate of an enrolled host expires within days and was not renewed.",
     "certificate ended": "The certificate of an enrolled host has expired; the host can no longer connect.",
@@ -172,7 +174,8 @@ SEVERITIES: dict[str, Severity] = {
         Severity.WARNING: (
             "bundle metadata rejected", "bundle refused",
             "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
-            "forwarding failed", "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
+            "forwarding failed", "host authority replaced",
+            "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
             "policy refused", "recording missed", "renewal refused", "rest certificate replaced",
             "specifications refused", "switchover failed",
             "tunnel refused",

@@ -59,14 +59,19 @@ def _write_over(state: Path) -> tuple[int, int]:
     for _folder, _folders, names, at in os.fwalk(state, follow_symlinks=False):
         for name in names:
             files += 1
-            found = os.stat(name, dir_fd=at, follow_symlinks=False)
-            if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _SMALL:
-                continue
-            descriptor = os.open(name, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=at)
-            try:
-                os.pwrite(descriptor, os.urandom(found.st_size), 0)
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-            written += 1
+            written += write_over(name, at)
     return files, written
+
+
+def write_over(name: str, folder: int) -> bool:
+    """Overwrite a small file of an open folder; return False for other files. Raises `OSError`."""
+    found = os.stat(name, dir_fd=folder, follow_symlinks=False)
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _SMALL:
+        return False
+    descriptor = os.open(name, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        os.pwrite(descriptor, os.urandom(found.st_size), 0)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    return True

@@ -56,7 +56,7 @@ class Group:
     """A command with its own verbs, such as `rosrv audit`."""
 
     help: str
-    verbs: Mapping[str, Verb]
+    verbs: "Verbs"
 
 
 def application(verbs: Verbs, *, callback: Callable[..., None] | None = None, **settings: Any) -> typer.Typer:

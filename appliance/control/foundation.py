@@ -141,7 +141,7 @@ async def make_foundation(
     # start the tunnels before the policy.
     table = make_host_table(settings, store)
     host_authority = make_host_authority(
-        settings, signing.link, store, table, pair=pair, replication=replication
+        settings, signing.link, store, trail, table, pair=pair, replication=replication
     )
     tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
     if pair is not None:

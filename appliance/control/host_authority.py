@@ -10,6 +10,7 @@ from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.shared_authority import SharedAuthority
 from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 
 
 class HostAuthority(NamedTuple):
@@ -23,15 +24,26 @@ def make_host_authority(
     settings: Settings,
     signer: Link,
     store: StateStore,
+    trail: AuditTrail,
     table: HostTable,
     *,
     pair: Pair | None,
     replication: Replication | None,
 ) -> HostAuthority:
     """Return the authority by this appliance's signer. On one of two appliances, the standby can introduce itself."""
-    authority = SharedAuthority(Authority(signer), store.hosts, shared=pair is not None)
+    authority = SharedAuthority(
+        Authority(signer), store.hosts, shared=pair is not None, replaced=lambda: _record_replaced(trail)
+    )
     endpoint = host_endpoint(settings, pair.membership) if pair is not None else None
     appliances = ApplianceTable(store.hosts, table.revoked, endpoint)
     if replication is not None:
         replication.on_introduction(lambda other: appliances.introduce(other, authority))
     return HostAuthority(authority, appliances)
+
+
+def _record_replaced(trail: AuditTrail) -> None:
+    trail.happened(
+        "host authority replaced",
+        "the authority of hosts has another key: no certificate of the earlier one is accepted, and each enrolled host"
+        " needs a new kit (rosrv host kit NAME)",
+    )

@@ -4,10 +4,11 @@ The authority's certificate and its last signed list of revoked certificates are
 takeover the tunnels of enrolled hosts open without the key. New certificates wait for it. A revoked host is shut out
 anyway, because charon loads no connection for it.
 
-A single appliance always uses its own key.
+A single appliance always uses its own key, and reports once that it has another one (`rosrv host authority rotate`).
 """
 
 import datetime
+from collections.abc import Callable
 
 from appliance.base import clock
 from appliance.channel.messages import CertificateMade
@@ -25,14 +26,23 @@ _WAITS = (
 class SharedAuthority:
     """The authority of the state, by the signer of this appliance. With `shared` this is one of two appliances.
 
-    Every method raises `AuthorityError`.
+    `replaced()` is called if a single appliance has another authority than before. Every method raises
+    `AuthorityError`.
     """
 
-    def __init__(self, signer: Authority, kept: HostTables, *, shared: bool) -> None:
+    def __init__(
+        self,
+        signer: Authority,
+        kept: HostTables,
+        *,
+        shared: bool,
+        replaced: Callable[[], object] = lambda: None,
+    ) -> None:
         self._signer = signer
         self._kept = kept
         self._shared = shared
-        self._row = kept.authority() if shared else None
+        self._replaced = replaced
+        self._row = kept.authority()
         self._obstacle = ""  # as last seen
 
     @property
@@ -49,12 +59,13 @@ class SharedAuthority:
     async def certificate(self) -> bytes:
         """Return the authority's certificate, in PEM."""
         own = (await self._signer.stated()).certificate
-        if not self._shared:
-            return own
-        if self._row is None:
-            self._save(AuthorityRow(own.decode(), "", 0.0))
-            return own
-        return self._row.certificate.encode()
+        kept = self._row
+        if kept is not None and (self._shared or kept.certificate == own.decode()):
+            return kept.certificate.encode()
+        self._save(AuthorityRow(own.decode(), "", 0.0))
+        if kept is not None:
+            self._replaced()
+        return own
 
     async def obstacle(self) -> str:
         """Return why this appliance cannot issue certificates; empty if it can."""

@@ -96,6 +96,18 @@ async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateS
     assert await alone.obstacle() == ""
 
 
+async def test_another_authority_is_reported_once(tmp_path: Path, store: StateStore) -> None:
+    """The first authority is none, a restart keeps it, and one with another key is reported by one start."""
+    told: list[str] = []
+    for name in ("a", "a", "b", "b"):
+        alone = SharedAuthority(
+            near(tmp_path, name), store.hosts, shared=False, replaced=lambda: told.append("new")
+        )
+        await alone.certificate()
+        await alone.certificate()
+    assert told == ["new"]
+
+
 async def test_the_standby_finds_its_certificate_in_the_state(tmp_path: Path, store: StateStore) -> None:
     """The active appliance certifies the key of the introduction, once; kits get its address and pin."""
     authority = SharedAuthority(near(tmp_path, "a"), store.hosts, shared=True)

@@ -1,0 +1,48 @@
+"""Remove the key of the hosts' authority of a stopped appliance, so that its next start makes another one.
+
+For a stolen or possibly stolen key: with it, anyone can make certificates of trusted hosts. The key file is overwritten
+first, as by `purge`.
+"""
+
+import os
+from contextlib import closing
+from pathlib import Path
+
+from appliance.backup.contents import BackupError
+from appliance.backup.purge import write_over
+from appliance.base.owner_access import acting_as
+from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
+from appliance.standby.membership import path_of
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.state_directory import StateDirectory, foreign
+
+
+def rotate_authority(state: Path) -> None:
+    """Remove key and certificate. Raises `BackupError` if an appliance runs, is one of two, or has no authority."""
+    state = state.absolute()
+    folder = state / "signer"
+    try:
+        reason = foreign(state)
+        if not state.is_dir() or reason is not None:
+            raise BackupError(reason or f"the state directory {state} does not exist")
+        with closing(StateDirectory(state)):
+            if path_of(state).exists():
+                raise BackupError(
+                    "this appliance is one of two, which share the authority: end the pair first (rosrv standby leave"
+                    " on both), rotate, and join again"
+                )
+            with acting_as(folder.stat().st_uid):  # in a container, root may not use the signer's folder
+                place = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+                try:
+                    write_over(KEY_FILE, place)
+                    for name in (KEY_FILE, CERTIFICATE_FILE):
+                        os.unlink(name, dir_fd=place)
+                    os.fsync(place)
+                finally:
+                    os.close(place)
+    except StartError as error:
+        raise BackupError(f"{error}; stop the appliance first") from None
+    except FileNotFoundError:
+        raise BackupError(f"{folder} has no authority yet: no host was enrolled") from None
+    except OSError as error:
+        raise BackupError(f"{folder}: {error.strerror}") from error

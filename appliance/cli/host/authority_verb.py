@@ -1,0 +1,39 @@
+"""`rosrv host authority rotate`: another key for the authority of hosts."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.backup.contents import BackupError
+from appliance.backup.rotate_authority import rotate_authority
+from appliance.cli.connection.target import DEFAULT_STATE, State
+from rosmop.tool.terminal import printable, refused, say
+
+
+def rotate(
+    state: State = DEFAULT_STATE,
+    confirm: Annotated[
+        str | None,
+        typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
+    ] = None,
+) -> None:
+    """Erase the key of the hosts' authority: the next start makes another. Stop the appliance first.
+
+    No certificate of the earlier authority is accepted then: all tunnels stay closed until each host has a new kit.
+
+    Example: rosrv host authority rotate --state /var/lib/rosrv
+    """
+    if confirm is None:
+        text = f"All hosts need new kits afterwards. Type {printable(str(state))} to erase the key of their authority"
+        confirm = str(typer.prompt(text, err=True))
+    if Path(confirm).absolute() != state.absolute():
+        raise refused([f"rosrv: {confirm} is not {state}: nothing was changed"])
+    try:
+        rotate_authority(state)
+    except BackupError as error:
+        raise refused([f"rosrv: {error}"]) from None
+    say(
+        "The key is erased. Start the appliance, which makes another; then, for each host of `rosrv host list`:"
+    )
+    say("    rosrv host kit NAME --token")

@@ -1,0 +1,57 @@
+"""`rosrv host authority rotate`."""
+
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from appliance.backup.contents import BackupError
+from appliance.backup.rotate_authority import rotate_authority
+from appliance.ipsec.certificate_authority import CertificateAuthority
+from appliance.standby.membership import path_of
+from appliance.supervisor.state_directory import StateDirectory
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """Return the state directory of a stopped appliance with an authority."""
+    StateDirectory(tmp_path).close()
+    (tmp_path / "signer").mkdir(mode=0o700)
+    CertificateAuthority(tmp_path / "signer").revocations([])
+    (tmp_path / "signer" / "key").write_text("of the log")
+    return tmp_path
+
+
+def test_the_next_start_has_another_authority(state: Path) -> None:
+    """Its list of revoked certificates has a higher number; the key of the log stays; the old key is overwritten."""
+    before = CertificateAuthority(state / "signer").certificate
+    number = int((state / "signer" / "ca.list").read_text())
+    key = (state / "signer" / "ca.key").open("rb")
+    secret = key.read()
+    rotate_authority(state)
+    with key:
+        key.seek(0)
+        assert key.read() != secret  # the blocks on the disk are overwritten
+    after = CertificateAuthority(state / "signer")
+    assert after.certificate != before
+    after.revocations([])
+    assert int((state / "signer" / "ca.list").read_text()) > number
+    assert (state / "signer" / "key").read_text() == "of the log"
+
+
+def test_it_needs_a_stopped_single_appliance_with_an_authority(state: Path, tmp_path: Path) -> None:
+    """Otherwise nothing changes, and the error says what to do."""
+    before = CertificateAuthority(state / "signer").certificate
+    with closing(StateDirectory(state)), pytest.raises(BackupError, match="stop the appliance first"):
+        rotate_authority(state)
+    path_of(state).parent.mkdir()
+    path_of(state).write_text("{}")
+    with pytest.raises(BackupError, match="rosrv standby leave"):
+        rotate_authority(state)
+    assert CertificateAuthority(state / "signer").certificate == before
+    path_of(state).unlink()
+    rotate_authority(state)
+    with pytest.raises(BackupError, match="no authority yet"):
+        rotate_authority(state)
+    with pytest.raises(BackupError, match="does not exist"):
+        rotate_authority(state / "nowhere")
