@@ -43,6 +43,7 @@ from appliance.store.revisions import LIMITS, Revisions, reloaded_by
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
+_REFUSED = "policy file refused"
 _log = structlog.get_logger()
 _SHOWN_NODES = 3
 
@@ -106,7 +107,7 @@ class Policies(Revisions[RevisionRow]):
         self._carried_out = carried_out
         self._site_keys = site_keys
         self._current: Policy | None = None
-        self.file_refused = ""
+        self.file_refused = store.settings().get(_REFUSED, "")
         """Why the file was refused at the last start or reload, in a line; empty: it was not."""
 
     @property
@@ -143,6 +144,8 @@ class Policies(Revisions[RevisionRow]):
         self._resume()
         if refused is not None:
             self._file_refused(refused)
+        elif not kept_first:
+            self._note_refused("")
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
@@ -163,7 +166,7 @@ class Policies(Revisions[RevisionRow]):
             try:
                 policy, signature = await self._prepared(lambda: read_policy(self.file), str(self.file), who)
             except PolicyRefusedError as error:
-                self.file_refused = error.findings[0]
+                self._note_refused(error.findings[0])
                 raise
             return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
 
@@ -300,9 +303,15 @@ class Policies(Revisions[RevisionRow]):
             who=who,
         )
 
+    def _note_refused(self, reason: str) -> None:
+        """Keep why the file was refused, also for a control that follows after a crash."""
+        if reason != self.file_refused:
+            self.file_refused = reason
+            self.store.save_setting(_REFUSED, reason)
+
     def _file_refused(self, error: PolicyRefusedError) -> None:
         """Report in the log, the records and the status that the start refused the file."""
-        self.file_refused = error.findings[0]
+        self._note_refused(error.findings[0])
         text = f"revision {self.revision} stays in force, because the start refused {self.file}"
         _log.error(text, findings=error.findings[:100])
         self._trail.happened(
@@ -338,7 +347,7 @@ class Policies(Revisions[RevisionRow]):
         within: float | None = None,
     ) -> Loaded:
         take_effect()
-        self.file_refused = ""
+        self._note_refused("")
         before = self.revision
         row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
         lost = [] if self._current is None else _losses(policy, self._live())
