@@ -1,6 +1,7 @@
 """Test the life of the container: start, stop, kill, restart, removal, and the need for each capability."""
 
 import json
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator
@@ -85,6 +86,21 @@ def test_nodes_go_on_after_stop_start_and_kill(talking: Compose) -> None:
     drives_on(talking)
     verified = talking.exec("appliance", "rosrv", "audit", "verify", check=False)
     assert verified.returncode == 0, verified.stdout + verified.stderr
+
+
+def test_a_recreated_container_keeps_its_certificate(site: Site, alone: Compose) -> None:
+    """As at each upgrade: the container has another id, and pinned clients of REST still know it."""
+
+    def certificate() -> str:
+        return site.machine.run(lambda: ssl.get_server_certificate(("127.0.0.1", 8443), timeout=30))
+
+    alone.wait_healthy()
+    before, container = certificate(), alone.container("appliance")
+    alone("up", "--detach", "--no-build", "--force-recreate", "appliance")
+    alone.wait_healthy()
+    assert alone.container("appliance") != container
+    assert certificate() == before
+    assert container[:12] not in ssl.PEM_cert_to_DER_cert(before).decode("latin-1")
 
 
 def test_the_robot_may_restart(talking: Compose) -> None:

@@ -1,0 +1,39 @@
+"""A block of a host keeps its length over switchovers between appliances whose clocks of ages differ."""
+
+import json
+import time
+from functools import partial
+
+import pytest
+
+from appliance.channel import admin
+from tests.support.standby_site import OCU, StandbySite
+from tests.support.waiting import allowed, eventually
+
+HOUR = 3600.0
+
+
+def blocked_for(site: StandbySite, name: str) -> float:
+    """Return the seconds that the block has left at an appliance."""
+    [block] = site.appliances[name].ask(admin.HostBlocks()).blocks
+    assert block.until is not None
+    return block.until - time.time()
+
+
+@pytest.mark.parametrize("ahead", [HOUR, -HOUR])
+def test_a_block_keeps_its_length_over_switchovers(site: StandbySite, ahead: float) -> None:
+    """The other appliance's first start was at a wrong time; neither the way there nor back changes the block."""
+    active, passive = site.pair()
+    age = site.appliances[passive].state / "control" / "age"
+    now = time.time_ns()
+    age.write_text(json.dumps({"lived": 0, "credited": now + int(ahead * 1e9), "believed": now}))
+    site.appliances[active].ask(admin.HostBlock(OCU, HOUR))
+    began = time.monotonic()
+    for leaves, follows in ((active, passive), (passive, active)):
+        time.sleep(6.0)  # noqa: TID251  a reading of the clocks is replicated every five seconds
+        site.promote(leaves)
+        site.until_taken_over(follows)
+        left = eventually(partial(blocked_for, site, follows), site.story)
+        assert left == pytest.approx(HOUR - (time.monotonic() - began), abs=allowed(5.0))
+        site.until_both_in_sync()
+    site.appliances[active].ask(admin.HostUnblock(OCU))
