@@ -3,9 +3,10 @@
 An appliance that holds the lease and does not serve is worse than none: the other one sees a healthy holder. So the
 lease is given away when control reports an obstacle (a full disk), is silent, or does not get ready after a start.
 
-A control that stood by is ready soon after the activation; it has `START_SECONDS`, as has one that starts again. But a
-lease that comes back after a lapse meets a control that has just begun to start. The other appliance takes over sooner,
-so it gets the lease, unless a monitor would then hold its topics, because its state would be lost.
+A control that stood by is ready soon after the activation, in less than `START_SECONDS`. A control that died and starts
+again has `RESTART_SECONDS`, because topics and the state of monitors need no control. But a lease that comes back after
+a lapse meets a control that has just begun to start, without relays. The other appliance takes over sooner, so it gets
+the lease, unless a monitor would then hold its topics, because its state would be lost.
 
 Each time that the lease is given away, all limits are doubled until this appliance has served for a minute: two
 appliances on busy machines must not pass the lease back and forth.
@@ -16,6 +17,7 @@ from appliance.standby.witness import EXPIRY
 OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
+RESTART_SECONDS = 10.0
 _STEADY_SECONDS = 60.0
 _MOST_DOUBLINGS = 5
 
@@ -30,6 +32,7 @@ class ServiceWatch:
         self._served = 0.0  # time of the last report without an obstacle; at first of the activation
         self._steady_since: float | None = None
         self._serves = False  # whether the present control has served
+        self._relays = False  # whether a control has served in this activation
         self._obstacle = ""
         self._obstacle_since = 0.0
         self._doublings = 0
@@ -42,7 +45,8 @@ class ServiceWatch:
         """Take a report of control; an empty obstacle: it serves."""
         self._keeps_state = keeps_state
         if not obstacle:
-            self._served, self._serves, self._cold = now, True, False
+            self._served, self._cold = now, False
+            self._serves = self._relays = True
             self._steady_since = now if self._steady_since is None else self._steady_since
             if now - self._steady_since > _STEADY_SECONDS:
                 self._doublings = 0
@@ -55,6 +59,7 @@ class ServiceWatch:
         """Return why the lease should be given away; empty: it should not. `present`: control stands by or serves."""
         if active and not self._active:
             self._served, self._steady_since, self._cold = now, None, not present
+            self._relays = False
             self.linked()
         self._active = active
         if not active:
@@ -66,7 +71,8 @@ class ServiceWatch:
             late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
             return self._obstacle if late else ""
         silent = now - self._served
-        if silent <= scale * (SILENT_SECONDS if self._serves else START_SECONDS):
+        limit = RESTART_SECONDS if self._relays else START_SECONDS
+        if silent <= scale * (SILENT_SECONDS if self._serves else limit):
             return ""
         what = "has not reported" if self._serves else "has not been ready"
         return f"control {what} for {silent:.1f} s"
