@@ -18,7 +18,7 @@ from typing import Any
 from unittest import mock
 
 from appliance.cli import main
-from appliance.cli.lazy import Group, Verb, loaded
+from appliance.cli.lazy import Group, Verb, Verbs, loaded
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output
@@ -48,11 +48,11 @@ def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
     return subprocess.CompletedProcess(command, status, said, wrong)
 
 
-def table() -> Iterator[tuple[str, Verb]]:
+def table(verbs: Verbs = main.VERBS) -> Iterator[tuple[str, Verb]]:
     """Yield every entry of the command table."""
-    for name, one in main.VERBS.items():
+    for name, one in verbs.items():
         if isinstance(one, Group):
-            yield from ((f"{name} {inner}", verb) for inner, verb in one.verbs.items())
+            yield from ((f"{name} {inner}", verb) for inner, verb in table(one.verbs))
         else:
             yield name, one
 
