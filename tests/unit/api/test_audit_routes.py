@@ -114,6 +114,12 @@ def test_an_export_has_one_record_a_line_oldest_first(world: RestWorld) -> None:
     assert (len(sequences), sequences) == (8, sorted(sequences))
 
 
+def test_a_summary_counts_the_denials_of_each_host(world: RestWorld) -> None:
+    [row] = world.asked("GET", "/v1/audit/summary").json()["hosts"]
+    assert (row["host"], row["count"]) == ("10.0.0.9", 7)
+    assert world.asked("GET", "/v1/audit/summary?since=never").status_code == 422
+
+
 def test_a_verification_proves_the_log(world: RestWorld) -> None:
     verified = world.asked("GET", "/v1/audit/verify").json()
     assert (verified["ok"], verified["findings"]) == (True, [])

@@ -6,18 +6,15 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, cast
 
-import msgspec
 import pytest
 from starlette.responses import Response
 
 from appliance.api import audit_summary
 from appliance.api.access import Bearer
-from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.audit.denial_summary import DenialSummary
 from appliance.audit.query import Filter
-from tests.support.audit import decision, settle
-from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
+from tests.unit.audit.conftest import key, make_log, notary, path
 
 pytestmark = pytest.mark.nightly
 
@@ -37,25 +34,6 @@ class _Log:
 def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
     [one] = audit_summary.routes(cast(Services, _Log(log))).routes
     return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
-
-
-def asked(log: Path, since: str | None = None) -> DenialSummary | int:
-    try:
-        body = asyncio.run(route(log)(_VIEWER, since, None, 20)).body
-        return msgspec.json.decode(bytes(body), type=DenialSummary)
-    except ProblemError as problem:
-        return problem.status
-
-
-def test_the_summary_is_made_from_the_log(make_log: MakeLog) -> None:
-    log = make_log()
-    log.record(decision(log, decision="deny", host="10.0.0.9"))
-    settle(log)
-    found = asked(log.path)
-    assert isinstance(found, DenialSummary)
-    assert [row.host for row in found.hosts] == ["10.0.0.9"]
-    assert asked(log.path, "never") == 422
-    assert asked(log.path.with_name("none.db")) == 503
 
 
 def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,8 +29,8 @@ count() { event said() /chatter std_msgs/String '{}' { } }
 
 
 @pytest.fixture(scope="module")
-def api() -> Iterator[RestWorld]:
-    api = RestWorld()
+def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RestWorld]:
+    api = RestWorld(tmp_path_factory.mktemp("state"))
     yield api
     api.close()
 
@@ -111,6 +111,10 @@ def test_a_request_is_explained_by_the_policy_in_force_or_by_a_draft(world: Rest
     for wrong in ("host=nobody&node=/b", "host=robot"):
         answer = world.asked("GET", f"/v1/policy/explain?category=publish&resource=/a&{wrong}")
         assert answer.status_code == 422, wrong
+
+
+def test_a_missing_log_is_a_problem(world: RestWorld) -> None:
+    assert world.asked("GET", "/v1/audit/summary").json()["type"] == "urn:rosrv:problem:log-unreadable"
 
 
 def test_one_monitor_is_shown_in_detail(world: RestWorld) -> None:

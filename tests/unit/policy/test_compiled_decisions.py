@@ -8,7 +8,6 @@ import ipaddress
 import itertools
 import re
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -143,17 +142,3 @@ def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) ->
     for name in names:
         ranks = [rank(key) for key in patterns if key_matches(key, name)]
         assert len(ranks) == len(set(ranks))
-
-
-@pytest.mark.parametrize(
-    ("key", "name", "matches"),
-    [
-        ("/arm", "/arm", True), ("/arm", "/arm2", False), ("/arm/*", "/arm", False), ("/arm/*", "/arm/x", True),
-        ("/arm/*", "/arm/x/y", False), ("/arm/**", "/arm", True), ("/arm/**", "/arm/x/y", True),
-        ("/arm/**", "/arm2", False), ("/arm*", "/arm", True), ("/arm*", "/arm2", True), ("/arm*", "/arm/x", False),
-        ("/**", "/x/y", True),
-    ],
-)  # fmt: skip
-def test_the_naive_decider_reads_keys_as_documented(key: str, name: str, matches: bool) -> None:
-    """The naive decider agrees with the forms of keys in docs/policy.md."""
-    assert key_matches(key, name) is matches
