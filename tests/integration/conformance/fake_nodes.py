@@ -81,11 +81,6 @@ class FakeNodes:
         with self._changed:
             return [one.params[1:] for one in self._calls if (one.node, one.method) == (node, method)]
 
-    def all_calls(self) -> list[NodeCalled]:
-        """Return every call so far except `getPid` (the liveness check)."""
-        with self._changed:
-            return [one for one in self._calls if one.method != "getPid"]
-
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
         """Wait until `wanted()` is true, tested after each call; return False after `timeout` seconds without a call.
 

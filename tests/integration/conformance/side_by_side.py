@@ -10,11 +10,11 @@ and `ServiceApi` stand for URIs of fake nodes; each master has its own fake node
 import itertools
 import re
 import xmlrpc.client
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from tests.integration.conformance.fake_nodes import FakeNodes, NodeCalled
+from tests.integration.conformance.fake_nodes import FakeNodes
 
 _HTTP_URI = re.compile(r"http://127\.0\.0\.1:\d+/[\w-]*")
 _SERVICE_URI = re.compile(r"rosrpc://[\w.]+:\d+")
@@ -139,18 +139,6 @@ class BothMasters:
             undo, positions = _UNDO[method]
             self._registered[undo, tuple(params[position] for position in positions)] = None
         return Answers(self.plain.named(plain), self.appliance.named(appliance))
-
-    def calls_made(self, of_interest: Callable[[NodeCalled], bool]) -> Answers:
-        """Return the calls of each master to its nodes, by node."""
-        return Answers(self._told(self.plain, of_interest), self._told(self.appliance, of_interest))
-
-    def _told(self, side: MasterSide, of_interest: Callable[[NodeCalled], bool]) -> dict[str, list[Any]]:
-        told: dict[str, list[Any]] = {}
-        for call in side.nodes.all_calls():
-            if of_interest(call):
-                node = call.node.rpartition("-")[0]
-                told.setdefault(node, []).append([call.method, *side.named(list(call.params[1:]))])
-        return told
 
     def reset(self) -> None:
         """Undo all registrations and parameters."""

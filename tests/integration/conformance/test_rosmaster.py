@@ -3,9 +3,11 @@
 `tests/unit/master/test_conversations.py` compares RVMaster's answers with the text.
 """
 
+import math
 import re
 from pathlib import Path
 from typing import Any
+from xmlrpc.client import Binary, DateTime
 
 import pytest
 
@@ -15,6 +17,13 @@ from tests.support.conversation_calls import PORTS, call_of
 
 _TEXT = Path(__file__).parents[2] / "unit" / "master" / "conversations" / "rosmaster.txt"
 _CONVERSATIONS = conversations_of(_TEXT.read_text(encoding="utf-8")).conversations
+VALUES: list[Any] = [
+    0, 1024, 2**31 - 1, -(2**31), True, False, "", "x", "hello world", "ünïcode & <xml> ]]>", "\t two\nlines ",
+    0.0, -0.0, math.pi, 3.4028235e38, -1e-300, 1e300, math.inf, -math.inf, math.nan, [], [1, 2, 3], ["a", "b"],
+    [0.0, -4.5], [1, "a", math.pi, False], [[1, 2], ["a"], []], {}, {"a": 2, "b": 4}, {"a": {"b": {"c": "d"}}},
+    {"list": [{"x": 1}, {"y": [2]}]}, {"z": 1, "a": 2}, Binary(b""), Binary(bytes(range(256))),
+    DateTime("20051206T12:13:14"), [Binary(b"x"), DateTime("14921206T12:13:14")],
+]  # fmt: skip
 _URI = re.compile(r"(http|rosrpc)://127\.0\.0\.1:(\d+)/?")
 
 
@@ -41,3 +50,9 @@ def test_answers_are_those_of_rosmaster(both: BothMasters, title: str) -> None:
         else:
             assert differences(answers) == [], line
         assert differences(both.call("getSystemState", TESTER)) == [], f"the state after {line}"
+
+
+@pytest.mark.parametrize("value", VALUES, ids=lambda value: f"{type(value).__name__}-{VALUES.index(value)}")
+def test_every_kind_of_value_is_kept_as_by_rosmaster(both: BothMasters, value: Any) -> None:
+    for step in (("setParam", "/kept/value", value), ("getParam", "/kept/value"), ("getParam", "/")):
+        assert differences(both.call(step[0], TESTER, *step[1:])) == [], step

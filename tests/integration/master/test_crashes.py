@@ -111,21 +111,6 @@ def test_killed_in_a_burst_of_registrations(working: Field, roles: list[str]) ->
         burst.all_there()
 
 
-def test_rosmaster_stopped_for_two_seconds(working: Field) -> None:
-    pid = working.appliance.pids("rosmaster")[0]
-    with Burst(working, "/burst_stopped") as burst:
-        os.kill(pid, signal.SIGSTOP)
-        goes_on = threading.Timer(2, os.kill, (pid, signal.SIGCONT))
-        goes_on.start()
-        working.listener.wait_for_count(  # messages do not need `rosmaster`
-            len(working.listener.seen(event="received")) + 50, event="received"
-        )
-        goes_on.join()
-        burst.finish()
-        burst.all_there()
-    assert working.appliance.pids("rosmaster") == [pid]
-
-
 def test_the_whole_appliance_restarts(battlefield: Field) -> None:
     field = battlefield
     ears = [
