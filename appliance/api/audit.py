@@ -26,12 +26,11 @@ from appliance.api.problems import ProblemError
 from appliance.api.route_roles import Operator, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.shown_records import PAGE, RECORD_REFERENCE, page_of, readable, readable_by
+from appliance.api.shown_records import PAGE, RECORD_REFERENCE, page_of, readable, readable_by, streamed
 from appliance.api.streams import StreamResponse, Streams, Work, in_thread, peer_of
 from appliance.audit.chain_findings import Verification
 from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
-from appliance.audit.equality import equality_of
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
@@ -343,9 +342,8 @@ async def _follow(
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in readable(entries, bearer, text):
-            more = {"equality": equality_of(entry.record)} if equality else {}
             yield ServerSentEvent(
-                event="record", id=str(entry.sequence), data=_as_line(as_object(entry) | more)
+                event="record", id=str(entry.sequence), data=_as_line(streamed(entry, equality=equality))
             )
         if not entries:
             with contextlib.suppress(TimeoutError):

@@ -7,7 +7,7 @@ import msgspec
 
 from appliance.audit.query import Filter, FilterError
 from appliance.channel.answers.policy_answers import PolicyInForce
-from appliance.policy.host_names import HostNames, UnknownHostError
+from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.model import address_of
 
 _GLOB = frozenset("*?[")
@@ -55,6 +55,6 @@ def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
     """Replace the name of a search's host by its networks. Raises `FilterError` for an unknown name."""
     try:
         networks = names_of(known).networks(wanted.host or "")
-    except UnknownHostError as error:
+    except UnknownHostNameError as error:
         raise FilterError(f"host: {error}") from None
     return msgspec.structs.replace(wanted, host=None, hosts=tuple(map(str, networks)))

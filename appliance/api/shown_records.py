@@ -79,6 +79,11 @@ def page_of(
     return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
 
 
+def streamed(entry: LogEntry, *, equality: bool) -> dict[str, Any]:
+    """Return a record of a stream, on request with what makes equal ones one row."""
+    return as_object(entry) | ({"equality": equality_of(entry.record)} if equality else {})
+
+
 def readable(entries: Iterable[LogEntry], bearer: Bearer, text: str | None = None) -> list[LogEntry]:
     """Return what the bearer may read, without records that match `text` only in their hidden parts."""
     found = []

@@ -12,7 +12,7 @@ Invariants:
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -82,7 +82,7 @@ def times(record: AuditRecord) -> int:
     return times_of(record.event, record.detail)
 
 
-def times_of(event: str, detail: Mapping[str, Any]) -> int:
+def times_of(event: str, detail: dict[str, Any]) -> int:
     """Return how often an event happened, from its record's fields."""
     return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
 

@@ -9,7 +9,6 @@ Texts from peers cannot create an unlimited number of kinds:
    and resources by name, and the rest together.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -62,7 +61,7 @@ class FoldState(msgspec.Struct, kw_only=True):
         """Count a repetition."""
         if not self.count:
             self.first_id, self.first_time = record.id, record.time
-        number = stands_for(record)
+        number = repetitions(record.detail)
         self.count += number
         self.last_id, self.last_time = record.id, record.time
         if self.scope != KIND:
@@ -162,12 +161,7 @@ def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = Fa
     )  # fmt: skip
 
 
-def stands_for(record: AuditRecord) -> int:
-    """Return `detail.count` of a record whose reporter already counted repetitions, else 1."""
-    return repetitions(record.detail)
-
-
-def repetitions(detail: Mapping[str, Any]) -> int:
+def repetitions(detail: dict[str, Any]) -> int:
     """Return `count` of a record's detail if it is a number of repetitions, else 1."""
     count = detail.get("count")
     return count if type(count) is int and count > 0 else 1

@@ -22,7 +22,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.host_blocks import BlockTable
 from appliance.control.policies import Policies
 from appliance.hosts.host_table import HostRefusedError
-from appliance.policy.host_names import HostNames, UnknownHostError
+from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.live_rights import LiveRight
 from appliance.policy.model import Address, address_of
 from appliance.rpc.front import plain_address
@@ -205,7 +205,7 @@ class BlockOrders:
         enrolled = {name: address_of(address) for name, address in self._enrolled().items()}
         try:
             networks = HostNames.of(policy.text, enrolled, policy.robot).networks(text[:_LONGEST_NAME])
-        except UnknownHostError as error:
+        except UnknownHostNameError as error:
             raise SenselessError(str(error)) from None
         if len(networks) > 1 or networks[0].num_addresses > 1:
             some = ", ".join(

@@ -5,7 +5,7 @@ import ipaddress
 from appliance.base.validation_messages import meant
 from appliance.policy.commands import ALIASES, COMMANDS, DECIDED_ELSEWHERE
 from appliance.policy.groups import ROBOT
-from appliance.policy.host_names import HostNames, UnknownHostError
+from appliance.policy.host_names import HostNames, UnknownHostNameError
 from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
@@ -57,7 +57,7 @@ def find_hosts(text: str, policy: Policy) -> tuple[Address, ...]:
         names = HostNames.of(policy.text, policy.enrolled, policy.robot)
     try:
         return tuple(_first(network) for network in names.networks(text))
-    except UnknownHostError as error:
+    except UnknownHostNameError as error:
         raise BadWordError(str(error)) from None
 
 

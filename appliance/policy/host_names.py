@@ -25,7 +25,7 @@ _MOST_NAMED = 20
 _EVERY = tuple(map(ipaddress.ip_network, ("0.0.0.0/0", "::/0")))
 
 
-class UnknownHostError(ValueError):
+class UnknownHostNameError(ValueError):
     """No host or group has this name; the message names the nearest one."""
 
 
@@ -51,7 +51,7 @@ class HostNames:
         return cls(groups, enrolled)
 
     def networks(self, text: str) -> tuple[Network, ...]:
-        """Return the networks that an address, a network or a name means. Raises `UnknownHostError`."""
+        """Return the networks that an address, a network or a name means. Raises `UnknownHostNameError`."""
         try:
             return (canonical_network(ipaddress.ip_network(text)),)
         except ValueError:
@@ -60,7 +60,7 @@ class HostNames:
         if name in self.enrolled:
             found[_network_of(self.enrolled[name])] = None
         if not found:
-            raise UnknownHostError(self._unknown(text, name))
+            raise UnknownHostNameError(self._unknown(text, name))
         return tuple(found)
 
     def _unknown(self, text: str, name: str) -> str:

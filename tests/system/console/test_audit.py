@@ -370,7 +370,7 @@ def test_rows_are_those_of_the_command(opened: Callable[..., Reader]) -> None:
 
 
 def test_a_host_that_makes_several_calls_in_turn_is_a_few_rows(opened: Callable[..., Reader]) -> None:
-    """What matters has a row for each kind of denial and of a monitor's action; another search keeps their order."""
+    """Denials and monitors' actions of one kind are a row, unless a search names something."""
     entries = [denial(number, f"/arm{number % 3}") for number in range(1, 40)] + [
         drop(40),
         denial(41, "/leg"),

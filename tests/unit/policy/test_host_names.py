@@ -4,7 +4,7 @@ from ipaddress import ip_address, ip_network
 
 import pytest
 
-from appliance.policy.host_names import HostNames, UnknownHostError, label_of
+from appliance.policy.host_names import HostNames, UnknownHostNameError, label_of
 
 TEXT = """
 [Groups]
@@ -51,7 +51,7 @@ def test_a_name_means_all_its_networks(text: str, networks: str) -> None:
 )
 def test_an_unknown_name_is_an_error(text: str, said: str) -> None:
     """It names the nearest name, or those that there are."""
-    with pytest.raises(UnknownHostError, match=said):
+    with pytest.raises(UnknownHostNameError, match=said):
         NAMES.networks(text)
 
 
