@@ -1,6 +1,6 @@
 /** The denials by host, the most first, as `rosrv audit summary` prints them. */
 
-import { html, useEffect, useState } from "../html.js";
+import { html, useEffect, useMemo, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { count, counted } from "../numbers.js";
 import { Given } from "../parts/given.js";
@@ -13,6 +13,7 @@ import { plain } from "../words.js";
 import { auditPath } from "./filters.js";
 
 const SHOWN = 5;
+const MOST_COUNTED = 200;
 const FOLDER = /\s\/\S*\/(?=[^/\s]+:\d+$)/; // of the policy's file, before its name and line
 const EVERY = 15_000; // milliseconds between two summaries while denials arrive
 
@@ -32,6 +33,13 @@ export function DeniedHosts({ since, until, mark, title = "" }) {
       <td class="nowrap" data-label="Last"><div><${Moment} at=${one.last} /><div class="muted small">since <${Moment} at=${one.first} /></div></div></td></tr>`)}</tbody></table></div>
     ${value.more_hosts > 0 && html`<p class="panel-body muted small">${counted(value.more_hosts, "further host")} with ${counted(value.more_denials, "denial")}.</p>`}
     ${value.counted_since && html`<p class="panel-body muted small">Records before <${Moment} at=${value.counted_since} /> are not counted, as there are too many.</p>`}`;
+}
+
+/** The number of denials of each host in the last hour: the newest records alone would be too few. @param {unknown} mark as for `DeniedHosts` */
+export function useDeniedCounts(mark) {
+  const seen = useSlowly(mark);
+  const { value } = useResource((signal) => get("/v1/audit/summary", { since: "1h", limit: MOST_COUNTED }, signal), [seen]);
+  return useMemo(() => new Map(/** @type {[string, number][]} */ ((value?.hosts ?? []).map((/** @type {any} */ one) => [one.host, one.count]))), [value]);
 }
 
 /** The latest mark, but at most one every `EVERY`. */

@@ -8,8 +8,8 @@
 
 /**
  * @typedef {{key: string, kind: "node" | "topic" | "service" | "party" | "missing" | "master", name: string, sub: string,
- *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, brief?: string, callers?: string[], denied?: number, owners?: string[]}} Item
- *   `brief`: in few words what `sub` is; of a denied host: the `callers` that it gave, `owners`: the hosts whose nodes' names it used, and how often it was `denied`
+ *   host?: string, rate?: number, mediated?: boolean, lost?: boolean, row?: any, brief?: string, callers?: string[], denied?: number, found?: number, owners?: string[]}} Item
+ *   `brief`: in few words what `sub` is; of a denied host: the `callers` that it gave, `owners`: the hosts whose nodes' names it used, how often it was `denied`, and how often it was `found` in the records
  * @typedef {{key: string, from: string, to: string, kind: "flow" | "denied", mediated: boolean, rate: number,
  *   denials?: any[], would?: boolean}} Line
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
@@ -24,15 +24,16 @@ const ATTEMPTS = 60;
 
 /**
  * @param {any} graph @param {any[]} denials @param {{services: boolean, quiet: boolean, denied: boolean}} wanted
- * @param {(address: string) => string} [shown] the text of a host @returns {Model}
+ * @param {(address: string) => string} [shown] the text of a host
+ * @param {Map<string, number>} [counts] the denials of hosts, where more than in `denials` are known @returns {Model}
  */
-export function modelOf(graph, denials, wanted, shown = (address) => address) {
+export function modelOf(graph, denials, wanted, shown = (address) => address, counts = new Map()) {
   /** @type {Model} */
   const model = { items: new Map(), lines: new Map() };
   for (const node of graph.nodes) put(model, { key: `n${node.name}`, kind: "node", name: node.name, sub: shown(node.host), host: node.host, lost: node.state === "lost", row: node });
   for (const topic of graph.topics) if (!(wanted.quiet && QUIET.has(topic.name))) topicOf(model, topic);
   if (wanted.services) for (const service of graph.services) if (!(wanted.quiet && /\/(get_loggers|set_logger_level)$/.test(service.name))) serviceOf(model, service);
-  if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt, shown);
+  if (wanted.denied) for (const attempt of attempts(denials)) attemptOf(model, attempt, shown, counts);
   return model;
 }
 
@@ -84,7 +85,7 @@ function serviceOf(/** @type {Model} */ model, /** @type {any} */ service) {
   for (const one of service.connections) flow(model, `n${one.to}`, key, service.mediated, service.messages_per_second);
 }
 
-function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt, /** @type {(address: string) => string} */ shown) {
+function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command: boolean, records: any[]}} */ attempt, /** @type {(address: string) => string} */ shown, /** @type {Map<string, number>} */ counts) {
   const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
   const owner = known && known.host !== undefined && known.host !== host ? known.host : null;
@@ -94,7 +95,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   // If the host now has the resource, the denial was brief (a late call) and not an attempt to show.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   const times = attempt.records.reduce((sum, one) => sum + (one.equality?.times ?? 1), 0);
-  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, more: times }, shown);
+  if (from.startsWith("x")) partyOf(model, from, { host: host ?? "", caller, owner, more: times }, shown, counts);
   if (!model.items.has(to)) {
     const kind = attempt.command ? "master" : "missing";
     put(model, { key: to, kind, name: attempt.command ? "RVMaster" : resource, sub: attempt.command ? "calls" : `denied ${category ?? event}` });
@@ -106,13 +107,14 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
 }
 
 /** Add a denied host, or one more of its attempts. */
-function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, more: number}} */ { host, caller, owner, more }, /** @type {(address: string) => string} */ shown) {
+function partyOf(/** @type {Model} */ model, /** @type {string} */ key, /** @type {{host: string, caller: string | null, owner: string | null, more: number}} */ { host, caller, owner, more }, /** @type {(address: string) => string} */ shown, /** @type {Map<string, number>} */ counts) {
   const before = model.items.get(key);
-  const denied = (before?.denied ?? 0) + more;
+  const found = (before?.found ?? 0) + more;
+  const denied = Math.max(found, counts.get(host) ?? 0);
   const callers = [...new Set([...(before?.callers ?? []), ...(caller ? [caller] : [])])];
   const owners = [...new Set([...(before?.owners ?? []), ...(owner === null ? [] : [owner])])];
   const times = counted(denied, "denial");
-  const item = { key, kind: /** @type {const} */ ("party"), host, callers, denied, owners: owners.length ? owners : undefined };
+  const item = { key, kind: /** @type {const} */ ("party"), host, callers, denied, found, owners: owners.length ? owners : undefined };
   if (owners.length) put(model, { ...item, name: shown(host) || "no address", sub: `uses names of ${owners.length > 1 ? counted(owners.length, "host") : shown(owners[0])}`, brief: "uses others' names" });
   else if (callers.length > 1) put(model, { ...item, name: shown(host) || "no address", sub: `${counted(callers.length, "name")} · ${times}`, brief: times });
   else put(model, { ...item, name: callers[0] ?? "no name", sub: `${shown(host)} · ${times}`, brief: times });

@@ -1,5 +1,6 @@
 /** Graph: nodes, topics and services, through the relay or past it, and denied hosts. */
 
+import { useDeniedCounts } from "../audit/denied_hosts.js";
 import { html, useEffect, useMemo, useRef, useState } from "../html.js";
 import { live } from "../live.js";
 import { notable } from "../notable.js";
@@ -37,8 +38,9 @@ export function GraphView() {
     loadLayout().then(() => setLayout({ loaded: true, error: null }), (error) => setLayout({ loaded: false, error }));
   }, []);
   const shownHost = useShown();
+  const counts = useDeniedCounts(denials?.[0]?.sequence ?? 0);
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
-  const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted, shownHost), search) : null), [graph, recent, wanted, search, shownHost]);
+  const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted, shownHost, counts), search) : null), [graph, recent, wanted, search, shownHost, counts]);
   const ready = model !== null && layout.loaded && denials !== null;
   const shown = useMemo(() => (model && ready ? collapse(model, opened, by, MOST, shownHost) : null), [model, opened, by, ready]);
   const closed = useMemo(() => (model && ready && opened.size ? collapse(model, new Set(), by, MOST, shownHost) : shown), [shown]);

@@ -3,7 +3,7 @@
 import { html, useState } from "../html.js";
 import { live } from "../live.js";
 import { Moment } from "../moments.js";
-import { count, counted } from "../numbers.js";
+import { count, counted, lately } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Dialog } from "../parts/dialog.js";
@@ -23,7 +23,7 @@ import { may } from "../session.js";
 import { useStore } from "../store.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
-import { counters, stateOf } from "./state.js";
+import { counters, countOf, stateOf } from "./state.js";
 import { MonitorSwitch, Promote, Resume } from "./switches.js";
 
 /** @param {{name: string, row: any, monitors: any}} given `row` is undefined for a monitor that is not loaded */
@@ -46,7 +46,7 @@ export function MonitorPage({ name, row, monitors }) {
 function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
   const samples = useStore(live, (one) => one.samples);
   const [span, setSpan] = useState(900);
-  const series = /** @type {any[]} */ ([["verdicts", "c1", 0], ["dropped", "c2", 1], ["changed", "c3", 2], ["faults", "c4", 3]]).map(([word, colour, place]) => ({ name: word, colour, points: counters(samples, name, place) }));
+  const series = /** @type {any[]} */ ([["verdicts", "c1", 0], ["dropped", "c2", 1], ["changed", "c3", 2], ["faults", "c4", 3]]).map(([word, colour, place]) => ({ name: word, colour, points: counters(samples, name, place), lately: lately(samples, countOf(name, place)) }));
   return html`<section class="panel" aria-labelledby="verdicts"><div class="panel-head"><h2 id="verdicts">Activity</h2><span class="end">${[[900, "15 min"], [3600, "1 h"]].map(([seconds, word]) => html`<button key=${word} class="button small" aria-pressed=${String(span === seconds)} onClick=${() => setSpan(Number(seconds))}>${word}</button>`)}</span></div>
     <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.shadow ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults], ...(row.slice_limit ? [["Slices", row.slices], ["Slice limit", row.slice_limit]] : [])].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
       <${Plot} label=${`What ${name} does`} series=${series} span=${span} /></div></section>`;

@@ -54,5 +54,10 @@ export function stateOf(row) {
 
 /** The growth of a monitor's counter over the samples. @param {any[]} samples @param {string} name @param {number} place */
 export function counters(samples, name, place) {
-  return growth(samples, (one) => one.monitors[name]?.[place] ?? 0);
+  return growth(samples, countOf(name, place));
+}
+
+/** Read a monitor's counter from a sample. @param {string} name @param {number} place */
+export function countOf(name, place) {
+  return (/** @type {any} */ sample) => sample.monitors[name]?.[place] ?? 0;
 }
