@@ -15,7 +15,7 @@ import { auditPath } from "./filters.js";
 const SHOWN = 5;
 const MOST_COUNTED = 200;
 const FOLDER = /\s\/\S*\/(?=[^/\s]+:\d+$)/; // of the policy's file, before its name and line
-const EVERY = 15_000; // milliseconds between two summaries while denials arrive
+const EVERY = 30_000; // milliseconds between two summaries while denials arrive
 
 /** @param {{since: string, until?: string, mark: unknown, title?: string}} given `mark`: another one after a new denial; the block is empty without denials */
 export function DeniedHosts({ since, until, mark, title = "" }) {
