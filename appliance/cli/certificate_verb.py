@@ -5,10 +5,10 @@ import sys
 
 from appliance.base.owner_access import open_named
 from appliance.cli.connection.target import DEFAULT_STATE, State
-from appliance.cli.output import usage_error
+from appliance.cli.output import Json, say_json, usage_error
 
 
-def certificate(state: State = DEFAULT_STATE) -> None:
+def certificate(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
     """Print the certificate of console and REST (PEM): for --api-ca, for curl's --cacert, or for a browser.
 
     The appliance makes it at its first start. It contains no secret.
@@ -27,4 +27,7 @@ def certificate(state: State = DEFAULT_STATE) -> None:
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise usage_error(f"{file} cannot be read: {error}", "rosrv certificate") from None
-    sys.stdout.write(text)
+    if as_json:
+        say_json({"certificate": text})
+    else:
+        sys.stdout.write(text)

@@ -8,6 +8,7 @@ import typer
 from appliance.backup.contents import BackupError
 from appliance.backup.rotate_authority import rotate_authority
 from appliance.cli.connection.target import DEFAULT_STATE, State
+from appliance.cli.output import Json, say_json
 from rosmop.tool.terminal import printable, refused, say
 
 
@@ -17,6 +18,7 @@ def rotate(
         str | None,
         typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
     ] = None,
+    as_json: Json = False,
 ) -> None:
     """Erase the key of the hosts' authority: the next start makes another. Stop the appliance first.
 
@@ -33,6 +35,9 @@ def rotate(
         rotate_authority(state)
     except BackupError as error:
         raise refused([f"rosrv: {error}"]) from None
+    if as_json:
+        say_json({"state": str(state)})
+        return
     say(
         "The key is erased. Start the appliance, which makes another; then, for each host of `rosrv host list`:"
     )
