@@ -35,8 +35,7 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.record_format import as_object
-from appliance.audit.repeated import recorded_in_full
-from appliance.audit.search import Follower, RecordInContext, export, show
+from appliance.audit.search import Follower, RecordInContext, export, recorded_in_full, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verification import verify
 from appliance.channel.admin import PolicyWanted

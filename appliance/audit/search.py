@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
+from appliance.audit.equality import FOLDED, equal_key
 from appliance.audit.ids import ID_LENGTH
 from appliance.audit.log_database import COLUMNS, LogUnreadableError, open_for_reading
 from appliance.audit.query import (
@@ -29,6 +30,7 @@ from appliance.audit.record_format import LogEntry
 
 LARGEST_PAGE = 10_000
 _SELECTIVE = 20_000
+_BEFORE_A_COUNT = 200  # records; a monitor's count is at most a second later than its record in full
 _Found = TypeVar("_Found")
 
 
@@ -91,6 +93,24 @@ def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
 def last_sequence(path: Path) -> int:
     """Return the sequence of the last record; 0 if there is none."""
     return _reading(path, _last_sequence)
+
+
+def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
+    """Return the record in full that a record of repetitions continues; None if there is none, or no more.
+
+    Raises `LogUnreadableError`.
+    """
+    record = entry.record
+    if record.event in FOLDED:
+        shown = show(path, str(record.detail.get("recorded_id", "")), 0)
+        return None if shown is None else shown.entry
+    if not ("count" in record.detail and "monitor" in record.detail):
+        return None
+    wanted = Filter(event=record.event, category=record.category)
+    page = search(path, wanted, str(entry.sequence), _BEFORE_A_COUNT)
+    key = equal_key(record)
+    earlier = (one for one in page.entries if "count" not in one.record.detail)
+    return next((one for one in earlier if key.equals(equal_key(one.record))), None)
 
 
 class Follower:

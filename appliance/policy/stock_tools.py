@@ -11,6 +11,7 @@ from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import Right, rights_of
 
 _READ = ("/use_sim_time", "/tcp_keepalive")
+_LONGEST = 256  # characters of a tool's own name
 _LOG_LEVEL = ("get_loggers", "set_logger_level")
 
 
@@ -50,6 +51,8 @@ _TOOLS = (
 
 def stock_tool(caller_id: str) -> StockTool | None:
     """Return the tool that calls under this name: `/rostopic`, `/rostopic_4711_1700000000000`, `/rosparam-4711`."""
+    if len(caller_id) > _LONGEST:
+        return None
     key = key_of(caller_id)
     own = key.removeprefix("/").removesuffix("_*").partition("-")[0]
     if key == caller_id and not own.startswith("ros"):

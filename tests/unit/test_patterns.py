@@ -37,7 +37,7 @@ LIMITED = {
     "appliance.configuration.inventory:_LICENCE": "the licence files of the installation",
     "appliance.ipsec.leftovers:_ENCAPSULATED": "the output of `ip xfrm`",
     "appliance.ipsec.leftovers:_POLICY": "the output of `ip xfrm`",
-    "appliance.policy.learn:_ANONYMOUS": "a node's name, 1024 characters; the command line runs it",
+    "appliance.policy.anonymous_names:_ANONYMOUS": "a tool's name, 256 characters; `learn` on the command line: 1024",
     "appliance.rpc.method_name:_METHOD": "4096 bytes, `_BEGINNING`",
     "roswire.xmlrpc.common_documents:_CALL": "32 KiB, `_LONGEST`",
     "roswire.xmlrpc.common_documents:_CALL_IN": "32 KiB, `_LONGEST`",

@@ -288,16 +288,16 @@ WALL_CLOCK = {
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/stored_times.py",
+        "control/alarm_orders.py", "control/stored_times.py",
         "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
     ],
     "whether the wall clock can be believed, and where it is read": [
         "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/alarms.py", "api/moments.py", "audit/filter_options.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
-        "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
-        "cli/status_verb.py", "cli/topic_verbs.py",
+        "api/moments.py", "channel/alarms.py", "audit/filter_options.py", "cli/evidence_verbs.py",
+        "cli/monitor/offline.py", "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
+        "cli/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""

@@ -45,7 +45,7 @@ def _explained(appliance: Appliance, record: str) -> Why:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
     from appliance.api.denials import asks_policy  # noqa: PLC0415  not for every verb
     from appliance.api.dry_run_policy import explained  # noqa: PLC0415  as above
-    from appliance.audit.repeated import recorded_in_full  # noqa: PLC0415  as above
+    from appliance.audit.search import recorded_in_full  # noqa: PLC0415  as above
 
     with Errors():
         entry = _entry(appliance, record)

@@ -165,7 +165,7 @@ class RosGraph:
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
             DropCalls(incarnation),
-            _record("node lost", why, incarnation, severity=_SEVERITY_OF_LOSS[incarnation.own]),
+            _record("node lost", why, incarnation, severity=Severity.NOTICE),
         ]
 
     def returned(self, incarnation: Incarnation) -> Effects:
@@ -418,9 +418,6 @@ def revocation(
     )
 
 
-_SEVERITY_OF_LOSS = {False: Severity.NOTICE, True: Severity.INFO}  # rosout is lost at each start
-
-
 def _record(
     event: str,
     reason: str,
@@ -430,8 +427,11 @@ def _record(
     *,
     severity: Severity = Severity.INFO,
 ) -> WriteRecord:
-    about = node.name if resource is None else resource
-    return WriteRecord(event, reason, str(node.host), node.name, category, about, severity)
+    about, level = (
+        resource or node.name,
+        Severity.INFO if node.own else severity,
+    )  # rosout is lost at each start
+    return WriteRecord(event, reason, str(node.host), node.name, category, about, level)
 
 
 def _at_master(incarnation: Incarnation, ended: Iterable[NodeRegistration]) -> Effects:

@@ -106,7 +106,7 @@ def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
 
 
 def test_only_a_present_alarm_is_handled(robot: Robot) -> None:
-    """A typing error would otherwise silence nothing; nobody silences an alarm for ever, or in advance."""
+    """A typing error is reported; an alarm is not silenced for ever, or in advance."""
     with pytest.raises(SenselessError):
         robot.silence(8 * 86_400)
     with pytest.raises(UnknownThingError, match="neither silenced"):

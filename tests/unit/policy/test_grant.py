@@ -220,7 +220,7 @@ def test_a_stock_tool_gets_all_that_it_needs(file: Path, caller: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["/record", "/cmd_1_1700000000000", "/arm"])
-def test_a_name_that_is_no_tools_is_granted_alone(name: str) -> None:
+def test_another_name_is_granted_alone(name: str) -> None:
     """A host that invents a name with numbers gets no pattern such as /cmd_*, which would also match /cmd_vel."""
     assert stock_tool(name) is None
     wanted = Request(HOST, name, Category.NODE, name)
