@@ -25,7 +25,7 @@ class Deadlines:
         return clock.wall() >= end or clock.since_boot() >= min(known[1], self._limits.get(name, math.inf))
 
     def limit(self, left: Mapping[str, float]) -> None:
-        """Let each of these ends pass in at most so many seconds, whatever the system time is."""
+        """Let each of these ends pass in at most the given number of seconds, whatever the system time is."""
         now = clock.since_boot()
         for name, seconds in left.items():
             self._limits[name] = min(now + seconds, self._limits.get(name, math.inf))
