@@ -9,7 +9,9 @@ from appliance.relay.relay_limits import RelayLimits
 
 
 @pytest.mark.parametrize(("unsettled", "seconds"), [(False, 0.0), (True, RelayLimits().linger)])
-def test_a_lazy_publisher_learns_at_once_that_its_last_subscriber_left(unsettled: bool, seconds: float) -> None:
+def test_a_lazy_publisher_learns_at_once_that_its_last_subscriber_left(
+    unsettled: bool, seconds: float
+) -> None:
     """Its connection stays only during a reload or a restart, and only until its subscriber may have returned."""
     context = MagicMock(limits=RelayLimits())
     publisher = PublisherConnection(
