@@ -34,6 +34,7 @@ from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
 from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
+from appliance.control.service_report import ServiceReport
 from appliance.control.spare_memory import return_spare_memory
 from appliance.control.standby_orders import begin_epoch, standby_source
 from appliance.control.stored_times import note_times
@@ -210,20 +211,10 @@ class _Control:
         base.lifeline.say(messages.Ready(detail))
         if base.pair is not None:
             reports = run_always(
-                "the reports to the lease", partial(base.pair.lease.report_service, self._service)
+                "the reports to the lease",
+                partial(base.pair.lease.report_service, ServiceReport(base, self._parts).now),
             )
             self._tasks.append(asyncio.get_running_loop().create_task(reports))
-
-    def _service(self) -> messages.ControlServes:
-        """Return whether this appliance can serve now, and what a takeover would lose."""
-        failed, monitors = self._base.audit.failed, self._parts.monitors
-        obstacle = ""
-        if failed is not None and self._base.settings.audit.on_audit_failure == "deny":
-            obstacle = f"nothing is granted, because the audit log cannot be written: {failed}"
-        keeps_state = any(
-            owner.holds and monitors.switches.enabled(name) for name, owner in monitors.checked.states.items()
-        )
-        return messages.ControlServes(obstacle, keeps_state)
 
     async def end(self) -> None:
         base, parts, ends = self._base, self._parts, self._parts.endpoints

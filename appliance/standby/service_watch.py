@@ -8,8 +8,8 @@ again has `RESTART_SECONDS`, because topics and the state of monitors need no co
 a lapse meets a control that has just begun to start, without relays. The other appliance takes over sooner, so it gets
 the lease, unless a monitor would then hold its topics, because its state would be lost.
 
-Each time that the lease is given away, all limits are doubled until this appliance has served for a minute: two
-appliances on busy machines must not pass the lease back and forth.
+Each time that the lease is given away, all limits are doubled for some minutes: two appliances on busy machines must
+not pass the lease back and forth.
 """
 
 from appliance.standby.witness import EXPIRY
@@ -18,7 +18,7 @@ OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 RESTART_SECONDS = 10.0
-_STEADY_SECONDS = 60.0
+_DOUBLED_SECONDS = 60  # times the factor
 _MOST_DOUBLINGS = 5
 
 
@@ -30,11 +30,11 @@ class ServiceWatch:
         self._cold = False
         self._keeps_state = True
         self._served = 0.0  # time of the last report without an obstacle; at first of the activation
-        self._steady_since: float | None = None
         self._serves = False  # whether the present control has served
         self._relays = False  # whether a control has served in this activation
         self._obstacle = ""
         self._obstacle_since = 0.0
+        self._given_away = 0.0
         self._doublings = 0
 
     def linked(self) -> None:
@@ -47,18 +47,14 @@ class ServiceWatch:
         if not obstacle:
             self._served, self._cold = now, False
             self._serves = self._relays = True
-            self._steady_since = now if self._steady_since is None else self._steady_since
-            if now - self._steady_since > _STEADY_SECONDS:
-                self._doublings = 0
-        else:
-            self._steady_since = None
-            self._obstacle_since = self._obstacle_since if self._obstacle else now
+        elif not self._obstacle:
+            self._obstacle_since = now
         self._obstacle = obstacle
 
     def fault(self, now: float, *, active: bool, present: bool = True) -> str:
         """Return why the lease should be given away; empty: it should not. `present`: control stands by or serves."""
         if active and not self._active:
-            self._served, self._steady_since, self._cold = now, None, not present
+            self._served, self._cold = now, not present
             self._relays = False
             self.linked()
         self._active = active
@@ -66,6 +62,8 @@ class ServiceWatch:
             return ""
         if self._cold and not self._keeps_state:
             return "control has just started when the lease came back"
+        if now - self._given_away > _DOUBLED_SECONDS << self._doublings:
+            self._doublings = 0
         scale = 1 << self._doublings
         if self._obstacle:
             late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
@@ -77,6 +75,7 @@ class ServiceWatch:
         what = "has not reported" if self._serves else "has not been ready"
         return f"control {what} for {silent:.1f} s"
 
-    def given_away(self) -> None:
+    def given_away(self, now: float) -> None:
         """Note that the lease was given away."""
+        self._given_away = now
         self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)

@@ -1,0 +1,75 @@
+"""Tests of `appliance.control.service_report`: what an active appliance reports to its lease."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from appliance.base import clock
+from appliance.channel.messages import ControlServes
+from appliance.control.service_report import ServiceReport
+from tests.support.virtual_clock import VirtualClock
+
+
+class Control:
+    """A control that serves; a test changes its parts."""
+
+    def __init__(self) -> None:
+        self.audit = SimpleNamespace(failed=None)
+        self.policy = SimpleNamespace(on_audit_failure="deny")
+        self.surroundings = SimpleNamespace(probe="passed")
+        self.relay = SimpleNamespace(presence="connected")
+        self.switches = SimpleNamespace(enabled=lambda name: name == "gun")
+        self.checked = SimpleNamespace(states={"gun": SimpleNamespace(holds=False)})
+
+    def report(self) -> ServiceReport:
+        """Return its reports."""
+        base: Any = SimpleNamespace(
+            audit=self.audit,
+            settings=SimpleNamespace(audit=self.policy),
+            lifeline=SimpleNamespace(surroundings=self.surroundings),
+        )
+        parts: Any = SimpleNamespace(
+            monitors=SimpleNamespace(switches=self.switches, checked=self.checked),
+            endpoints=SimpleNamespace(relay=self.relay),
+        )
+        return ServiceReport(base, parts)
+
+
+def test_a_full_disk_is_an_obstacle_only_if_nothing_is_granted_then() -> None:
+    """`audit.on_audit_failure: allow` goes on without records."""
+    control = Control()
+    report = control.report()
+    assert report.now() == ControlServes("", keeps_state=False)
+    control.audit.failed = "audit.db: the disk is full"
+    assert "cannot be written: audit.db: the disk is full" in report.now().obstacle
+    control.policy.on_audit_failure = "allow"
+    assert report.now().obstacle == ""
+
+
+@pytest.mark.parametrize("broken", [("relay", "presence", "away"), ("surroundings", "probe", "it answers")])
+def test_what_is_repaired_in_time_is_no_obstacle(broken: tuple[str, str, str]) -> None:
+    """Relays start again, and the firewall is written again; if not, another appliance should serve."""
+    part, field, value = broken
+    control, machine = Control(), VirtualClock()
+    with clock.using(machine):
+        report = control.report()
+        before = getattr(getattr(control, part), field)
+        for seconds, state, found in (
+            (7, value, False),
+            (7, before, False),
+            (7, value, False),
+            (9, value, True),
+        ):
+            setattr(getattr(control, part), field, state)
+            machine.advance(seconds)
+            assert bool(report.now().obstacle) is found
+
+
+def test_only_monitors_in_force_keep_state() -> None:
+    """A monitor that is disabled or in shadow mode holds nothing after a takeover."""
+    control = Control()
+    control.checked.states = {"gun": SimpleNamespace(holds=True), "arm": SimpleNamespace(holds=False)}
+    assert control.report().now().keeps_state
+    control.checked.states = {"gun": SimpleNamespace(holds=False), "arm": SimpleNamespace(holds=True)}
+    assert not control.report().now().keeps_state
