@@ -34,9 +34,8 @@ from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
 from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
-from appliance.control.service_report import ServiceReport
 from appliance.control.spare_memory import return_spare_memory
-from appliance.control.standby_orders import begin_epoch, standby_source
+from appliance.control.standby_orders import begin_epoch, service_reports, standby_source
 from appliance.control.stored_times import note_times
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
@@ -210,10 +209,7 @@ class _Control:
         }
         base.lifeline.say(messages.Ready(detail))
         if base.pair is not None:
-            reports = run_always(
-                "the reports to the lease",
-                partial(base.pair.lease.report_service, ServiceReport(base, self._parts).now),
-            )
+            reports = run_always("the reports to the lease", service_reports(base, self._parts, base.pair))
             self._tasks.append(asyncio.get_running_loop().create_task(reports))
 
     async def end(self) -> None:

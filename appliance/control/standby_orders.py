@@ -15,7 +15,8 @@ from appliance.control.errors import UnknownThingError
 from appliance.control.foundation import Foundation
 from appliance.control.inheritance import inherited_state, keep_state, leave_state
 from appliance.control.lease_client import HandOverError
-from appliance.control.replication import Replication
+from appliance.control.replication import Pair, Replication
+from appliance.control.service_report import ServiceReport
 from appliance.control.takeover_record import TakeoverRecorder
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -113,6 +114,11 @@ def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | 
             _log.warning("the log is not sealed before the switchover: the signer does not answer")
 
     return ActiveAppliance(replication, leaving, partial(keep_state, base.store, rollout))
+
+
+def service_reports(base: Foundation, parts: Parts, pair: Pair) -> Callable[[], Awaitable[None]]:
+    """Return the reports to the lease, of an appliance that serves from now on."""
+    return partial(pair.lease.report_service, ServiceReport(base, parts).now)
 
 
 class StandbyOrders:

@@ -135,7 +135,7 @@ class LeaseProcess:
             return
         with contextlib.suppress(LeaseError):  # the other appliance could not serve, either
             due = self._lease.switch_over(now)
-            self._service.given_away(now)
+            self._service.given_away()
             _log.error(
                 "the lease is given to the other appliance, because this one does not serve", reason=fault
             )

@@ -8,8 +8,8 @@ again has `RESTART_SECONDS`, because topics and the state of monitors need no co
 a lapse meets a control that has just begun to start, without relays. The other appliance takes over sooner, so it gets
 the lease, unless a monitor would then hold its topics, because its state would be lost.
 
-Each time that the lease is given away, all limits are doubled for some minutes: two appliances on busy machines must
-not pass the lease back and forth.
+If the lease is given away after less than `STEADY_SECONDS` of service, all limits are doubled the next time: two
+appliances that both cannot serve must not pass it back and forth.
 """
 
 from appliance.standby.witness import EXPIRY
@@ -18,7 +18,7 @@ OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 RESTART_SECONDS = 10.0
-_DOUBLED_SECONDS = 60  # times the factor
+STEADY_SECONDS = 10.0
 _MOST_DOUBLINGS = 5
 
 
@@ -31,10 +31,9 @@ class ServiceWatch:
         self._keeps_state = True
         self._served = 0.0  # time of the last report without an obstacle; at first of the activation
         self._serves = False  # whether the present control has served
-        self._relays = False  # whether a control has served in this activation
+        self._ready: float | None = None  # time of the first report without an obstacle in this activation
         self._obstacle = ""
         self._obstacle_since = 0.0
-        self._given_away = 0.0
         self._doublings = 0
 
     def linked(self) -> None:
@@ -45,8 +44,8 @@ class ServiceWatch:
         """Take a report of control; an empty obstacle: it serves."""
         self._keeps_state = keeps_state
         if not obstacle:
-            self._served, self._cold = now, False
-            self._serves = self._relays = True
+            self._served, self._serves, self._cold = now, True, False
+            self._ready = now if self._ready is None else self._ready
         elif not self._obstacle:
             self._obstacle_since = now
         self._obstacle = obstacle
@@ -55,27 +54,25 @@ class ServiceWatch:
         """Return why the lease should be given away; empty: it should not. `present`: control stands by or serves."""
         if active and not self._active:
             self._served, self._cold = now, not present
-            self._relays = False
+            self._ready = None
             self.linked()
         self._active = active
         if not active:
             return ""
         if self._cold and not self._keeps_state:
             return "control has just started when the lease came back"
-        if now - self._given_away > _DOUBLED_SECONDS << self._doublings:
-            self._doublings = 0
         scale = 1 << self._doublings
         if self._obstacle:
             late = now - self._obstacle_since > scale * OBSTACLE_SECONDS
             return self._obstacle if late else ""
         silent = now - self._served
-        limit = RESTART_SECONDS if self._relays else START_SECONDS
+        limit = START_SECONDS if self._ready is None else RESTART_SECONDS
         if silent <= scale * (SILENT_SECONDS if self._serves else limit):
             return ""
         what = "has not reported" if self._serves else "has not been ready"
         return f"control {what} for {silent:.1f} s"
 
-    def given_away(self, now: float) -> None:
+    def given_away(self) -> None:
         """Note that the lease was given away."""
-        self._given_away = now
-        self._doublings = min(self._doublings + 1, _MOST_DOUBLINGS)
+        steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS
+        self._doublings = 0 if steady else min(self._doublings + 1, _MOST_DOUBLINGS)

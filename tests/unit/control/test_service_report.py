@@ -48,7 +48,7 @@ def test_a_full_disk_is_an_obstacle_only_if_nothing_is_granted_then() -> None:
 
 
 @pytest.mark.parametrize("broken", [("relay", "presence", "away"), ("surroundings", "probe", "it answers")])
-def test_what_is_repaired_in_time_is_no_obstacle(broken: tuple[str, str, str]) -> None:
+def test_damage_that_is_repaired_in_time_is_not_reported(broken: tuple[str, str, str]) -> None:
     """Relays start again, and the firewall is written again; if not, another appliance should serve."""
     part, field, value = broken
     control, machine = Control(), VirtualClock()

@@ -1,10 +1,13 @@
 """Tests of `appliance.standby.service_watch`: when an active appliance does not serve."""
 
+import pytest
+
 from appliance.standby.service_watch import (
     OBSTACLE_SECONDS,
     RESTART_SECONDS,
     SILENT_SECONDS,
     START_SECONDS,
+    STEADY_SECONDS,
     ServiceWatch,
 )
 
@@ -59,11 +62,12 @@ def test_an_obstacle_that_lasts() -> None:
     assert watch.fault(105.0, active=True) == ""
 
 
-def test_two_appliances_do_not_pass_the_lease_back_and_forth() -> None:
-    """Each time, the limits are doubled for some minutes."""
+@pytest.mark.parametrize(("seconds", "factor"), [(STEADY_SECONDS - 1, 2), (STEADY_SECONDS + 1, 1)])
+def test_two_appliances_do_not_pass_the_lease_back_and_forth(seconds: float, factor: int) -> None:
+    """If one serves for a short time only, its limits are doubled the next time, until it has served for longer."""
     watch = serving()
-    watch.given_away(105.0)
-    for now, factor in ((150.0, 2), (300.0, 1)):
-        assert watch.fault(now, active=False) == watch.fault(now, active=True) == ""
-        assert watch.fault(now + factor * START_SECONDS, active=True) == ""
-        assert watch.fault(now + factor * START_SECONDS + 0.1, active=True)
+    watch.reported(102.0 + seconds, "", keeps_state=False)
+    watch.given_away()
+    assert watch.fault(200.0, active=False) == watch.fault(200.0, active=True) == ""
+    assert watch.fault(200.0 + factor * START_SECONDS, active=True) == ""
+    assert watch.fault(200.1 + factor * START_SECONDS, active=True)
