@@ -74,5 +74,7 @@ class ServiceWatch:
 
     def given_away(self) -> None:
         """Note that the lease was given away."""
+        if self._cold:
+            return  # the other one stands by, and nothing was tried here
         steady = self._ready is not None and self._served - self._ready > STEADY_SECONDS
         self._doublings = 0 if steady else min(self._doublings + 1, _MOST_DOUBLINGS)

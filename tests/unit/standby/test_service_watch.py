@@ -37,8 +37,10 @@ def test_a_lease_that_comes_back_before_control() -> None:
         watch.reported(102.5, "", keeps_state=keeps_state)
         assert watch.fault(103.0, active=False) == ""
         assert ("just started" in watch.fault(103.3, active=True, present=False)) is not keeps_state
+        watch.given_away()
         watch.reported(105.0, "", keeps_state=keeps_state)
-        assert watch.fault(105.0, active=True) == ""
+        assert watch.fault(105.0 + SILENT_SECONDS, active=True) == ""
+        assert watch.fault(105.1 + SILENT_SECONDS, active=True)
 
 
 def test_a_control_that_hangs_and_one_that_starts_again() -> None:
