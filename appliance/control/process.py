@@ -28,14 +28,13 @@ from appliance.configuration.settings import Settings, load_resolved
 from appliance.control.admin_socket import AdminServer
 from appliance.control.assembly import Parts, assemble
 from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
-from appliance.control.inheritance import StateCopies
 from appliance.control.lease_client import LeaseClient
 from appliance.control.operators import Operators, make_operators
 from appliance.control.passive import until_activated
 from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.robot import master_address
 from appliance.control.spare_memory import return_spare_memory
-from appliance.control.standby_orders import begin_epoch, service_reports, standby_source
+from appliance.control.standby_orders import begin_epoch, service_reports, standby_source, state_copies
 from appliance.control.stored_times import note_times
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
@@ -173,8 +172,7 @@ class _Control:
                 work["the readings of the clocks"] = partial(
                     note_times, base.store, base.pair, base.blocks.age_now
                 )
-                followed = base.replication.followed
-                copies = StateCopies(base.pair, base.store, parts.monitors.rollout, followed)
+                copies = state_copies(base.pair, base.replication, base, parts)
                 work["the copies of monitors' state"] = copies.run
             work["the orders of the standby"] = partial(
                 operators.standby.obey,

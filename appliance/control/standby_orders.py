@@ -13,7 +13,7 @@ from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
 from appliance.control.foundation import Foundation
-from appliance.control.inheritance import inherited_state, keep_state, leave_state
+from appliance.control.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Pair, Replication
 from appliance.control.service_report import ServiceReport
@@ -119,6 +119,11 @@ def standby_source(base: Foundation, parts: Parts, recorder: TakeoverRecorder | 
 def service_reports(base: Foundation, parts: Parts, pair: Pair) -> Callable[[], Awaitable[None]]:
     """Return the reports to the lease, of an appliance that serves from now on."""
     return partial(pair.lease.report_service, ServiceReport(base, parts).now)
+
+
+def state_copies(pair: Pair, replication: Replication, base: Foundation, parts: Parts) -> StateCopies:
+    """Return the copies of the state of monitors for the standby."""
+    return StateCopies(pair, base.store, parts.monitors.rollout, replication.followed)
 
 
 class StandbyOrders:
