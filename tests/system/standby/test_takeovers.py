@@ -27,14 +27,14 @@ ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
 def orders(site: StandbySite, name: str) -> list[Any]:
-    """Return the orders of operators: policies, specifications, tokens."""
+    """Return the orders of operators: policies, specifications, tokens. A takeover moves the ends of tokens."""
     one = site.appliances[name]
     monitors = one.ask(admin.MonitorsWanted(True))
     return [
         one.ask(admin.PolicyRevisions()),
         [found.name for found in monitors.monitors],
-        [(token.id, token.name, token.role) for token in one.ask(admin.TokenList()).tokens],
-    ]  # a token keeps the time that it has left, so its end moves by the length of a takeover
+        [(token.id, token.name, token.role, token.revoked) for token in one.ask(admin.TokenList()).tokens],
+    ]
 
 
 @pytest.fixture(autouse=True)
