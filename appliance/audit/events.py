@@ -143,6 +143,7 @@ EVENTS: dict[str, str] = {
     " reasons. The last good one stays in force.",
     "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
     " older than known, or for other robots.",
+    "fleet not joined": "After a takeover, this appliance of a pair is not in the other one's fleet: both must join.",
     "forwarding failed": "The receiver of the forwarded log was unreachable for ten seconds; records wait in the"
     " appliance.",
     "forwarding resumed": "The receiver of the forwarded log is reachable again.",
@@ -181,8 +182,9 @@ SEVERITIES: dict[str, Severity] = {
             "tunnel refused",
         ),
         Severity.ALARM: (
-            "forwarding gap", "monitor not built", "monitors restarted", "policy file refused", "probe failed",
-            "process failing", "protection forgotten", "publication refused", "records lost", "topics held",
+            "fleet not joined", "forwarding gap", "monitor not built", "monitors restarted", "policy file refused",
+            "probe failed", "process failing", "protection forgotten", "publication refused", "records lost",
+            "topics held",
         ),
     }.items()
     for name in names

@@ -12,6 +12,7 @@ from appliance.channel.admin import A
 from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
+from appliance.control.fleet_of_pair import compare_fleets
 from appliance.control.foundation import Foundation
 from appliance.control.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.control.lease_client import HandOverError
@@ -94,6 +95,7 @@ async def begin_epoch(base: Foundation, parts: Parts) -> TakeoverRecorder | None
         base.trail, base.audit, base.store, base.signing.signed, name=name, other=other
     )
     await recorder.took_over(pair.epoch)
+    compare_fleets(base.settings.fleet, base.store, base.trail, name=name)
     parts.monitors.rollout.inherit(*inherited_state(pair, base.store))
     return recorder
 

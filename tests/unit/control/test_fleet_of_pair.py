@@ -1,0 +1,42 @@
+"""Tests of `appliance.control.fleet_of_pair`: a pair of which one appliance is not in the fleet is noticed."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.configuration.settings import Fleet
+from appliance.control.fleet_of_pair import compare_fleets
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.engines import InlineDatabase
+
+FILES: dict[str, Any] = {name: Path(name) for name in ("ca", "certificate", "key", "receipt_key")}
+JOINED = Fleet(collector="https://10.0.0.9:8444", robot="arm7", **FILES)
+OTHER = Fleet(collector="https://10.0.0.9:8444", robot="arm8", **FILES)
+
+
+@pytest.mark.parametrize(
+    ("takeovers", "alarms"),
+    [
+        ([("a", JOINED), ("b", JOINED), ("a", JOINED)], 0),
+        ([("a", Fleet()), ("b", Fleet())], 0),
+        ([("a", JOINED), ("b", Fleet()), ("b", Fleet()), ("b", JOINED)], 2),
+        ([("a", JOINED), ("b", OTHER)], 1),
+        ([("a", JOINED), ("a", Fleet()), ("b", Fleet())], 0),
+    ],
+    ids=["both", "none", "one", "as another robot", "left"],
+)
+def test_an_appliance_that_did_not_join_raises_an_alarm(
+    takeovers: list[tuple[str, Fleet]], alarms: int, tmp_path: Path
+) -> None:
+    """Each start of an active appliance compares its fleet with that of the other one, until both agree."""
+    store = StateStore(tmp_path, failed=lambda _reason: None, kind=InlineDatabase)
+    said: list[str] = []
+    trail = cast(AuditTrail, SimpleNamespace(happened=lambda _event, reason, **_detail: said.append(reason)))
+    for name, fleet in takeovers:
+        compare_fleets(fleet, store, trail, name=name)
+    assert len(said) == alarms
+    if alarms == 2:
+        assert "rosrv-fleet robot invite arm7 --appliance b" in said[0]
