@@ -339,7 +339,7 @@ REST_CONNECTIONS = QuotaRow(
 )
 _STREAMS_SHOWN_BY = (
     "unit/api/test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
-    "integration/api/test_audit.py::test_followers_have_a_quota_of_streams",
+    "unit/api/test_streams.py::test_one_token_and_one_host_have_a_quota",
 )
 REST_STREAMS = QuotaRow(
     thing="streams of REST by token: followers of the audit log, and of `/v1/live` (a limit for each)",
