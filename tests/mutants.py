@@ -209,7 +209,7 @@ class Hunt:
         with tempfile.NamedTemporaryFile("r") as answer:
             child = os.fork()
             if not child:
-                # Of the processor, for a busy machine is not a hang.
+                # Time of the processor, because a busy machine is not a hang.
                 signal.setitimer(signal.ITIMER_PROF, seconds)
                 self._run(session, items, answer.name)
             ended = select.select([process := os.pidfd_open(child)], [], [], 10 * seconds)[0]

@@ -8,6 +8,7 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
+from appliance.standby.witness import EXPIRY
 
 _HAND_OVER_SECONDS = 5.0
 _SERVES_SECONDS = 0.5
@@ -64,6 +65,11 @@ class LeaseClient:
     def active(self) -> bool:
         """Whether this appliance may answer now."""
         return self.state is not None and clock.since_boot() < self.state.until
+
+    def hears_witness(self) -> bool:
+        """Whether the witness on the robot has just answered this appliance."""
+        answered = None if self.state is None else self.state.answered
+        return answered is not None and clock.since_boot() - answered <= EXPIRY
 
     async def until_active(self) -> None:
         """Wait until this appliance may answer. If the lease has ended, the supervisor ends this process."""

@@ -37,7 +37,6 @@ from appliance.standby.replica_sync import ReplicaSync
 from appliance.standby.replication_frames import ReplicationError
 from appliance.standby.replication_receiver import ReplicationReceiver
 from appliance.standby.replication_transport import follow_at
-from appliance.standby.witness import EXPIRY
 from appliance.store.state_file import SCHEMA
 from appliance.store.writer_thread import StoreError
 
@@ -194,8 +193,7 @@ class PassiveControl:
         """Ask the active appliance to hand over. Raises `HandOverError` if that is not possible now."""
         if self._check.obstacle:
             raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
-        lease = self._lease.state
-        if lease is None or lease.answered is None or clock.since_boot() - lease.answered > EXPIRY:
+        if not self._lease.hears_witness():
             raise HandOverError(
                 f"the witness on the robot ({self._membership.witness}) does not answer this appliance, so it could not"
                 " take over; check the network between the two"

@@ -22,7 +22,7 @@ _LONGEST_PATH = 4096
 _ERROR_BYTES = 4  # an answer: an error number, or 0 and a descriptor
 _NOT_AN_INPUT = (1 << 32) - 1
 _BESIDE = ("", ".sig", ".tests.yaml")
-_ANSWER_SECONDS = 0.5  # RVMaster may wait meanwhile
+_ANSWER_SECONDS = 0.5  # RVMaster may wait for it
 
 
 class Borrower:
