@@ -49,6 +49,17 @@ def open_named(path: Path) -> int:
     return lent
 
 
+def is_named_there(path: Path) -> bool:
+    """Whether a file or folder that an operator names exists, also where root may not look as itself."""
+    try:
+        os.close(open_named(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:  # it exists, and its reader reports why it cannot be used
+        return True
+    return True
+
+
 def open_as_owner(path: Path) -> int:
     """Open a file or folder with the rights of its folder's owner, or of its own. Raises `OSError`."""
     return _open_in(_folder(path.absolute().parent), path.name, path)

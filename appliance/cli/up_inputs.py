@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from appliance.base.actors import DISK
+from appliance.base.owner_access import is_named_there
 from appliance.configuration.settings import Settings
 from appliance.control.policy_gate import KeptPolicy, PolicyRefusedError, policy_at_start
 from appliance.control.robot import robot_addresses
@@ -62,7 +63,7 @@ def read_node_ports(settings: Settings, witness: str | None = None) -> range:
     except PolicyRefusedError as error:
         if not stored.complete or stored.policy is not None:
             return DEFAULT_PORTS  # RVMaster decides; it has the whole state
-        hint = "" if settings.policy.exists() else _NOTHING
+        hint = "" if is_named_there(settings.policy) else _NOTHING
         raise StartError(f"{error}{hint}") from None
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from msgspec.structs import asdict
 
+from appliance.base.owner_access import is_named_there
 from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.connection.target import Appliance
 from appliance.cli.policy.policy_input import known_of, live_now, read_text
@@ -37,7 +38,7 @@ def impact_of(
     try:
         policy = judge(read_text(file), str(file), known, read_signature(file)).accepted()
         beside = cases_beside(file)
-        if beside.exists() and str(beside.absolute()) != known.cases_file:
+        if is_named_there(beside) and str(beside.absolute()) != known.cases_file:
             own = replace(known, cases_file=str(beside), cases=read_text(beside), site_keys=())
             judge(policy.text, str(file), own).accepted()
     except PolicyError as error:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.owner_access import is_named_there
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, by_host, say_json
@@ -263,7 +264,7 @@ def _judge(
     file: Path, robot: list[str] | None, enrolled: list[str] | None, cases: Path | None = None
 ) -> PolicyJudgement:
     known, text = known_of(robot, enrolled), read_text(file)
-    if cases is not None and cases.exists():
+    if cases is not None and is_named_there(cases):
         known = replace(known, cases_file=str(cases), cases=read_text(cases))
     return judge(text, str(file), known)
 
