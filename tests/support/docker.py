@@ -102,7 +102,7 @@ class Engine:
 
     def compose(self, directory: Path, project: str, *files: str, **environment: str) -> "Compose":
         """Return the project of the compose files in `directory`; without `files`, compose finds its own."""
-        return Compose(self, directory, project, files, environment)
+        return Compose(self, directory, project, files, {"LANDSHARK_REPORTS": "json", **environment})
 
     def build(self, target: str, tag: str, context: Path = ROOT) -> None:
         """Run `docker build` for one target of the Dockerfile, on the base image made here."""

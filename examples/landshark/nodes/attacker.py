@@ -19,6 +19,8 @@ import xmlrpc.client
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from report import report
+
 MASTER = os.environ["ROS_MASTER_URI"]
 MY_ADDRESS = os.environ["ROS_IP"]
 MY_API = f"http://{MY_ADDRESS}:40404/"  # no program listens on this port
@@ -26,6 +28,7 @@ ME = "/tablet"  # a name that belongs to this host, so an attacker who took over
 VICTIM = "/landshark_laser"
 BATTERY, GPS = "/landshark/battery", "/landshark/gps"
 LIMIT = 3.0
+ROBOT_LIMIT = 60.0  # a robot may start after this host
 NODE_LIMIT = 15.0  # behind a master that does not answer, a node retries forever
 ROBOT = os.environ.get("LANDSHARK", "10.77.0.10")
 NODE_PORTS = range(32768, 61000)  # where Linux puts programs that do not choose: ROS nodes
@@ -75,7 +78,14 @@ def forge(name):
     """Run a rospy node that fires."""
     command = ["/usr/bin/python3", str(Path(__file__).with_name("forger.py")), name]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=NODE_LIMIT, check=False)
+        done = subprocess.run(
+            command,
+            env=os.environ | {"LANDSHARK_REPORTS": "json"},
+            capture_output=True,
+            text=True,
+            timeout=NODE_LIMIT,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         return (
             False,
@@ -100,8 +110,13 @@ def replace_a_driver():
 
 
 def watch_the_battery():
-    """Read the charge of the battery, which is this host's task."""
-    return subscribe(BATTERY)
+    """Read the charge of the battery, which is this host's task. Wait until the robot publishes it."""
+    deadline = time.monotonic() + ROBOT_LIMIT
+    while True:
+        succeeded, tried, answer = subscribe(BATTERY)
+        if succeeded or not granted(answer) or time.monotonic() > deadline:
+            return succeeded, tried, answer
+        time.sleep(1)
 
 
 def spy_on_gps():
@@ -252,8 +267,7 @@ def main():
         sys.exit(f"attacker.py: no attack {unknown[0]!r}; there are: {', '.join(ATTACKS)}")
     for name in sys.argv[1:] or ATTACKS:
         succeeded, tried, answer = ATTACKS[name]()
-        line = {"event": "attacked", "attack": name, "succeeded": succeeded, "tried": tried, "answer": answer}
-        print(json.dumps(line, default=str), flush=True)
+        report("attacked", attack=name, succeeded=succeeded, tried=tried, answer=answer)
 
 
 if __name__ == "__main__":

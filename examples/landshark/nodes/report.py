@@ -1,9 +1,38 @@
-"""Report events to the program's starter: one JSON object per line on standard output."""
+"""Report events to the program's starter: one JSON object per line on standard output, or words for a person.
+
+The words are for the containers of compose.yaml: LANDSHARK_REPORTS=words.
+"""
 
 import json
 import os
 
+WORDS = {
+    "connected": "the operator has the controls",
+    "drove": "drove {metres} m",
+    "aimed": "aimed the gun: tilt {tilt:.2f} rad",
+    "fired": "fired: {shots} shot",
+    "lost": "the robot's odometry is late",
+    "regained": "the odometry arrives again, after {seconds} s",
+}
+QUIET = ("position",)  # it comes every second
+
 
 def report(event, **fields):
     """Print one event with one write and no lock, because a signal handler may interrupt another report."""
-    os.write(1, (json.dumps({"event": event, **fields}) + "\n").encode())
+    if os.environ.get("LANDSHARK_REPORTS") != "words":
+        line = json.dumps({"event": event, **fields}, default=str)
+    elif event in QUIET:
+        return
+    elif event == "attacked":
+        line = in_words(**fields)
+    else:
+        line = WORDS[event].format(**fields)
+    os.write(1, (line + "\n").encode())
+
+
+def in_words(attack, succeeded, tried, answer):
+    """Describe an attack, its outcome and the answer in two lines."""
+    text = next((part for part in answer if isinstance(part, str)), "")
+    if answer and isinstance(answer[-1], dict):
+        text = f"{answer[-1]['drivers']} drivers of the robot took its messages"
+    return f"{'allowed' if succeeded else 'denied':9} {attack}: {tried}\n          {text[:200]}"

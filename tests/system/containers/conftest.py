@@ -1,5 +1,6 @@
 """A machine of the lab with a Docker engine, a laptop on its network, and the product there as containers."""
 
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +45,11 @@ def site(images: None) -> Iterator[Site]:
 @pytest.fixture(scope="module")
 def demo(site: Site, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Compose]:
     """Run `docker compose --profile demo up`: the appliance, the LandShark, its operator and a visitor."""
-    compose = site.engine.compose(project(tmp_path_factory.mktemp("project")), "demo")
+    folder = project(tmp_path_factory.mktemp("project"))
+    # A clone of another user under umask 077: root of the container reads it with the rights of its owner.
+    subprocess.run(["chown", "--recursive", "1000:1000", folder], check=True)
+    subprocess.run(["chmod", "--recursive", "go-rwx", folder], check=True)
+    compose = site.engine.compose(folder, "demo")
     try:
         compose("--profile", "demo", "up", "--detach", "--no-build")
         yield compose
