@@ -54,12 +54,10 @@ class FakeAppliance:
     # --- the admin socket ---
 
     def answer(self, verb: str, **fields: Any) -> None:
-        """Give this answer to a request from now on."""
         body = example(answer_to(_KINDS[verb]), **fields)
         self.decide(verb, lambda _request: AdminAnswer(True, body))
 
     def reject(self, verb: str, trouble: Trouble, error: str, *findings: str) -> None:
-        """Reject a request from now on."""
         self.decide(verb, lambda _request: AdminAnswer(False, None, error, list(findings), trouble))
 
     def decide(self, verb: str, answer: Answer) -> None:
@@ -68,7 +66,6 @@ class FakeAppliance:
         self._answers[verb] = answer
 
     def serve(self, state: Path) -> Path:
-        """Serve the admin socket in this state directory."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         listener.bind(str(state / "admin.sock"))
         listener.listen()
@@ -100,13 +97,11 @@ class FakeAppliance:
     def problem(
         self, status: int, kind: str, detail: str, headers: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Answer with a problem from now on."""
         self.status, self.headers = status, dict(headers)
         self.body = json.dumps({"type": f"urn:rosrv:problem:{kind}", "detail": detail}).encode()
 
     @property
     def url(self) -> str:
-        """Return the URL of REST."""
         if not self._url:
             server = ThreadingHTTPServer(("127.0.0.1", 0), self._handler())
             if self._context is not None:

@@ -29,12 +29,10 @@ class Answer:
 
     @property
     def json(self) -> Any:
-        """The body as JSON."""
         return json.loads(self.body)
 
     @property
     def etag(self) -> str:
-        """The ETag of the answer."""
         return self.headers["etag"]
 
 
@@ -55,15 +53,12 @@ class Rest:
         self.patient = patient
 
     def with_token(self, token: str | None) -> "Rest":
-        """Return a client of the same server with another token."""
         return Rest(self.url.geturl(), token, self.certificate, patient=self.patient)
 
     def impatient(self) -> "Rest":
-        """Return a client of the same server that does not repeat requests."""
         return Rest(self.url.geturl(), self.token, self.certificate, patient=False)
 
     def connect(self, timeout: float = 30, source: str = "") -> http.client.HTTPConnection:
-        """Open a connection, from the address `source` of this machine if given."""
         assert self.url.hostname is not None
         local = (source, 0) if source else None
         if self.url.scheme == "http":
@@ -76,7 +71,6 @@ class Rest:
         )
 
     def headers(self, given: dict[str, str] | None = None) -> dict[str, str]:
-        """Return the headers of every request."""
         known = {"Authorization": f"Bearer {self.token}"} if self.token is not None else {}
         return known | (given or {})
 
@@ -88,7 +82,6 @@ class Rest:
         headers: dict[str, str] | None = None,
         timeout: float = 30,
     ) -> Answer:
-        """Make one request and return its last answer."""
         with self._asked(method, path, body, headers, timeout) as response:
             names = {name.lower(): value for name, value in response.getheaders()}
             return Answer(response.status, names, response.read())

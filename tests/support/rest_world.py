@@ -82,7 +82,6 @@ class Carried:
         self.error: Exception | None = None
 
     async def out(self, request: AdminRequest[Any], who: str | None = None) -> Any:
-        """Answer a request with an example."""
         if type(request) in CHANGES:
             if self.error is not None:
                 raise self.error
@@ -99,7 +98,6 @@ class Tokens:
         self.texts = {role: text for role, (_row, text) in made.items()}
 
     def usable(self) -> list[TokenKept]:
-        """Return what the api gets of them."""
         return [
             TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
             for row in self.rows.values()
@@ -121,7 +119,6 @@ class Trail:
         self.records: list[dict[str, Any]] = []
 
     def happened(self, event: str, reason: str, **fields: Any) -> str:
-        """Keep a record."""
         self.records.append({"event": event, "reason": reason, **fields})
         return "id"
 
@@ -177,18 +174,15 @@ class RestWorld:
 
     @property
     def made(self) -> list[RequestMade]:
-        """The orders that control got from the api since the last request began."""
         return [
             one for one in self._ends[0].messages if isinstance(one, RequestMade) and type(one.request) in CHANGES
         ]  # fmt: skip
 
     def sent(self, kind: type[R]) -> list[R]:
-        """Return the requests of a kind that control got from the api since the last request began."""
         made = [one.request for one in self._ends[0].messages if isinstance(one, RequestMade)]
         return [one for one in made if isinstance(one, kind)]
 
     def close(self) -> None:
-        """Close the loop."""
         self._runner.close()
 
     def asked(
@@ -225,8 +219,6 @@ class RestWorld:
         return record
 
     def play(self, what: Callable[[], Awaitable[T]]) -> T:
-        """Run something, and what follows from it."""
-
         async def playing() -> T:
             result = await what()
             for _turn in range(20):
@@ -237,14 +229,12 @@ class RestWorld:
 
 
 def idle_application() -> FastAPI:
-    """Return the application, which nothing reaches."""
     return _application(
         ControlLink(lambda _tokens: None, lambda: None), TokenAuthenticator(10, lambda _token: None), Journal(print)
     )  # fmt: skip
 
 
 def make_api(state: Path = _STATE) -> tuple[RequestGate, ControlLink]:
-    """Return the api's gate and its link to control, which states the tokens."""
     door = TokenAuthenticator(10, lambda _token: None)
     control = ControlLink(door.state, lambda: None)
     journal = Journal(control.tell)

@@ -81,7 +81,6 @@ class Section(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Return all actions with the lines below them."""
         return f"{self.head}\n{self.steps}".strip()
 
     def played(self, transcript: "Transcript") -> str:
@@ -96,7 +95,6 @@ class Section(NamedTuple):
 
 
 def sections(*files: Path) -> list[Any]:
-    """Return a parameter for each section of these files."""
     found = []
     for file in files:
         head, *texts = f"\n{file.read_text(encoding='utf-8')}".split("\n# ")
@@ -122,7 +120,6 @@ class Transcript:
         Path("state").mkdir()
 
     def play(self, text: str) -> str:
-        """Return the text with the actual output of its actions."""
         played: list[str] = []
         for action, below in _actions(text):
             came = self._act(action, below)
@@ -216,7 +213,6 @@ def _frozen(now: float | None) -> Iterator[None]:
 
 
 def _actions(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield each action with the lines below it, without their indentation."""
     action, below = "", list[str]()
     for line in text.splitlines():
         if line and not line.startswith("    "):
@@ -230,13 +226,11 @@ def _actions(text: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def _matches(written: list[str], came: list[str]) -> bool:
-    """Whether the output matches the written lines."""
     pattern = "".join(_ANY_LINES if line == "..." else f"{_pattern(line)}\n" for line in written)
     return re.fullmatch(pattern, "".join(f"{line}\n" for line in came)) is not None
 
 
 def _as_written(line: str, written: list[str]) -> str:
-    """Return a line of other output with the placeholders that it had before."""
     return next((one for one in written if "<" in one and re.fullmatch(_pattern(one), line)), line)
 
 
