@@ -195,7 +195,8 @@ class Hunt:
         for count, number in enumerate(chosen, 1):
             self._active = number
             wanted = set(reaches.get(str(number), []))
-            outcome = self._fork(session, [item for item in items if item.nodeid in wanted], self._seconds)
+            reaching = [item for item in items if item.nodeid in wanted]
+            outcome = self._fork(session, reaching, self._seconds) if wanted else {"failed": []}
             found = ", ".join(outcome["failed"]) or "SURVIVED"
             self.survivors += [] if outcome["failed"] else [number]
             print(f"{count}/{len(chosen)} {self._loader.described[number]}: {found[:120]}", flush=True)
