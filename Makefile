@@ -61,8 +61,8 @@ nightly: setup ## every test, with all its examples: attacks, crashes, takeovers
 steady: setup ## run one test N times beside busy loops: make steady TEST=tests/integration/test_nodes.py N=50
 	$(BIN)/python -m tests.steady $(TEST) $(N)
 
-mutants: setup ## change the kernel in N small wrong ways (SEED=1), and list what no test of the gate finds
-	$(BIN)/python -m tests.mutants --number $(or $(N),200) --seed $(or $(SEED),1)
+mutants: setup ## change the kernel, or the modules of a MODULE, in N small wrong ways (SEED=1), and list what no test of the gate finds
+	$(BIN)/python -m tests.mutants --number $(or $(N),200) --seed $(or $(SEED),1) $(if $(MODULE),--module $(MODULE))
 
 wheel: setup ## the wheel of this architecture, for pipx: dist/rosrv_appliance-VERSION-….whl, and the versions that were tested
 	$(BIN)/python -m hatchling build --target wheel
