@@ -1,6 +1,7 @@
-"""Find whether another policy takes a right from a host, by one name for each rule of both policies."""
+"""Find whether another policy takes a right from a host, by some names for each rule of both policies."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from appliance.policy.commands import COMMANDS
 from appliance.policy.keys import Key
@@ -11,37 +12,41 @@ _ANY = "any_name"  # stands for the stars of a key
 
 
 class LostRights:
-    """The hosts that had a right under the policy `old` and do not have it under `new`."""
+    """The hosts that had a right under the policy `old` and do not have it under `new`; blocks of hosts are ignored."""
 
     def __init__(self, old: Policy, new: Policy) -> None:
         self.old, self.new = old, new
         self._names = {category: tuple(dict.fromkeys(_names(old, new, category))) for category in Category}
-        self._lost: dict[Address, bool] = {}
+        self._before, self._after = replace(old, blocks={}), replace(new, blocks={})
+        self._lost: dict[tuple[str, str], bool] = {}  # by the networks that both policies name
 
     def took_from(self, host: Address) -> bool:
         """Whether this host lost a right."""
-        if host not in self._lost:
-            self._lost[host] = any(
-                self.old.decide(request).allowed and not self.new.decide(request).allowed
+        networks = self.old.alike(host), self.new.alike(host)
+        if networks not in self._lost:
+            self._lost[networks] = any(
+                self._before.decide(request).allowed and not self._after.decide(request).allowed
                 for category, names in self._names.items()
                 for request in (Request(host, "", category, name) for name in names)
             )
-        return self._lost[host]
+        return self._lost[networks]
 
 
 def _names(old: Policy, new: Policy, category: Category) -> Iterator[str]:
     if category is Category.COMMAND:
         yield from COMMANDS
         return
-    yield f"/{_ANY}"  # decided by the default
+    yield from (f"/{_ANY}", f"/{_ANY}/{_ANY}", f"/{_ANY}/{_ANY}/{_ANY}")  # mostly decided by the default
     for rule in (*old.rules(category), *new.rules(category)):
         if rule.key is not None:
-            yield _name(rule.key)
+            yield from _matching(rule.key)
 
 
-def _name(key: Key) -> str:
-    """Return a name that the key matches."""
+def _matching(key: Key) -> Iterator[str]:
+    """Yield names that the key matches, at each depth at which another key may be more specific."""
     if key.exact:
-        return key.text
-    steps = "".join(f"/{text}{_ANY if star else ''}" for text, star in key.steps)
-    return f"{steps}/{_ANY}" if key.subtree else steps
+        yield key.text
+        return
+    for word in (_ANY, "") if all(text for text, _star in key.steps) else (_ANY,):
+        steps = "".join(f"/{text}{word if star else ''}" for text, star in key.steps)
+        yield from (steps, f"{steps}/{_ANY}", f"{steps}/{_ANY}/{_ANY}") if key.subtree else (steps,)
