@@ -18,7 +18,7 @@ OBSTACLE_SECONDS = EXPIRY  # another process may lock the log for a moment
 SILENT_SECONDS = 4.0  # the supervisor kills a silent control after 5 s; its next start takes seconds
 START_SECONDS = 5.0
 RESTART_SECONDS = 10.0
-STEADY_SECONDS = 10.0
+STEADY_SECONDS = 4.0
 _MOST_DOUBLINGS = 5
 
 
