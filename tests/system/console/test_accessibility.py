@@ -43,7 +43,7 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
         expect(page.locator("[data-standing=live]")).to_be_visible()
         expect(page.locator(".skeleton")).to_have_count(0)
         if view.startswith("audit"):
-            page.locator("tbody tr").first.click()
+            page.get_by_role("table", name="Records").locator("tbody tr").first.click()
             expect(page.locator(".record .facts").first).to_be_visible()
         if view == "policy":
             reader.write("bogus")
