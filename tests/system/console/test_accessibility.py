@@ -133,7 +133,7 @@ def test_single_keys_can_be_turned_off(opened: Callable[..., Reader]) -> None:
         page.keyboard.press(key)
     expect(page.get_by_role("dialog")).to_have_count(0)
     assert page.url.endswith("/console/audit?decision=deny")
-    page.locator("tbody tr a").first.press("Enter")
+    page.get_by_role("table", name="Records").locator("tbody tr a").first.press("Enter")
     record = page.get_by_role("region", name=re.compile(r"^Record \d"))
     expect(record).to_be_focused()
     page.keyboard.press("Escape")

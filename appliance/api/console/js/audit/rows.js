@@ -79,9 +79,9 @@ function kindOf({ decision, event, host, category, resource, detail, ...record }
   return category === "monitor" && detail.monitor && !detail.who ? JSON.stringify([event, detail.monitor, host, resource, record.severity]) : null;
 }
 
-/** How many other resources a row's records have than the one that it shows. @param {Row} row */
-export function othersOf({ records }) {
-  return new Set(records.map((one) => one.resource)).size - 1;
+/** How many other resources, or callers, a row's records have than the one that it shows. @param {Row} row @param {"resource" | "caller_id"} [field] */
+export function othersOf({ records }, field = "resource") {
+  return new Set(records.map((one) => one[field])).size - 1;
 }
 
 /** The record that a row shows and opens: the newest that is not just a number of repetitions. @param {Row} row */

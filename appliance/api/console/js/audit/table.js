@@ -18,13 +18,13 @@ export function RecordTable({ rows, opened, toggle, chosen, filter }) {
       const time = html`<${Range} row=${row} />`;
       const count = html`<${Count} row=${row} open=${open} toggle=${() => toggle(row)} />`;
       return [
-        html`<${Row} key=${row.first.id} record=${shownOf(row)} others=${othersOf(row)} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
+        html`<${Row} key=${row.first.id} record=${shownOf(row)} others=${othersOf(row)} callers=${othersOf(row, "caller_id")} time=${time} count=${count} reason=${row.value || row.last.reason} chosen=${!open && row.records.some(is)} filter=${filter} />`,
         open && row.records.map((one) => html`<${Row} key=${`each ${one.id}`} record=${one} time=${html`<${Moment} at=${one.time} />`} reason=${one.reason} part chosen=${is(one)} filter=${filter} />`),
       ];
     })}</tbody></table></div>`;
 }
 
-function Row(/** @type {{record: any, others?: number, time: any, count?: any, reason: string, part?: boolean, chosen: boolean, filter: Record<string, string>}} */ { record, others = 0, time, count, reason, part = false, chosen, filter }) {
+function Row(/** @type {{record: any, others?: number, callers?: number, time: any, count?: any, reason: string, part?: boolean, chosen: boolean, filter: Record<string, string>}} */ { record, others = 0, callers = 0, time, count, reason, part = false, chosen, filter }) {
   const open = () => go(auditPath(filter, record.id));
   const link = (/** @type {MouseEvent} */ event) => {
     event.preventDefault();
@@ -36,7 +36,7 @@ function Row(/** @type {{record: any, others?: number, time: any, count?: any, r
     <td class="time"><a href=${auditPath(filter, record.id)} onClick=${link}>${time}</a></td>
     <td><${Outcome} record=${record} /></td>
     <td><${Given} value=${record.event === "decision" ? requested(record) : record.event} most=${30} /> ${record.detail.monitor && html`<span class="muted small"><${Given} value=${record.detail.monitor} most=${40} /></span> `}${count}</td>
-    <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono /></td>
+    <td data-label="Who" class=${who ? "" : "bare"}><${Given} value=${who} most=${40} mono />${callers > 0 && html` <span class="muted small nowrap">and ${callers} more</span>`}</td>
     <td class=${`nowrap${record.host ? "" : " bare"}`} data-label="Host"><${Host} value=${record.host} /></td>
     <td data-label="Resource" class=${record.resource ? "" : "bare"}><${Given} value=${record.resource} most=${60} mono />${others > 0 && html` <span class="muted small nowrap">and ${others} more</span>`}</td>
     <td data-label="Rule" class=${`wide-only${record.rule ? "" : " bare"}`}>${record.rule ? html`<${Given} value=${`[${record.rule.section}]`} most=${22} mono /> <${Given} value=${record.rule.key} most=${40} mono />` : html`<span class="muted">–</span>`}</td>
