@@ -364,4 +364,4 @@ def test_over_rest_messages_are_for_investigators(
     assert admin.request("DELETE", path).status == 200
     assert viewer.get(path).status == 404
     assert investigator.get(f"{path}/bag").status == 404
-    assert appliance.status()["recorder"] == {"running": True, "recordings": 0, "bytes": 0}
+    assert appliance.status()["recorder"] == {"running": True, "recordings": 0, "bytes": 0, "in_progress": 0}
