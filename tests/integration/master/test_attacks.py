@@ -111,11 +111,14 @@ def test_uri_of_a_third_machine(field: Field) -> None:
             assert answer[0] == 1
             assert third.uri not in answer[2]
             talker = field.ros.talker("rospy", "/shared/talk", name="second_shared_voice")  # causes an update
-            for expected in (b"", b"POST /"):  # first RVMaster looks whether a node listens there
+            for _ in range(5):  # the first connections only check that the node is there
                 connection, peer = home.accept()
                 with connection:
                     assert peer[0] == "10.77.0.2"
-                    assert expected in connection.recv(4096)
+                    request = connection.recv(4096)
+                if request:
+                    break
+            assert b"POST /" in request
             talker.stop()
         assert third.peers == []
 

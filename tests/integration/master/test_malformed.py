@@ -26,7 +26,7 @@ def test_a_malformed_request_is_refused_and_recorded(field: Field, node: str) ->
     uri = field.rogue("lookupNode", "/looker", node)[2] if node else field.master
     port = int(uri.rstrip("/").rpartition(":")[2])
     assert field.raw(b"GET / HTTP/1.1\r\n\r\n", port=port).split()[1] == b"405"
-    field.recorded("did not POST", event="malformed", host="10.77.0.66")
+    field.recorded("did not POST", event="malformed", host="10.77.0.66", decision="deny")
     answer = field.raw(post("<methodCall><methodName>getPid</methodName><params><oops/></params>"), port=port)
     assert b"<fault>" in answer
     field.recorded("byte", event="malformed", host="10.77.0.66", decision="deny")

@@ -105,17 +105,17 @@ def test_a_policy_that_it_cannot_load(site: StandbySite) -> None:
     until_obstacle(site, "", "a", "b")
 
 
-def test_an_unreadable_folder(site: StandbySite) -> None:
+def test_a_missing_folder(site: StandbySite) -> None:
     """The active appliance has no specifications, so a takeover would read the folder of the standby.
 
-    The active appliance loses its power in the meantime: the standby takes over when its folder is readable again.
+    The active appliance loses its power in the meantime: the standby takes over when its folder is there again.
     """
     folder = site.appliances["b"].directory / "monitors"
-    folder.chmod(0)
-    until_obstacle(site, f"{folder}: the specifications cannot be read: Permission denied", "a", "b")
+    elsewhere = folder.rename(folder.with_name("elsewhere"))
+    until_obstacle(site, f"{folder}: the folder of specifications does not exist", "a", "b")
     site.cut("a")
     until_obstacle_without_active(site)
-    folder.chmod(0o755)
+    elsewhere.rename(folder)
     site.until_taken_over("b")
     site.until_active("b")
     site.restore("a")
