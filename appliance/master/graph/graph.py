@@ -427,10 +427,8 @@ def _record(
     *,
     severity: Severity = Severity.INFO,
 ) -> WriteRecord:
-    about, level = (
-        resource or node.name,
-        Severity.INFO if node.own else severity,
-    )  # rosout is lost at each start
+    about = node.name if resource is None else resource
+    level = Severity.INFO if node.own else severity  # rosout is lost at each start
     return WriteRecord(event, reason, str(node.host), node.name, category, about, level)
 
 
