@@ -427,9 +427,8 @@ def _record(
     *,
     severity: Severity = Severity.INFO,
 ) -> WriteRecord:
-    about = node.name if resource is None else resource
     level = Severity.INFO if node.own else severity  # rosout is lost at each start
-    return WriteRecord(event, reason, str(node.host), node.name, category, about, level)
+    return WriteRecord(event, reason, str(node.host), node.name, category, resource or node.name, level)
 
 
 def _at_master(incarnation: Incarnation, ended: Iterable[NodeRegistration]) -> Effects:
