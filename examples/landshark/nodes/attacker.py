@@ -14,6 +14,7 @@ import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 import xmlrpc.client
 from pathlib import Path
@@ -111,12 +112,12 @@ def replace_a_driver():
 
 def watch_the_battery():
     """Read the charge of the battery, which is this host's task. Wait until the robot publishes it."""
-    deadline = time.monotonic() + ROBOT_LIMIT
+    deadline, pause = time.monotonic() + ROBOT_LIMIT, threading.Event()
     while True:
         succeeded, tried, answer = subscribe(BATTERY)
         if succeeded or not granted(answer) or time.monotonic() > deadline:
             return succeeded, tried, answer
-        time.sleep(1)
+        pause.wait(1)
 
 
 def spy_on_gps():
