@@ -65,11 +65,11 @@ def main() -> None:
     try:
         app()
     except _ERRORS as error:
-        sys.stderr.write(f"rosrv-fleet: {printable(_reason(error))}\n")
+        sys.stderr.write(f"rosrv-fleet: {printable(reason_of(error))}\n")
         sys.exit(2)
 
 
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
     """Return what failed, where and what to do."""
     if not isinstance(error, OSError) or error.strerror is None or isinstance(error, ssl.SSLError):
         return str(error).strip()

@@ -143,17 +143,9 @@ def test_tracebacks_show_no_values(capfd: pytest.CaptureFixture[str]) -> None:
     assert secret not in shown
 
 
-def test_a_command_on_a_full_disk_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The error names the file and the remedy, in a line."""
-
-    def fail() -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "data/tokens.json")
-
-    monkeypatch.setattr(cli, "app", fail)
-    with pytest.raises(SystemExit):
-        cli.main()
-    assert capsys.readouterr().err == (
-        "rosrv-fleet: data/tokens.json: No space left on device; free space on this disk, and run the command again\n"
+def test_a_command_on_a_full_disk_says_what_to_do() -> None:
+    """The error names the file and the remedy."""
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "data/tokens.json")
+    assert cli.reason_of(error) == (
+        "data/tokens.json: No space left on device; free space on this disk, and run the command again"
     )
