@@ -2,12 +2,16 @@
 
 import itertools
 import time
+from typing import Any
+from xmlrpc.client import ServerProxy
 
 import pytest
 
+from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.integration.conformance.nodes import order, roscpp_node, rospy_node
 from tests.support.nodes import Client, RosSession, numbers, without_gap
 from tests.support.processes import LIMIT, Process
+from tests.support.site import Site
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
@@ -160,3 +164,49 @@ def test_wrong_type_is_not_connected(ros: RosSession) -> None:
     ear.wait_for_count(3, event="received")
     assert {event["publisher"] for event in ear.seen(event="received")} == {"/right"}
     assert wrong.running
+
+
+def test_actions(ros: RosSession) -> None:
+    rospy_node(ros, "action_server", "counter")
+    client = rospy_node(ros, "action_client", "asker")
+    assert client.wait_for(event="reached")["result"] == 5
+    cancelled = client.wait_for(event="cancelled")
+    assert (cancelled["state"], cancelled["feedback"] > 0) == (2, True)  # the goal's status is PREEMPTED
+    assert client.wait() == 0
+
+
+def test_hundred_nodes_of_ten_topics(local: Site) -> None:
+    with FakeNodes() as nodes, ServerProxy(local.master_uri) as server:
+        master: Any = server
+        start = time.monotonic()
+        for node in range(100):
+            uri = nodes.uri(f"n{node}")
+            for topic in range(10):
+                for method, name in (
+                    ("registerPublisher", f"/n{node}/t{topic}"),
+                    ("registerSubscriber", f"/n{(node + 1) % 100}/t{topic}"),
+                ):
+                    answer = getattr(master, method)(f"/n{node}", name, "std_msgs/String", uri)
+                    assert answer[0] == 1, answer
+        print(f"{local.mode}: 2000 registrations in {time.monotonic() - start:.2f} s")  # noqa: T201  a figure for the reader of the run
+        publishers, subscribers, _services = master.getSystemState("/test")[2]
+        wanted = [f"/n{node}/t{topic}" for node in range(100) for topic in range(10)]
+        assert [name for name, _nodes in publishers if name.startswith("/n")] == wanted
+        assert sorted(name for name, _nodes in subscribers if name.startswith("/n")) == sorted(wanted)
+        assert nodes.wait_until(lambda: len(_told(nodes)) == 1000), "every subscriber is told its publisher"
+        parts = [
+            {
+                "methodName": method,
+                "params": [f"/n{node}", f"/n{(node + one) % 100}/t{topic}", nodes.uri(f"n{node}")],
+            }
+            for node in range(100)
+            for topic in range(10)
+            for method, one in (("unregisterPublisher", 0), ("unregisterSubscriber", 1))
+        ]
+        assert all(answer[0][0] == 1 for answer in master.system.multicall(parts))
+
+
+def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
+    """Return the subscribers that know a publisher, from an update or from their registration, each with its topic."""
+    told = {(call.node, call.params[1]) for call in nodes.all_calls() if call.method == "publisherUpdate"}
+    return told | {("n99", f"/n0/t{topic}") for topic in range(10)}

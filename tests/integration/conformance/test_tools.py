@@ -60,9 +60,7 @@ def test_rosnode_of_a_killed_node(ros: RosSession) -> None:
     voice.kill()
     ros.run("rosnode", "ping", "-a", check=False)
     ros.run("rosnode", "info", "/voice", check=False)
-    ros.run(
-        "rosnode", "cleanup", text="y\n", check=False
-    )  # it fails if the appliance removes the node first
+    ros.run("rosnode", "cleanup", text="y\n", check=False)  # it fails if the appliance removes the node first
     eventually(
         lambda: set(ros.run("rosnode", "list").stdout.split()) == {"/rosout", "/ear"}, "the node is removed"
     )
