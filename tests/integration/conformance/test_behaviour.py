@@ -208,5 +208,6 @@ def test_hundred_nodes_of_ten_topics(local: Site) -> None:
 
 def _told(nodes: FakeNodes) -> set[tuple[str, str]]:
     """Return the subscribers that know a publisher, from an update or from their registration, each with its topic."""
-    told = {(call.node, call.params[1]) for call in nodes.all_calls() if call.method == "publisherUpdate"}
+    names = [f"n{node}" for node in range(100)]
+    told = {(name, topic) for name in names for topic, _uris in nodes.calls(name, "publisherUpdate")}
     return told | {("n99", f"/n0/t{topic}") for topic in range(10)}
