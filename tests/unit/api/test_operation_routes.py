@@ -87,6 +87,9 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("POST", "/v1/blocks", {"address": "ocu-1", "for_seconds": 3600, "note": "strange traffic", "force": True}),
     ("DELETE", "/v1/blocks/10.0.0.7", None),
     ("DELETE", "/v1/blocks/fd00%3A%3A7", None),
+    ("POST", "/v1/alarms/acknowledge", {"kind": "monitor-held:zone", "note": "on the way"}),
+    ("POST", "/v1/alarms/silence", {"kind": "recorder", "seconds": 3600}),
+    ("POST", "/v1/alarms/silence", {"kind": "recorder"}),
     ("POST", "/v1/hosts/reload", None),
     ("POST", "/v1/standby/promote", None),
     ("DELETE", "/v1/hosts/laptop", None),
@@ -113,7 +116,7 @@ LEAST = {
         (
             "reload_policy", "roll_back_policy", "confirm_policy", "topic_messages", "reload_monitors",
             "confirm_monitors", "switch_monitors", "switch_monitor", "record_now", "tell_host_ports", "reload_hosts",
-            "block_host", "unblock_host",
+            "block_host", "unblock_host", "acknowledge_alarm", "silence_alarm",
         ),
         "operator",
     ),
