@@ -1,7 +1,7 @@
 """Tests of `appliance.api.rates`."""
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from appliance.api.rates import Buckets, peer_key
@@ -24,6 +24,7 @@ def test_a_stopped_clock_adds_nothing() -> None:
 
 
 @given(st.lists(st.integers(0, 10_000), max_size=300))
+@example(list(range(40)))
 def test_memory_is_bounded(peers: list[int]) -> None:
     buckets = Buckets(1e-6, 5, peers=16)
     hosts = [f"10.0.{peer // 256}.{peer % 256}" for peer in peers]
