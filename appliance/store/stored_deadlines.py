@@ -30,6 +30,6 @@ class StoredDeadlines(Deadlines):
     async def watch(self) -> None:
         """Store the remaining times every half a minute."""
         while True:
+            await asyncio.sleep(_SAVE_SECONDS)
             with contextlib.suppress(StoreError):  # a full disk: the next save tries again
                 self.save()
-            await asyncio.sleep(_SAVE_SECONDS)

@@ -51,4 +51,4 @@ def test_a_seed_gives_the_same_history_again(kind: type[World]) -> None:
 @pytest.mark.parametrize("fault", sorted((MUTANTS.keys() | PAIR_MUTANTS.keys()) - NOT_SEEN))
 def test_each_fault_of_the_product_is_found(fault: str) -> None:
     """The faults that the world does not see are listed in `NOT_SEEN`."""
-    assert first_broken(fault, range(300)) is not None
+    assert first_broken(fault, range(500)) is not None
