@@ -31,6 +31,7 @@ _log = structlog.get_logger()
 MASTER_NAME = "/master"
 _APART_SECONDS = 0.3  # between a list that removes a publisher and a list that adds it
 _LISTS = "publisherUpdate"
+_SHORTEST_WAIT = 0.001  # seconds: a timer that ends a little early does not make the worker spin
 
 
 @dataclass(slots=True)
@@ -186,7 +187,7 @@ class Delivery:
             while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
                 position, seconds = self._next(queue)
                 if seconds:
-                    await asyncio.sleep(seconds)
+                    await asyncio.sleep(max(seconds, _SHORTEST_WAIT))
                     continue
                 call = self._take(queue, position)
                 await self._deliver(incarnation, call)
