@@ -66,7 +66,7 @@ def join(
         raise usage_error(f"{audit_key}: {error.strerror}; {advice}", _VERB) from None
     making = _unfinished(state)
     try:
-        certificate = _prepared(making, invitation)
+        certificate = prepare_membership(making, invitation)
         request = JoinRequest(token=invitation.token, key=public, certificate=certificate)
         collector = CollectorConnection(invitation.collector, lambda: trusting_context(making / AUTHORITY))
         try:
@@ -126,7 +126,7 @@ def _unfinished(state: Path) -> Path:
     return state / f"{FOLDER}.new"
 
 
-def _prepared(folder: Path, invitation: Invitation) -> str:
+def prepare_membership(folder: Path, invitation: Invitation) -> str:
     """Write the files of the membership to `folder`; return the certificate (PEM). Raises `OSError`.
 
     The key and the certificate of an earlier try with this token are kept: the collector may have enrolled them.

@@ -445,10 +445,7 @@ NAMES = QuotaRow(
     counting="hosts that the policy names as one network count as one",
     alarm="`decision`: the record of the rejected call",
     setting="limits.topics_per_host (for a host)",
-    shown_by=(
-        "integration/master/test_floods.py::test_registrations_of_one_node",
-        "unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",
-    ),
+    shown_by=("unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",),
 )
 GRANTS = QuotaRow(
     thing="grants of the relays (permissions to subscribe to a topic or to call a service)",

@@ -138,7 +138,7 @@ class Supervisor:
         )
         self._suspended_at = 0.0
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
-        self._reports = ProcessCallbacks(self._received, self._violated, self.died)
+        self.reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
         self._process_died = asyncio.Event()
         self._lacking: set[tuple[str, ...]] = set()
@@ -171,7 +171,7 @@ class Supervisor:
             self._spawn(self._watchdog.run())
             await self.stopping.wait()
         finally:
-            await self._end()
+            await self.end()
             self.kept.close()
             for listener in self._listeners.values():
                 listener.close()
@@ -251,7 +251,7 @@ class Supervisor:
         try:
             with self._watchdog.isolation.inside():
                 plan = slot.plan(self._facts, there.fileno(), lender.fileno() if lender is not None else None)
-                slot.process = ProcessHandle(slot.role.name, slot.index, plan, here, self._reports)
+                slot.process = ProcessHandle(slot.role.name, slot.index, plan, here, self.reports)
         except OSError as error:
             here.close()
             slot.short_runs += 1
@@ -643,7 +643,8 @@ class Supervisor:
 
     # --- ending -------------------------------------------------------------------------------------------
 
-    async def _end(self) -> None:
+    async def end(self) -> None:
+        """End all processes."""
         self.stopping.set()
         for task in self._tasks:
             task.cancel()

@@ -58,8 +58,8 @@ _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0
 _IDLE_SECONDS = 30.0  # longer than any registering call takes
 _LOOK_AGAIN_SECONDS = 0.3
-_RECENT_SECONDS = 30.0  # after a loss, during which the node is checked every `_RECENTLY_LOST_SECONDS`
-_RECENTLY_LOST_SECONDS = 0.5
+_RECENT_SECONDS = 30.0  # after a loss, during which the node is checked every `RECENTLY_LOST_SECONDS`
+RECENTLY_LOST_SECONDS = 0.5
 _MADE_UP_SECONDS = 1.0  # between two repetitions for a node that keeps failing
 
 
@@ -182,7 +182,7 @@ class Liveness:
 
     async def _look_at_lost(self) -> None:
         while True:
-            await asyncio.sleep(_RECENTLY_LOST_SECONDS)
+            await asyncio.sleep(RECENTLY_LOST_SECONDS)
             now = clock.now()
             for incarnation in self.registry.all():
                 if incarnation.life is Life.SHADOW and now - incarnation.changed < _RECENT_SECONDS:
@@ -237,7 +237,7 @@ class Liveness:
         self.enactor.carry_out(self.revocation.returned(incarnation))
         self.watchlist.returned(incarnation)
         # Its publishers may return with it, so the lists follow a little later.
-        asyncio.get_running_loop().call_later(_RECENTLY_LOST_SECONDS, self.look_at, incarnation)
+        asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     async def look(self, incarnation: Incarnation) -> None:
         """Check a node, and carry out the consequences."""
@@ -260,7 +260,7 @@ class Liveness:
         elif there:
             self._make_up(incarnation)
         elif there is None or self.watchlist.has_missed(incarnation):
-            asyncio.get_running_loop().call_later(_RECENTLY_LOST_SECONDS, self.look_at, incarnation)
+            asyncio.get_running_loop().call_later(RECENTLY_LOST_SECONDS, self.look_at, incarnation)
 
     def _make_up(self, incarnation: Incarnation) -> None:
         """Send a node the updates that it missed. It drops the publishers first to which it is not connected."""

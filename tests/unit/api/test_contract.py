@@ -83,9 +83,8 @@ def test_every_operation_has_a_summary_its_token_and_problems(contract: dict[str
         for path, row in contract["paths"].items()
         for method, one in row.items()
     }
-    assert {name for name, one in operations.items() if "security" not in one} == BY_HAND[None] - {
-        "GET /v1/openapi.json"
-    }
+    own = {name for name in BY_HAND[None] if " /v1/openapi." in name}
+    assert {name for name, one in operations.items() if "security" not in one} == BY_HAND[None] - own
     assert len({one["operationId"] for one in operations.values()}) == len(operations)
     for name, one in operations.items():
         assert one["summary"] and one["description"], name

@@ -47,6 +47,6 @@ def test_a_join_needs_no_checkpoint(
         return _CERTIFICATE
 
     monkeypatch.setattr(fleet_verbs, "CollectorConnection", Collector)
-    monkeypatch.setattr(fleet_verbs, "_prepared", prepared)
+    monkeypatch.setattr(fleet_verbs, "prepare_membership", prepared)
     fleet_verbs.join(invitation, state)
     assert [request.key for request in posted] == [sent]

@@ -45,8 +45,8 @@ def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytes
         token=f"rosrv-join_{'A' * 43}",
     )  # fmt: skip
     with using(at(3)):
-        wrong = fleet_verbs._prepared(tmp_path / "joined.new", invitation)
-    first, second = (fleet_verbs._prepared(tmp_path / "joined.new", invitation) for _ in range(2))
+        wrong = fleet_verbs.prepare_membership(tmp_path / "joined.new", invitation)
+    first, second = (fleet_verbs.prepare_membership(tmp_path / "joined.new", invitation) for _ in range(2))
     assert first == second != wrong
 
 

@@ -22,7 +22,7 @@ _CASES = [(name, title) for name, read in _READ.items() for title in read.conver
 async def test_conversation(name: str, title: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each action has exactly the effects below it, in that order."""
     # Checks of lost nodes would begin on their own during a later action.
-    monkeypatch.setattr(liveness, "_RECENTLY_LOST_SECONDS", 3600.0)
+    monkeypatch.setattr(liveness, "RECENTLY_LOST_SECONDS", 3600.0)
     written = _READ[name].conversations[title]
     took_place = await taken_place(_READ[name], title)
     if took_place != written and os.environ.get("TRANSCRIPTS") == "write":

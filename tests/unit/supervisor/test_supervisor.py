@@ -7,7 +7,6 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
-from unittest.mock import AsyncMock
 
 import pytest
 from structlog.testing import capture_logs
@@ -220,7 +219,7 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
         slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
 
     def report(message: object) -> None:
-        supervisor._reports.received(cast(ProcessHandle, lease), message, ())
+        supervisor.reports.received(cast(ProcessHandle, lease), message, ())
 
     report(LeaseHeld(clock.since_boot() + 60, 5))
     report(LeaseEnded(renewable=True))
@@ -232,8 +231,12 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
         supervisor.died(cast(ProcessHandle, relay), -9)
         supervisor.slots[1].due.cancel()
     elif end == "a stop":
-        monkeypatch.setattr(module, "end_all", AsyncMock())
-        await supervisor._end()
+
+        async def end_none(*_processes: object, **_how: object) -> None:
+            pass
+
+        monkeypatch.setattr(module, "end_all", end_none)
+        await supervisor.end()
     else:
         report(LeaseHeld(clock.since_boot() + 60, 5 if end == "renewed" else 7))
     assert control.signals[1:] == [signal.SIGCONT if end == "renewed" else signal.SIGKILL]

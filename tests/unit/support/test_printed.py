@@ -12,7 +12,6 @@ from tests.support.waiting import NoAnswerError, eventually
 STANDS_BY = '{"error":"this appliance stands by for a","findings":[]}\n'
 FAILING_VERB = re.compile(r'"--json"[^()]*check=False')
 READ_ITS_STATUS_TOO = {  # the exit status, or the number of lines, is what they test
-    "test_topic_echo.py",
     "test_takeover_check.py",
     "test_package.py",
     "test_cloud_init.py",

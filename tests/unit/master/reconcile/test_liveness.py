@@ -32,7 +32,7 @@ async def test_a_clock_that_is_set_forward_forgets_no_node() -> None:
 
 
 async def test_a_node_that_was_lost_for_a_moment_returns_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(liveness, "_RECENTLY_LOST_SECONDS", 0.0)
+    monkeypatch.setattr(liveness, "RECENTLY_LOST_SECONDS", 0.0)
     world = await ControlParts.begun()
     node = world.node("/n")
     await world.register(node, Kind.PUBLICATION, "/a")
@@ -65,7 +65,7 @@ async def test_a_refusal_of_a_robot_that_shuts_out_loses_no_node(monkeypatch: py
     await world.settle()
     assert (world.lives, world.deliveries.told) == ([Life.LIVE, Life.LIVE], [])
     world.shut_out, world.clients.gone = False, set()
-    await asyncio.sleep(2 * liveness._RECENTLY_LOST_SECONDS)
+    await asyncio.sleep(2 * liveness.RECENTLY_LOST_SECONDS)
     assert len(world.deliveries.told) == 2
     world.clients.gone = {"/ear"}
     await world.look(ear)
