@@ -96,7 +96,7 @@ def last_sequence(path: Path) -> int:
 
 
 def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
-    """Return the record in full that a record of repetitions continues; None if there is none, or no more.
+    """Return the full record that a record of repetitions continues; None if the log does not have it.
 
     Raises `LogUnreadableError`.
     """

@@ -134,10 +134,9 @@ def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
 
 
 def _last_author(state: Path) -> str:
-    """Return who brought the last stored specifications into force; `DISK`: they were read from the folder.
+    """Return the author of the last stored specifications; `DISK` if they were read from the folder, empty without any.
 
-    Empty: there are none. A question mark: unknown, because an earlier run may have left changes that are not in the
-    database yet.
+    A question mark means unknown: an earlier run may have left changes that are not in the database yet.
     """
     try:
         if not state.exists():

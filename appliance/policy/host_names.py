@@ -73,7 +73,7 @@ class HostNames:
         return f"{quoted(text)} is not an address, nor the name of a group or an enrolled host{guess}"
 
     def labels(self) -> list[tuple[Network, str]]:
-        """Return networks with their names: the first one that contains an address has its label."""
+        """Return networks with their names; of several networks that contain an address, the first names it."""
         rows = [(-1, _network_of(address), name) for name, address in self.enrolled.items()]
         rows += [
             (0 if name == ROBOT else len(some), one, name)

@@ -87,7 +87,7 @@ class Replica:
             return bool(self._connection.execute(query).fetchone()[0])
 
     def setting(self, name: str) -> str:
-        """Return a replicated setting; empty if there is none. Raises `StoreError`."""
+        """Return a replicated setting, or an empty string. Raises `StoreError`."""
         with self._lock, self._explained():
             found = self._connection.execute("SELECT value FROM setting WHERE name = ?", (name,)).fetchone()
             return str(found[0]) if found else ""

@@ -1124,7 +1124,7 @@ def serve(settings: WitnessSettings, backend: str, lease: LeaseFile) -> None:
 
 
 def _note_trouble(witness: Witness, lease: LeaseFile, disk: DiskCheck, log: BoundedLog) -> None:
-    """Keep why the next change of the lease would not be saved, for the answers; make room for it if there is none."""
+    """Store for the answers why the next change of the lease would not be saved. If the file has no room, make it."""
     if witness.record is not None and not lease.has_room():
         with contextlib.suppress(WitnessError):  # reported as the trouble
             lease.write(witness.record)

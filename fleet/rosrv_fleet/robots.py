@@ -206,7 +206,7 @@ class Robots:
     ) -> tuple[Robot, str]:
         """Return a robot with an appliance, and the appliance's name. Raises `EnrolmentError`.
 
-        The log key decides which appliance it is: one that is known gets the certificate.
+        The log key identifies the appliance: a known appliance gets the certificate.
         """
         if appliance:
             check_name(appliance)
