@@ -10,8 +10,6 @@ from typing import Any
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.text import Text
 
 
 def printable(text: str) -> str:
@@ -35,6 +33,9 @@ def say(line: str, style: str = "") -> None:
     """Write one line to standard output."""
     shown = printable(line)
     if sys.stdout.isatty():
+        from rich.console import Console  # noqa: PLC0415  `rosrv up` shall not load it
+        from rich.text import Text  # noqa: PLC0415  as above
+
         Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
     else:
         sys.stdout.write(shown + "\n")
