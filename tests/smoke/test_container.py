@@ -43,7 +43,10 @@ def rest(machine: Host, demo: Compose, tmp_path_factory: pytest.TempPathFactory)
     certificate = tmp_path_factory.mktemp("rest") / "certificate.pem"
     address = ("127.0.0.1", 8443)
     certificate.write_text(machine.run(lambda: ssl.get_server_certificate(address, timeout=30)))
-    return Rest("https://127.0.0.1:8443", token, certificate)
+    client = Rest("https://127.0.0.1:8443", token, certificate)
+    # Nodes may connect before the api has read its tokens; until then it answers 503.
+    eventually(lambda: machine.run(lambda: client.get("/v1/status")).status == 200, demo.story)
+    return client
 
 
 def test_messages_pass_and_a_visitor_is_denied(demo: Compose) -> None:
