@@ -211,7 +211,10 @@ class Appliance:
             served = ssl.get_server_certificate((str(place.hostname), place.port or 443), timeout=LIMIT)
             certificate = self.state / "api" / "certificate.pem"
             assert certificate.read_text() == served
-        return Rest(url, token or self.token, certificate)
+        client = Rest(url, token or self.token, certificate)
+        # The api answers 503 until it has read its tokens.
+        eventually(lambda: b"the appliance is starting" not in client.get("/v1/status").body, self.story)
+        return client
 
     def processes(self) -> dict[str, dict[str, Any]]:
         """Return the row of each role in `rosrv status`, once every process has reported its sandbox."""
