@@ -36,7 +36,7 @@ def test_a_join_with_a_wrong_clock_is_refused(years: float, tmp_path: Path) -> N
 
 
 def test_a_join_after_the_clock_was_corrected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same invitation is tried again with a new certificate; one that is valid is kept."""
+    """A new try with the same invitation makes a new certificate, unless the present one is valid."""
     monkeypatch.setattr(
         fleet_verbs, "account_of", lambda _user: SimpleNamespace(uid=os.getuid(), gid=os.getgid())
     )

@@ -97,7 +97,7 @@ async def test_a_single_appliance_uses_its_own_key(tmp_path: Path, store: StateS
 
 
 async def test_another_authority_is_reported_once(tmp_path: Path, store: StateStore) -> None:
-    """The first authority is none, a restart keeps it, and one with another key is reported by one start."""
+    """Neither the first start nor a restart reports an authority; the first start with another key does."""
     told: list[str] = []
     for name in ("a", "a", "b", "b"):
         alone = SharedAuthority(

@@ -122,7 +122,7 @@ def test_a_change_that_holds_a_topic_with_traffic_needs_consent() -> None:
 
 
 def test_a_change_that_holds_a_topic_without_traffic_warns_only() -> None:
-    """The robot stands, so nothing is cut off; one publisher that moves is enough."""
+    """While the robot stands, no message is lost; a single publisher with traffic is enough to ask."""
     still = LiveType("geometry_msgs/Twist", moving=False)
     conflicts, [warning] = held(CHANGED, {"/cmd_vel": {"/teleop": still}})
     assert conflicts == []

@@ -295,7 +295,7 @@ COPY = StateWanted(7, copy=True)
 
 @pytest.mark.parametrize("modifier", ["", "hold"])
 def test_the_other_appliance_goes_on_with_a_copy(modifier: str) -> None:
-    """A monitor without a copy holds its topics, and so does one that is declared `hold`."""
+    """Monitors without a copy hold their topics, as do monitors with the modifier `hold`."""
     first = stop(modifier)
     keeper = begun(first, bytearray(SIZE))
     press(first, keeper)
