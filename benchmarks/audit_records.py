@@ -16,12 +16,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from appliance.audit.folding import FoldSettings
-from appliance.audit.log import AuditLog
-from appliance.audit.query import Filter
-from appliance.audit.record import AuditRecord, RuleReference, Severity
-from appliance.audit.search import search
-from appliance.audit.verification import verify
+from appliance.audit.log.folding import FoldSettings
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+from appliance.audit.proof.verification import verify
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.forwarding.log_forwarder import LogForwarder
 from appliance.forwarding.receiver import StreamReceiver
 from appliance.forwarding.syslog import Formatter

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import appliance
-from appliance.audit.events import EVENTS, SEVERITIES
-from appliance.audit.record import Severity
-from appliance.audit.repetition import ABOUT
+from appliance.audit.log.events import EVENTS, SEVERITIES
+from appliance.audit.log.record import Severity
+from appliance.audit.log.repetition import ABOUT
 
 _FIELDS = frozenset(
     {

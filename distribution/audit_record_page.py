@@ -7,7 +7,7 @@ import json
 import sys
 from typing import Any
 
-from appliance.audit.schema import FIELDS, json_schema
+from appliance.audit.log.schema import FIELDS, json_schema
 
 _HASH = {"type": "string", "pattern": "^[0-9a-f]{64}$"}
 CHAIN: dict[str, Any] = {

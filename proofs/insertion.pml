@@ -221,7 +221,7 @@ inline take_back_trial() {
 
 /* --- control: the policy ---------------------------------------------------------------------------------- */
 
-/* = appliance/control/policies.py Policies.reload */
+/* = appliance/control/assembly/policies.py Policies.reload */
 inline answer_policy() {
     ordering = false;
     orders_done = false;
@@ -625,7 +625,7 @@ end:
 }
 
 /* The policy is changed: one node's right is taken or given.
-   = appliance/control/policies.py Policies.reload
+   = appliance/control/assembly/policies.py Policies.reload
    = appliance/master/graph/revocation.py Revocation.policy_changed */
 proctype Policy() POSSIBLE {
     byte who;

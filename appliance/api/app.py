@@ -9,26 +9,25 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 import appliance
-from appliance.api import (
+from appliance.api import evidence_routes, recording_routes
+from appliance.api.console import console
+from appliance.api.front import health
+from appliance.api.front.control import ControlAwayError
+from appliance.api.front.problems import REASON, BadInput, ProblemError, bad_input, defect
+from appliance.api.front.services import Services
+from appliance.api.routes import (
     audit,
     audit_summary,
-    console,
     enrol,
-    evidence_routes,
-    health,
     host_routes,
     live,
     metrics_route,
     monitor_routes,
     operation_routes,
     policy_routes,
-    recording_routes,
 )
-from appliance.api.contract import contract_of
-from appliance.api.contract_page import PATH, page_of
-from appliance.api.control import ControlAwayError
-from appliance.api.problems import REASON, BadInput, ProblemError, bad_input, defect
-from appliance.api.services import Services
+from appliance.api.routes.contract import contract_of
+from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import meant, refusal
 
 _MOST_SHOWN = 5

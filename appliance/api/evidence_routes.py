@@ -6,15 +6,15 @@ from typing import Annotated, Any
 from fastapi import Query, Request, Response
 from starlette.responses import StreamingResponse
 
-from appliance.api.access import Bearer
-from appliance.api.moments import given
-from appliance.api.problems import ProblemError
+from appliance.api.front.access import Bearer
+from appliance.api.front.moments import given
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Investigator, Reader, problem_of
+from appliance.api.front.routing import Responses, Routes, file
+from appliance.api.front.services import Services
+from appliance.api.front.streams import StreamResponse, in_thread, peer_of
 from appliance.api.recording_routes import OneId
-from appliance.api.route_roles import Investigator, Reader, problem_of
-from appliance.api.routing import Responses, Routes, file
-from appliance.api.services import Services
-from appliance.api.streams import StreamResponse, in_thread, peer_of
-from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
 

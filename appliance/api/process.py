@@ -21,15 +21,15 @@ import structlog
 import uvloop
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from appliance.api.access import TokenAuthenticator
-from appliance.api.certificate import fingerprint_of, pin_of, renew, tls_context
-from appliance.api.control import ControlLink
-from appliance.api.etags import ConditionalGet
-from appliance.api.history import SampleHistory, measures_of
-from appliance.api.journal import FOLD_SECONDS, Journal
-from appliance.api.listener import Listener
-from appliance.api.request_gate import RequestGate
-from appliance.api.services import Services
+from appliance.api.front.access import TokenAuthenticator
+from appliance.api.front.certificate import fingerprint_of, pin_of, renew, tls_context
+from appliance.api.front.control import ControlLink
+from appliance.api.front.etags import ConditionalGet
+from appliance.api.front.history import SampleHistory, measures_of
+from appliance.api.front.journal import FOLD_SECONDS, Journal
+from appliance.api.front.listener import Listener
+from appliance.api.front.request_gate import RequestGate
+from appliance.api.front.services import Services
 from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages

@@ -12,14 +12,14 @@ from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.convertors import StringConvertor, register_url_convertor
 
-from appliance.api.access import Bearer
-from appliance.api.moments import given
-from appliance.api.problems import ProblemError
-from appliance.api.route_roles import Investigator, Viewer, answered
-from appliance.api.routing import Responses, Routes, file
-from appliance.api.services import Services
-from appliance.api.streams import StreamResponse, Work, in_thread, peer_of
-from appliance.audit.log_database import LogUnreadableError
+from appliance.api.front.access import Bearer
+from appliance.api.front.moments import given
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Investigator, Viewer, answered
+from appliance.api.front.routing import Responses, Routes, file
+from appliance.api.front.services import Services
+from appliance.api.front.streams import StreamResponse, Work, in_thread, peer_of
+from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import (
     RecordedMessages,

@@ -21,9 +21,9 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.log_database import reading
+from appliance.audit.log.log_database import reading
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.audit.takeovers import EpochOf, Handover, Takeover, TakeoverLog, checkpoint_fault
 
 _SECOND = 1_000_000_000

@@ -12,9 +12,9 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.signatures import signature_is_valid
+from appliance.audit.log.signatures import signature_is_valid
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.copies import SignedCheckpoint
 from appliance.signing.signed_statements import parse_checkpoint
 
 TOOK_OVER, HANDED_OVER, STAYED = "took over", "handed over", "switchover failed"

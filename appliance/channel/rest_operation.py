@@ -1,7 +1,7 @@
 """Define a row of the table of operations: how clients send a request of `channel/admin.py` over REST.
 
-The api's routes (`api/operation_routes.py`), the command line's calls and control's check (`channel/rest_meaning.py`)
-are derived from the rows.
+The api's routes (`api/routes/operation_routes.py`), the command line's calls and control's check
+(`channel/rest_meaning.py`) are derived from the rows.
 """
 
 import functools

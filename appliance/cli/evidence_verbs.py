@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 import typer
 
-from appliance.audit.filter_options import Since, Until
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
+from appliance.audit.search.filter_options import Since, Until
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp

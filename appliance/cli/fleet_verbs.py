@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from appliance.audit.signatures import pinned_key_path
+from appliance.audit.log.signatures import pinned_key_path
 from appliance.backup.contents import AUDIT_LOG
 from appliance.base.atomic_files import write_whole
 from appliance.cli.connection.target import DEFAULT_STATE, State

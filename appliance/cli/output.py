@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from appliance.api.moments import in_full
+from appliance.api.front.moments import in_full
 from appliance.base import actors
 from appliance.base.atomic_files import NotLastingError, write_where_told
 from rosmop.tool import terminal

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import msgspec
 import typer
 
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp

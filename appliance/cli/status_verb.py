@@ -11,7 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from appliance.api.moments import in_full
+from appliance.api.front.moments import in_full
 from appliance.base import clock
 from appliance.base.actors import DISK
 from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted

@@ -12,7 +12,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.output import say_json

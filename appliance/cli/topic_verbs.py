@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.api.moments import in_full
-from appliance.audit.publishers import publishers_at
-from appliance.audit.query import Filter
-from appliance.audit.record_format import rfc3339
+from appliance.api.front.moments import in_full
+from appliance.audit.log.record_format import rfc3339
+from appliance.audit.search.publishers import publishers_at
+from appliance.audit.search.query import Filter
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin

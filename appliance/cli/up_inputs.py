@@ -16,8 +16,8 @@ from typing import NamedTuple
 from appliance.base.actors import DISK
 from appliance.base.owner_access import is_named_there
 from appliance.configuration.settings import Settings
-from appliance.control.policy_gate import KeptPolicy, PolicyRefusedError, policy_at_start
-from appliance.control.robot import robot_addresses
+from appliance.control.assembly.policy_gate import KeptPolicy, PolicyRefusedError, policy_at_start
+from appliance.control.assembly.robot import robot_addresses
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS

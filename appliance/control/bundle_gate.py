@@ -27,9 +27,9 @@ from appliance.channel.answers.status import BundlesState
 from appliance.channel.link import Link
 from appliance.channel.messages import BundleHealth, BundleOffered, BundleStated, RefusedBundle
 from appliance.configuration.settings import Fleet
+from appliance.control.assembly.policies import Policies, PolicyCases, RevisionChangedError
+from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.bundle_health import RobotHealth
-from appliance.control.policies import Policies, PolicyCases, RevisionChangedError
-from appliance.control.policy_gate import PolicyRefusedError
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.hosts_file import IN_BUNDLE, DeclaredHostsError, parse_declared

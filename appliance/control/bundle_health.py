@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 from appliance.channel.answers.status import MinuteState, ProcessInfo
-from appliance.control.monitor_states import monitors_status
+from appliance.control.assembly.monitor_states import monitors_status
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.specifications.specification_manager import SpecificationManager

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from appliance.audit.log import AuditLog
+from appliance.audit.log.log import AuditLog
 from appliance.channel import admin
 from appliance.channel.answers.evidence_answers import Sealed
 from appliance.telemetry.audit_trail import AuditTrail

@@ -20,14 +20,14 @@ from appliance.channel import messages
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
-from appliance.control.admin_socket import AdminServer
 from appliance.control.inheritance import CopyAge
 from appliance.control.lease_client import HandOverError, LeaseClient
+from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
 from appliance.control.replication import Pair, host_endpoint, state_of
 from appliance.control.standby_orders import StandbyAdministration
 from appliance.control.standby_tunnels import StandbyTunnels
-from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.takeover_check import TakeoverCheck
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.standby.link_certificates import replication_context

@@ -13,9 +13,9 @@ from appliance.channel.admin import AdminAnswer, encode
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import RequestAnswered, RequestMade, RestServed, TokenKept, TokensStated
-from appliance.control.admin_socket import RequestHandler
-from appliance.control.rest_proof import RequestAuthenticator, UnprovenError
-from appliance.control.token_orders import kept_by_api
+from appliance.control.operators.admin_socket import RequestHandler
+from appliance.control.operators.token_orders import kept_by_api
+from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow
 

@@ -25,18 +25,18 @@ import uvloop
 from appliance.base.background import run_always
 from appliance.channel import messages
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.control.admin_socket import AdminServer
-from appliance.control.assembly import Parts, assemble
-from appliance.control.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.assembly.assembly import Parts, assemble
+from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
+from appliance.control.assembly.robot import master_address
+from appliance.control.assembly.stored_times import note_times
 from appliance.control.lease_client import LeaseClient
-from appliance.control.operators import Operators, make_operators
+from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.operator_assembly import Operators, make_operators
+from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.passive import until_activated
 from appliance.control.replication import Pair, answered_when_stored
-from appliance.control.robot import master_address
 from appliance.control.spare_memory import return_spare_memory
 from appliance.control.standby_orders import begin_epoch, service_reports, standby_source, state_copies
-from appliance.control.stored_times import note_times
-from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.supervisor_messages import SupervisorMessages
 from appliance.control.takeover_check import STATE_ERRORS
 from appliance.control.takeover_record import TakeoverRecorder

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from msgspec.structs import replace
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.channel import admin, messages
 from appliance.channel.answers.recording_answers import (

@@ -7,8 +7,8 @@ is repaired; they are reported only if they last, because a takeover costs more 
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.status_summary import no_relay
-from appliance.control.assembly import Parts
-from appliance.control.foundation import Foundation
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
 
 _REPAIR_SECONDS = 8.0
 

@@ -10,10 +10,10 @@ import structlog
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.channel.answers.standby_answers import StandbyState
-from appliance.control.assembly import Parts
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
 from appliance.control.errors import UnknownThingError
 from appliance.control.fleet_of_pair import compare_fleets
-from appliance.control.foundation import Foundation
 from appliance.control.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.control.lease_client import HandOverError
 from appliance.control.replication import Pair, Replication

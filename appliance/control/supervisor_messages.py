@@ -11,11 +11,11 @@ from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import ProcessInfo
 from appliance.channel.channel import Channel
-from appliance.control.assembly import Parts
-from appliance.control.foundation import Foundation
-from appliance.control.operators import Operators
-from appliance.control.policies import RevisionChangedError
-from appliance.control.policy_gate import PolicyRefusedError
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Foundation
+from appliance.control.assembly.policies import RevisionChangedError
+from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.operator_assembly import Operators
 from appliance.hosts.host_table import HostRefusedError
 from appliance.master.graph.registry import Kind
 from appliance.specifications.allocation import TOPIC

@@ -19,10 +19,10 @@ from pathlib import Path
 import structlog
 
 from appliance.configuration.settings import Settings
-from appliance.control.foundation import make_host_table, open_listener
-from appliance.control.policies import kept_policy
-from appliance.control.policy_gate import PolicyRefusedError, policy_at_start
-from appliance.control.robot import robot_addresses
+from appliance.control.assembly.foundation import make_host_table, open_listener
+from appliance.control.assembly.policies import kept_policy
+from appliance.control.assembly.policy_gate import PolicyRefusedError, policy_at_start
+from appliance.control.assembly.robot import robot_addresses
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import restore
 from appliance.policy.judgement import PolicyContext

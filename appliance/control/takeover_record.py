@@ -12,12 +12,12 @@ from typing import TypeVar
 import msgspec
 import structlog
 
-from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
-from appliance.audit.log import AuditLog
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter
-from appliance.audit.search import search
-from appliance.audit.signatures import KeyUnreadableError, pinned_key_path, read_public_key
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.signatures import KeyUnreadableError, pinned_key_path, read_public_key
+from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.audit.takeovers import TOOK_OVER, EpochOf, TookOver, checkpoint_fault
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail

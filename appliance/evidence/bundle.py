@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from appliance.audit.chain import StoredColumns
-from appliance.audit.chain_proofs import ChainProof, ChainReader
-from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
-from appliance.audit.signatures import pinned_key_path
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.signatures import pinned_key_path
+from appliance.audit.proof.chain_proofs import ChainProof, ChainReader
 from appliance.base import clock
 from appliance.channel.admin import (
     A,

@@ -8,10 +8,10 @@ from typing import IO
 
 import msgspec
 
-from appliance.audit.chain_proofs import ChainProof
-from appliance.audit.columns import to_columns
-from appliance.audit.record_format import entry_of
-from appliance.audit.signatures import write_public_key
+from appliance.audit.log.columns import to_columns
+from appliance.audit.log.record_format import entry_of
+from appliance.audit.log.signatures import write_public_key
+from appliance.audit.proof.chain_proofs import ChainProof
 from appliance.base.input_files import lines_given
 from appliance.evidence.bundle import stored_line
 from appliance.evidence.bundle_verifier import Verifier

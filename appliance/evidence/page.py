@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from appliance.audit.record_format import printable, rfc3339
+from appliance.audit.log.record_format import printable, rfc3339
 from appliance.channel.answers.recording_answers import Recording
 
 _MOST_ROWS = 2000

@@ -18,12 +18,12 @@ from typing import Any, Literal
 import msgspec
 import structlog
 
-from appliance.audit.copies import signed_checkpoints
-from appliance.audit.log_database import LogUnreadableError, reading
-from appliance.audit.query import Filter
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import LogEntry
-from appliance.audit.search import search
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.copies import signed_checkpoints
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported

@@ -3,7 +3,7 @@
 import asyncio
 from pathlib import Path
 
-from appliance.audit.signatures import read_public_key
+from appliance.audit.log.signatures import read_public_key
 from appliance.collector.connection import robot_connection
 from appliance.configuration.settings import Settings, load_resolved
 from appliance.forwarding.process import ForwardingProcess

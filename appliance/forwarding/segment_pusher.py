@@ -25,9 +25,9 @@ from typing import Annotated
 import msgspec
 import structlog
 
-from appliance.audit.copies import signed_checkpoints
-from appliance.audit.log_database import LogUnreadableError, reading
-from appliance.audit.segments import SegmentSummary, next_segment, write_segment
+from appliance.audit.log.log_database import LogUnreadableError, reading
+from appliance.audit.proof.copies import signed_checkpoints
+from appliance.audit.proof.segments import SegmentSummary, next_segment, write_segment
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported

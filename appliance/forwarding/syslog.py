@@ -15,9 +15,9 @@ from datetime import UTC, datetime
 
 import msgspec
 
-from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.record import Severity
-from appliance.audit.record_format import LogEntry, fields_of, printable
+from appliance.audit.log.record import Severity
+from appliance.audit.log.record_format import LogEntry, fields_of, printable
+from appliance.audit.proof.copies import SYSLOG_ELEMENT, SignedCheckpoint
 
 ELEMENT = "rosrv@32473"  # 32473 is reserved for examples (RFC 5612); the project has no number
 LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1

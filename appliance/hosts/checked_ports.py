@@ -3,7 +3,7 @@
 import ipaddress
 from collections.abc import Callable
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import PortsReport

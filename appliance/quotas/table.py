@@ -41,7 +41,7 @@ RVMASTER_CONNECTIONS = QuotaRow(
     setting="limits.connections",
     shown_by=(
         "integration/master/test_quotas.py::test_connections_of_two_hundred_addresses",
-        "unit/control/test_listener_limits.py::test_connections_of_a_wildcard_displace_no_named_host",
+        "unit/control/assembly/test_listener_limits.py::test_connections_of_a_wildcard_displace_no_named_host",
     ),
 )
 RVMASTER_ARRIVALS = QuotaRow(
@@ -54,8 +54,8 @@ RVMASTER_ARRIVALS = QuotaRow(
     shown_by=(
         "integration/master/test_accept_queues.py::test_a_full_queue_of_unknown_hosts",
         "unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",
-        "unit/control/test_listener_limits.py::test_hosts_of_a_wildcard_leave_a_named_host_its_slot",
-        "unit/control/test_listener_limits.py::test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots",
+        "unit/control/assembly/test_listener_limits.py::test_hosts_of_a_wildcard_leave_a_named_host_its_slot",
+        "unit/control/assembly/test_listener_limits.py::test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots",
     ),
 )
 RVMASTER_BYTES = QuotaRow(
@@ -333,13 +333,13 @@ REST_CONNECTIONS = QuotaRow(
     setting="api_limits.connections",
     shown_by=(
         "integration/master/test_quotas.py::test_handshakes_with_rest",
-        "unit/api/test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
-        "unit/api/test_listener.py::test_unknown_hosts_in_the_handshake_make_room",
+        "unit/api/front/test_listener.py::test_a_known_peer_is_opened_before_waiting_unknown_hosts",
+        "unit/api/front/test_listener.py::test_unknown_hosts_in_the_handshake_make_room",
     ),
 )
 _STREAMS_SHOWN_BY = (
-    "unit/api/test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
-    "unit/api/test_streams.py::test_one_token_and_one_host_have_a_quota",
+    "unit/api/front/test_streams.py::test_two_hundred_viewers_leave_slots_to_operators",
+    "unit/api/front/test_streams.py::test_one_token_and_one_host_have_a_quota",
 )
 REST_STREAMS = QuotaRow(
     thing="streams of REST by token: followers of the audit log, and of `/v1/live` (a limit for each)",
@@ -375,7 +375,7 @@ REST_WORK = QuotaRow(
     between="next is the token with the longest wait since its last turn",
     counting="a host is a token; kept: not for viewers",
     alarm="`rest call` with status 503",
-    shown_by=("unit/api/test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",),
+    shown_by=("unit/api/front/test_streams.py::test_a_viewer_with_many_requests_leaves_turns_to_an_admin",),
 )
 AUDIT_KINDS = QuotaRow(
     thing="kinds of folded denials in the audit log",
@@ -384,8 +384,8 @@ AUDIT_KINDS = QuotaRow(
     between="further denials of all unknown hosts are counted as one kind",
     alarm="`denials folded` with `scope` `host` or `unknown hosts`",
     shown_by=(
-        "unit/audit/test_folding.py::test_unknown_hosts_leave_named_hosts_their_kinds",
-        "unit/audit/test_folding.py::test_named_hosts_keep_a_line_each",
+        "unit/audit/log/test_folding.py::test_unknown_hosts_leave_named_hosts_their_kinds",
+        "unit/audit/log/test_folding.py::test_named_hosts_keep_a_line_each",
         "integration/master/test_audit_quotas.py::test_unknown_hosts_do_not_displace_denials_of_named_hosts",
     ),
 )
@@ -394,7 +394,7 @@ AUDIT_READ_KINDS = QuotaRow(
     bounds=Bounds(whole=8192, host=512, unknown=0, kept=0),
     at_limit="further reads are recorded in full and charged to the host's bytes of audit records",
     alarm="none",
-    shown_by=("unit/audit/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
+    shown_by=("unit/audit/log/test_folding.py::test_reads_beyond_the_quota_are_recorded_in_full",),
 )
 AUDIT_BYTES = QuotaRow(
     thing="bytes of audit records that a host owes; its debt falls by 64 KiB a second",
@@ -404,8 +404,8 @@ AUDIT_BYTES = QuotaRow(
     " all unknown hosts owe as one",
     alarm="`limit exceeded`",
     shown_by=(
-        "unit/audit/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
-        "unit/audit/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
+        "unit/audit/log/test_budget.py::test_two_hundred_hosts_leave_the_robot_its_quota",
+        "unit/audit/log/test_budget.py::test_a_host_in_debt_waits_until_it_is_paid",
         "integration/master/test_audit_quotas.py::test_reads_with_long_keys_do_not_fill_the_disk",
     ),
 )
@@ -419,8 +419,8 @@ AUDIT_RESERVE = QuotaRow(
     alarm="`disk nearly full`; `rosrv status`",
     setting="audit.reserve_bytes",
     shown_by=(
-        "unit/control/test_quota_class.py::test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart",
-        "unit/audit/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
+        "unit/control/assembly/test_quota_class.py::test_the_last_of_the_disk_is_for_named_hosts_also_after_a_restart",
+        "unit/audit/log/test_disk_space.py::test_low_space_raises_an_alarm_before_the_disk_is_full",
     ),
 )
 NODE_PORTS = QuotaRow(

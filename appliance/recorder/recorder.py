@@ -19,10 +19,10 @@ from typing import Any
 
 import structlog
 
-from appliance.audit.ids import IdSource
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter
-from appliance.audit.search import Follower, export, search
+from appliance.audit.log.ids import IdSource
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import Follower, export, search
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.recording_answers import Recording, Trigger

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.audit.record import Severity
-from appliance.audit.record_format import LogEntry, as_json
+from appliance.audit.log.record import Severity
+from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.recording_answers import (
     OPERATORS,

@@ -23,7 +23,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.channel.answers.recording_answers import (
     APPLIANCE,
     OPERATORS,

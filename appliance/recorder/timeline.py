@@ -17,12 +17,12 @@ from typing import Any, get_args
 
 import msgspec
 
-from appliance.audit.equality import times_of
-from appliance.audit.folding import FoldSettings
-from appliance.audit.query import Filter
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import without_binding
-from appliance.audit.search import export
+from appliance.audit.log.folding import FoldSettings
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import without_binding
+from appliance.audit.search.equality import times_of
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import export
 from appliance.channel.answers.recording_answers import (
     EventKind,
     EventMarks,

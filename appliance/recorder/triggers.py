@@ -6,9 +6,9 @@ restarts.
 
 from collections.abc import Collection
 
-from appliance.audit.equality import equality_of
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import without_binding
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import without_binding
+from appliance.audit.search.equality import equality_of
 from appliance.channel.answers.recording_answers import APPLIANCE, Trigger, TriggerKind
 
 _BY_EVENT: dict[str, TriggerKind] = {

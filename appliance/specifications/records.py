@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import Any
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.channel.messages import MonitorEvent
 from appliance.telemetry.audit_trail import AuditTrail
 

@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Se
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages

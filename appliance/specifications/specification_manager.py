@@ -28,7 +28,7 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 import structlog
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.actors import DISK, UNCONFIRMED
 from appliance.base.withdrawal import WithdrawnError, take_effect

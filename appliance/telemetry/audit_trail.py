@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from appliance.audit.events import SEVERITIES
-from appliance.audit.log import AuditLog
-from appliance.audit.record import AuditRecord, RuleReference, Severity
+from appliance.audit.log.events import SEVERITIES
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.base import clock
 from appliance.policy.model import Decision, Rule
 from appliance.quotas.pool import QuotaClass
@@ -144,7 +144,7 @@ class AuditTrail:
     ) -> str:
         """Record an event that is not a decision; return the record's id, as `decided` does. `more` adds details.
 
-        `severity` overrides the default severity of the event (`audit/events.py`).
+        `severity` overrides the default severity of the event (`audit/log/events.py`).
         `reads`: the event changed nothing, so repetitions are only counted. `whole`: every record is kept, even if the
         host is beyond its quota.
         """

@@ -2,7 +2,7 @@
 
 `/metrics` and docs/reference/metrics.md are both generated from `METRICS` (`python -m appliance.telemetry.metrics`).
 Counting costs a few additions per request and no formatting. Labels have few values. Calls, categories and roles are
-fixed sets. Only topics and services on a relay are labels; `appliance.control.measurements` limits their number.
+fixed sets. Only topics and services on a relay are labels; `control.operators.measurements` limits their number.
 """
 
 import bisect

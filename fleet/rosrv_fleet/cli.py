@@ -12,8 +12,8 @@ import msgspec
 import psycopg
 import typer
 
-from appliance.audit.query import Filter, FilterError
-from appliance.audit.record_format import printable
+from appliance.audit.log.record_format import printable
+from appliance.audit.search.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector

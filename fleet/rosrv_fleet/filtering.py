@@ -5,7 +5,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from appliance.audit.filter_options import filter_given
+from appliance.audit.search.filter_options import filter_given
 
 
 def searched(verb: Callable[..., None]) -> Callable[..., None]:

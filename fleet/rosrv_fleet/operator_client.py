@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import httpx
 import typer
 
-from appliance.audit.record_format import printable
+from appliance.audit.log.record_format import printable
 from appliance.base.input_files import read_given
 
 NO_TOKEN = Path("token")

@@ -8,7 +8,7 @@ from typing import Any
 import structlog
 import typer
 
-from appliance.audit.record_format import printable
+from appliance.audit.log.record_format import printable
 
 
 def say(line: str) -> None:

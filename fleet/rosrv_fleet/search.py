@@ -10,10 +10,10 @@ import msgspec
 import psycopg
 from psycopg_pool import PoolTimeout
 
-from appliance.audit.chain import StoredColumns
-from appliance.audit.columns import from_columns
-from appliance.audit.query import FilterError
-from appliance.audit.record_format import LogEntry, as_object
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import from_columns
+from appliance.audit.log.record_format import LogEntry, as_object
+from appliance.audit.search.query import FilterError
 from rosrv_fleet.database import IndexDatabase
 from rosrv_fleet.search_sql import FleetFilter, SearchCursor, days_statement, parse_cursor, search_statement
 

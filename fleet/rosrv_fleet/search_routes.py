@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import msgspec
 from fastapi import APIRouter, Depends, HTTPException, Query, Response
 
-from appliance.audit.filter_options import filter_given
-from appliance.audit.query import Filter, FilterError
+from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.query import Filter, FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.access import holder_of
 from rosrv_fleet.collector import Collector

@@ -10,9 +10,9 @@ from typing import LiteralString, NamedTuple
 
 import msgspec
 
-from appliance.audit.chain import StoredColumns
-from appliance.audit.query import Filter, FilterError, checked_pattern
-from appliance.audit.record import Severity
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.record import Severity
+from appliance.audit.search.query import Filter, FilterError, checked_pattern
 
 _ORDER: LiteralString = " ORDER BY time DESC, robot DESC, id DESC LIMIT %s"
 _WORDS: LiteralString = (

@@ -37,7 +37,7 @@ from typing import IO, NamedTuple
 
 import msgspec
 
-from appliance.audit.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
+from appliance.audit.proof.segments import LONGEST_LINE, SegmentHeader, SegmentSummary
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.robots import make_folder

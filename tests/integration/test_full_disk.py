@@ -8,7 +8,7 @@ import pytest
 
 from appliance.channel import admin
 from appliance.cli.connection.admin_client import AdminSocket
-from appliance.control.administration import KEPT
+from appliance.control.operators.administration import KEPT
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from appliance.api.contract import EXAMPLES
+from appliance.api.routes.contract import EXAMPLES
 from appliance.recorder.mcap import as_mcap
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import rosrv

@@ -9,11 +9,11 @@ from pathlib import Path
 import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
+from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
 from appliance.base.clock import now, using
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.control.signer_requests import SignerRequests
+from appliance.control.links.signer_requests import SignerRequests
 from appliance.control.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail

@@ -3,8 +3,8 @@
 import asyncio
 from typing import Any
 
-from appliance.audit.log import AuditLog
-from appliance.audit.record import AuditRecord, RuleReference
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.record import AuditRecord, RuleReference
 from appliance.base import clock
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import let_pass

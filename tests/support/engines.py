@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from appliance.audit.log import AuditLog
+from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.base.engine_thread import InCaller, Turn
 from appliance.store.writer_thread import Database

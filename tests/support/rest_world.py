@@ -13,13 +13,13 @@ from typing import Any, TypeVar, cast
 import httpx
 from fastapi import FastAPI
 
-from appliance.api.access import TokenAuthenticator
 from appliance.api.app import build_app
-from appliance.api.control import ControlLink
-from appliance.api.history import SampleHistory
-from appliance.api.journal import Journal
-from appliance.api.request_gate import RequestGate
-from appliance.api.services import Services
+from appliance.api.front.access import TokenAuthenticator
+from appliance.api.front.control import ControlLink
+from appliance.api.front.history import SampleHistory
+from appliance.api.front.journal import Journal
+from appliance.api.front.request_gate import RequestGate
+from appliance.api.front.services import Services
 from appliance.base.clock import using
 from appliance.channel import admin
 from appliance.channel.admin import CHANGES, AdminRequest, answer_to
@@ -30,18 +30,18 @@ from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
-from appliance.control.administration import Administration
-from appliance.control.alarm_orders import AlarmOrders
-from appliance.control.block_orders import BlockOrders
+from appliance.control.assembly.policies import Policies
 from appliance.control.evidence_orders import EvidenceOrders
-from appliance.control.limit_use import LimitQueries
-from appliance.control.policies import Policies
-from appliance.control.queries import Queries
+from appliance.control.operators.administration import Administration
+from appliance.control.operators.alarm_orders import AlarmOrders
+from appliance.control.operators.block_orders import BlockOrders
+from appliance.control.operators.limit_use import LimitQueries
+from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_methods import request_methods
+from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.recording_orders import RecordingOrders
-from appliance.control.request_methods import request_methods
-from appliance.control.rest import RestLink
+from appliance.control.rest.rest import RestLink
 from appliance.control.standby_orders import StandbyOrders
-from appliance.control.token_orders import TokenOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment

@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from appliance.api.contract import EXAMPLES
+from appliance.api.routes.contract import EXAMPLES
 from appliance.ipsec.requests import make_key, signing_request
 from examples.landshark.lab import Host, Lab
 from tests.support.nodes import RosSession, has_ros

@@ -27,11 +27,11 @@ UNLIMITED = 64 << 20
 MOST_STEPS = 200_000  # ten milliseconds or less
 
 LIMITED = {
-    "appliance.audit.copies:_ELEMENT": "65,536 characters, `_LONGEST_LINE`; an operator's own file",
-    "appliance.audit.copies:_PARAMETER": "as `_ELEMENT`",
-    "appliance.audit.record_format:_BOUND": "a record's reason; each word is scanned once, as the next word follows it",
-    "appliance.api.console:_ADDRESS": "the console's files, at the start",
-    "appliance.api.console:_GZIP": "a header of 16 KiB; each `gzip` is followed by its own scan",
+    "appliance.audit.proof.copies:_ELEMENT": "65,536 characters, `_LONGEST_LINE`; an operator's own file",
+    "appliance.audit.proof.copies:_PARAMETER": "as `_ELEMENT`",
+    "appliance.audit.log.record_format:_BOUND": "a record's reason; each word is scanned once, as another follows",
+    "appliance.api.console.console:_ADDRESS": "the console's files, at the start",
+    "appliance.api.console.console:_GZIP": "a header of 16 KiB; each `gzip` is followed by its own scan",
     "appliance.base.varying_numbers:_NUMBER": "a record's reason; time is linear, see the comment there",
     "appliance.configuration.inventory:_COMMON": "the licence files of the installation",
     "appliance.configuration.inventory:_LICENCE": "the licence files of the installation",
@@ -48,7 +48,7 @@ LIMITED = {
 """Patterns with more steps, and the limit of their text or the reason why the bound is too high."""
 
 LOCAL = {
-    "appliance/api/console_bundle.py": "the console's own files, at the start",
+    "appliance/api/console/console_bundle.py": "the console's own files, at the start",
     "appliance/base/validation_messages.py": "sentences of our libraries about settings and bodies",
     "appliance/cli/": "a process of the operator",
     "rosmop/certify/": "a process of the compiler, whose processor time is limited (`DRY_RUNS`)",

@@ -145,14 +145,14 @@ _IMPORTED = "imported only where it runs; a test resolves every row"
 _LIBRARY = "how the library or Python itself offers it"
 _TEXT = "a word in a text for people"
 LOOKUPS = {
-    "appliance/api/moments.py _units": "msgspec names the schemas of structs by their classes",
-    "appliance/api/operation_routes.py _add": _LIBRARY,
-    "appliance/api/routing.py add_api_route": _LIBRARY,
-    "appliance/api/routing.py components": "the schemas in the contract have the names of their structs",
-    "appliance/api/routing.py tagged": "monitors have a tag, other answers with an ETag a revision",
-    "appliance/audit/query.py conditions": "the fields of a filter have the names of the log's columns",
-    "appliance/audit/record_format.py as_object": _FIELDS,
-    "appliance/audit/search.py _neighbours": "the fields of a record have the names of the log's columns",
+    "appliance/api/front/moments.py _units": "msgspec names the schemas of structs by their classes",
+    "appliance/api/routes/operation_routes.py _add": _LIBRARY,
+    "appliance/api/front/routing.py add_api_route": _LIBRARY,
+    "appliance/api/front/routing.py components": "the schemas in the contract have the names of their structs",
+    "appliance/api/front/routing.py tagged": "monitors have a tag, other answers with an ETag a revision",
+    "appliance/audit/search/query.py conditions": "the fields of a filter have the names of the log's columns",
+    "appliance/audit/log/record_format.py as_object": _FIELDS,
+    "appliance/audit/search/search.py _neighbours": "the fields of a record have the names of the log's columns",
     "appliance/backup/create.py _is_full": _LIBRARY,
     "appliance/cli/connection/target.py speaking": _LIBRARY,
     "appliance/cli/demo.py demo": "the demonstration is beside the package, and imports it",
@@ -266,11 +266,11 @@ def unfilled(seen: Sequence[Seen]) -> Iterator[str]:
 
 WALL_CLOCK = {
     "a moment that people are shown, or that stands in a file": [
-        "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
+        "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
         "bundles/poller.py", "control/bundle_gate.py",
         "cli/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
-        "control/host_blocks.py", "control/passive.py",
-        "control/policies.py", "control/queries.py", "control/replication.py",
+        "control/assembly/host_blocks.py", "control/passive.py",
+        "control/assembly/policies.py", "control/operators/queries.py", "control/replication.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
         "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
@@ -280,22 +280,23 @@ WALL_CLOCK = {
         "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
         "base/deadlines.py", "bundles/verified_bundles.py",
-        "control/token_orders.py", "hosts/appliance_table.py",
+        "control/operators/token_orders.py", "hosts/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
         "signing/own_certificate.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "control/alarm_orders.py", "control/stored_times.py",
-        "control/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py", "store/revisions.py",
+        "control/operators/alarm_orders.py", "control/assembly/stored_times.py",
+        "control/operators/switched_off.py", "hosts/self_service.py", "specifications/timed_disables.py",
+        "store/revisions.py",
     ],
     "whether the wall clock can be believed, and where it is read": [
-        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/clock_check.py",
+        "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/moments.py", "channel/alarms.py", "audit/filter_options.py", "cli/evidence_verbs.py",
+        "api/front/moments.py", "channel/alarms.py", "audit/search/filter_options.py", "cli/evidence_verbs.py",
         "cli/monitor/offline.py", "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
         "cli/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
     ],

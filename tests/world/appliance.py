@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from appliance.channel import messages
 from appliance.configuration.settings import Audit, LivenessSection, Settings
-from appliance.control.assembly import Parts
+from appliance.control.assembly.assembly import Parts
 from appliance.control.process import _run as run_control
 from appliance.relay.connections.admission import missing
 from appliance.relay.grant_table import GrantTable

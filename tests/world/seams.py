@@ -13,22 +13,14 @@ from random import Random
 from types import SimpleNamespace
 from typing import Any
 
-from appliance.audit import log_database, log_writer
-from appliance.audit.log import AuditLog
+from appliance.audit.log import log_database, log_writer
+from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.channel import child_process
-from appliance.control import (
-    assembly,
-    foundation,
-    listener_limits,
-    open_audit,
-    passive,
-    replication,
-    supervisor_link,
-    supervisor_messages,
-    takeover_check,
-)
+from appliance.control import passive, replication, supervisor_messages, takeover_check
 from appliance.control import process as control_process
+from appliance.control.assembly import assembly, foundation, listener_limits, open_audit
+from appliance.control.links import supervisor_link
 from appliance.master import rosmaster
 from appliance.master.endpoints import node_ports
 from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal

@@ -26,9 +26,9 @@ from typing import Any, Literal, NoReturn
 
 import structlog
 
-from appliance.audit.verification import verify
+from appliance.audit.proof.verification import verify
 from appliance.channel import admin, messages
-from appliance.control.assembly import Parts
+from appliance.control.assembly.assembly import Parts
 from appliance.master.graph.registry import Kind, Life
 from roswire.parameter_tree import standing_at
 from tests.world import seams

@@ -6,11 +6,11 @@ from typing import NoReturn
 
 import typer
 
-from appliance.audit.copies import CopiesUnreadableError
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import FilterError
-from appliance.audit.record_format import printable
-from appliance.audit.signatures import KeyUnreadableError
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record_format import printable
+from appliance.audit.log.signatures import KeyUnreadableError
+from appliance.audit.proof.copies import CopiesUnreadableError
+from appliance.audit.search.query import FilterError
 from appliance.base.timestamps import TimestampError
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.evidence.export_verification import ExportUnreadableError

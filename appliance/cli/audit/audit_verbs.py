@@ -16,12 +16,12 @@ from typing import Annotated, TextIO, TypeVar
 import msgspec
 import typer
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.copies import read_copies
-from appliance.audit.query import Filter
-from appliance.audit.record_format import LogEntry, as_json, as_object
-from appliance.audit.search import LARGEST_PAGE
-from appliance.audit.signatures import read_public_key
+from appliance.audit.log.record_format import LogEntry, as_json, as_object
+from appliance.audit.log.signatures import read_public_key
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.copies import read_copies
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import LARGEST_PAGE
 from appliance.audit.takeover_verification import (
     PairVerification,
     VerifiedLog,

@@ -5,11 +5,11 @@ import inspect
 from collections.abc import Callable
 from typing import Concatenate, ParamSpec
 
-from appliance.api.named_hosts import has_name, with_networks
-from appliance.api.unrecorded import unrecorded
-from appliance.audit.filter_options import filter_given
-from appliance.audit.query import Filter, FilterError
-from appliance.audit.record_format import printable
+from appliance.api.front.unrecorded import unrecorded
+from appliance.api.routes.named_hosts import has_name, with_networks
+from appliance.audit.log.record_format import printable
+from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.query import Filter, FilterError
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, note

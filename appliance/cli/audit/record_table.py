@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.audit.chain_findings import Elsewhere, FindingKind, Verification
-from appliance.audit.equality import FOLDED, EqualRecords, grouped
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
-from appliance.audit.search import RecordInContext
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
+from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
+from appliance.audit.search.equality import FOLDED, EqualRecords, grouped
+from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
 from appliance.evidence.export_verification import ExportVerification
 

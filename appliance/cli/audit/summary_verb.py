@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from appliance.audit.denial_summary import LARGEST_SUMMARY, DenialSummary, HostDenials
-from appliance.audit.filter_options import Since, Until, times_given
-from appliance.audit.query import Filter
-from appliance.audit.record_format import printable
+from appliance.audit.log.record_format import printable
+from appliance.audit.search.denial_summary import LARGEST_SUMMARY, DenialSummary, HostDenials
+from appliance.audit.search.filter_options import Since, Until, times_given
+from appliance.audit.search.query import Filter
 from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.record_table import write
 from appliance.cli.connection.target import Appliance, speaks_with

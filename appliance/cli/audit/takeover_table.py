@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from appliance.audit.record_format import printable, rfc3339
+from appliance.audit.log.record_format import printable, rfc3339
 from appliance.audit.takeover_verification import PairVerification, TakeoverProof
 from appliance.cli.audit.record_table import print_verification, write
 

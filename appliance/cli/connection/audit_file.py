@@ -5,15 +5,23 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.chain_proofs import evidence, evidence_line
-from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
-from appliance.audit.denial_summary import DenialSummary, summary_of_log
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter
-from appliance.audit.record_format import LogEntry
-from appliance.audit.search import Follower, RecordInContext, SearchPage, export, last_sequence, search, show
-from appliance.audit.verification import verify
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.chain_proofs import evidence, evidence_line
+from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
+from appliance.audit.proof.verification import verify
+from appliance.audit.search.denial_summary import DenialSummary, summary_of_log
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import (
+    Follower,
+    RecordInContext,
+    SearchPage,
+    export,
+    last_sequence,
+    search,
+    show,
+)
 
 _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]

@@ -9,12 +9,12 @@ from typing import Any
 
 import msgspec
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.denial_summary import DenialSummary
-from appliance.audit.query import Filter, FilterError
-from appliance.audit.record_format import LogEntry, entry_of, rfc3339
-from appliance.audit.search import RecordInContext, SearchPage
+from appliance.audit.log.record_format import LogEntry, entry_of, rfc3339
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.audit.search.denial_summary import DenialSummary
+from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.search import RecordInContext, SearchPage
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import Progress
 from appliance.cli.connection.rest_session import RestClient, RestProblemError

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from msgspec.structs import replace
 
-from appliance.api.kits import KitOptions
+from appliance.api.routes.kits import KitOptions
 from appliance.base.validation_messages import meant
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
 from appliance.channel.answers.host_answers import Host, PortsSeen

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from appliance.api.kits import KitOptions, kit_of
+from appliance.api.routes.kits import KitOptions, kit_of
 from appliance.base.input_files import open_given
 from appliance.channel.admin import HostEndpoint
 from appliance.channel.answers.host_answers import EnrolmentToken, KitParts

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.table import Column
 
-from appliance.api.moments import in_full
+from appliance.api.front.moments import in_full
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitor_answers import MonitorState, Replacement, Switched

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.base import clock
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from appliance.audit.filter_options import Since
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter, FilterError
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.filter_options import Since
+from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
 from appliance.base.timestamps import TimestampError, parse_timestamp
 from appliance.cli.connection.admin_client import NotRunningError

@@ -12,8 +12,8 @@ import msgspec
 import typer
 from msgspec.structs import asdict
 
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter, FilterError
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.query import Filter, FilterError
 from appliance.base.input_files import read_given_text
 from appliance.channel.admin import PolicyWanted, RegistrationsWanted
 from appliance.channel.answers.policy_answers import PolicyInForce

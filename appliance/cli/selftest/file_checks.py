@@ -7,9 +7,9 @@ from pathlib import Path
 
 from cryptography import x509
 
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter
-from appliance.audit.search import search
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.input_files import read_given, read_given_text
 from appliance.base.shipped import SHIPPED, before_program

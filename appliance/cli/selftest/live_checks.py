@@ -5,8 +5,8 @@ import time
 from collections.abc import Iterator
 from urllib.parse import urlsplit, urlunsplit
 
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.query import Filter, FilterError
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.query import Filter, FilterError
 from appliance.base import clock
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status

@@ -6,7 +6,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from appliance.api.moments import in_full
+from appliance.api.front.moments import in_full
 from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.channel.standby_summary import is_silent, lag_of, lasting, standby_troubles
 from appliance.cli.output import moment

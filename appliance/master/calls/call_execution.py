@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import structlog
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import (
     Attempt,

@@ -7,7 +7,7 @@ from itertools import zip_longest
 
 import msgspec
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.answers.graph_answers import Flow

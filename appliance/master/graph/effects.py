@@ -7,7 +7,7 @@ of the event loop, so that no reader sees a change without its effects.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.master.graph.registry import Durable, Incarnation, Kind, NodeRegistration
 from appliance.policy.model import Rule
 from appliance.store.state_file import PermissionRow

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.master.graph.effects import (
     CloseNode,

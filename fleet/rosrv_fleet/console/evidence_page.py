@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.console.frame import Column, field, link, moment, row, table, text
 from rosrv_fleet.evidence.store import StoredEvidence

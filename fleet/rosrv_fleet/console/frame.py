@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 
 from fastapi.responses import HTMLResponse
 
-from appliance.audit.record_format import printable
+from appliance.audit.log.record_format import printable
 from appliance.base import clock
 from rosrv_fleet.tokens import OperatorToken
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from appliance.audit.filter_options import filter_given
-from appliance.audit.query import FilterError
+from appliance.audit.search.filter_options import filter_given
+from appliance.audit.search.query import FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.console.frame import Column, alert, badge, choice, field, link, row, table, text

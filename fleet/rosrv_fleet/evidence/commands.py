@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import name_to_make
 from appliance.base.input_files import open_given
 from rosrv_fleet.operator_client import NO_TOKEN, Authority, Token, Url, answer_to

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from appliance.audit.record_format import rfc3339
+from appliance.audit.log.record_format import rfc3339
 from appliance.base.atomic_files import write_whole
 from rosrv_fleet.acts import recorded
 from rosrv_fleet.robots import make_folder

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.folding import FoldSettings
+from appliance.audit.log.folding import FoldSettings
 from appliance.quotas.table import AUDIT_BYTES, AUDIT_KINDS
 from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.audit.log import AuditLog
+from appliance.audit.log.log import AuditLog
 from appliance.supervisor.clock_sync import clock_is_synchronised
 from tests.support.appliance import Appliance
 from tests.support.audit import decision, settle

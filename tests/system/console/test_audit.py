@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Route, expect
 
-from appliance.audit.equality import equality_of, grouped
-from appliance.audit.record import AuditRecord, RuleReference, Severity
-from appliance.audit.record_format import LogEntry, as_object
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+from appliance.audit.log.record_format import LogEntry, as_object
+from appliance.audit.search.equality import equality_of, grouped
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 

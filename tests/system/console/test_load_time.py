@@ -2,7 +2,7 @@
 
 from playwright.sync_api import Browser, expect
 
-from appliance.api.console_bundle import join_modules
+from appliance.api.console.console_bundle import join_modules
 from tests.support.appliance import Appliance
 from tests.support.waiting import eventually
 from tests.system.console.reader import Reader

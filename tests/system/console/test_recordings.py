@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from playwright.sync_api import Route, expect
 
-from appliance.api.contract import EXAMPLES
+from appliance.api.routes.contract import EXAMPLES
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader, wait_until
 

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from appliance.audit.signatures import read_public_key
+from appliance.audit.log.signatures import read_public_key
 from appliance.collector.connection import robot_connection
 from appliance.configuration.config_sources import resolve
 from appliance.forwarding.segment_pusher import SegmentPusher

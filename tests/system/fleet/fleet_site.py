@@ -19,9 +19,9 @@ import yaml
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rosrv_fleet.robots import Robots
 
-from appliance.audit.copies import signed_checkpoints
-from appliance.audit.log import AuditLog
-from appliance.audit.signatures import read_public_key, write_public_key
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.signatures import read_public_key, write_public_key
+from appliance.audit.proof.copies import signed_checkpoints
 from appliance.collector.connection import robot_connection
 from appliance.forwarding.segment_pusher import SegmentPusher
 from tests.support.audit import decision, settle

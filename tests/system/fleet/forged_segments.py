@@ -6,13 +6,13 @@ import secrets
 import time
 from typing import Any, NamedTuple
 
-from appliance.audit.chain import StoredColumns, genesis, record_hash
-from appliance.audit.chain_proofs import ChainProof, evidence_line
-from appliance.audit.columns import from_columns, to_columns
-from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.record import AuditRecord
-from appliance.audit.record_format import LogEntry
-from appliance.audit.segments import RecordPlace, SegmentHeader, SegmentSummary
+from appliance.audit.log.chain import StoredColumns, genesis, record_hash
+from appliance.audit.log.columns import from_columns, to_columns
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
+from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.audit.proof.segments import RecordPlace, SegmentHeader, SegmentSummary
 from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint
 from tests.system.fleet.fleet_site import FleetRobot
 

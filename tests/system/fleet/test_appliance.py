@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.signatures import write_public_key
+from appliance.audit.log.signatures import write_public_key
 from tests.support.appliance import Appliance
 from tests.support.bundle_site import GROUP, ROBOT, SITE, BundleSite
 from tests.support.certificates import make_certificates

@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from appliance.audit.segments import SegmentSummary, write_segment
+from appliance.audit.proof.segments import SegmentSummary, write_segment
 from appliance.collector.connection import CollectorConnection, CollectorError
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.small_disk import small_disk

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.copies import signed_checkpoints
+from appliance.audit.proof.copies import signed_checkpoints
 from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs

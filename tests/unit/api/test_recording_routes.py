@@ -9,9 +9,9 @@ import pytest
 from starlette.responses import StreamingResponse
 
 from appliance.api import recording_routes
-from appliance.api.access import Bearer
-from appliance.api.problems import ProblemError
-from appliance.api.services import Services
+from appliance.api.front.access import Bearer
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.services import Services
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.recording_answers import Recording
 from appliance.recorder.bag_writer import BagMessage, BagWriter

@@ -8,14 +8,14 @@ from typing import Any
 import httpx
 import pytest
 
-import appliance.api as examples
-from appliance.api.access import Bearer, TokenAuthenticator
+import appliance.api.routes as examples
 from appliance.api.app import build_app
-from appliance.api.control import ControlLink
-from appliance.api.history import SampleHistory, measures_of
-from appliance.api.journal import Journal
-from appliance.api.request_gate import RequestGate
-from appliance.api.services import Services
+from appliance.api.front.access import Bearer, TokenAuthenticator
+from appliance.api.front.control import ControlLink
+from appliance.api.front.history import SampleHistory, measures_of
+from appliance.api.front.journal import Journal
+from appliance.api.front.request_gate import RequestGate
+from appliance.api.front.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.channel.answers.standby_answers import StandbyState

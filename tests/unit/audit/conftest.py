@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.log import AuditLog
+from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError

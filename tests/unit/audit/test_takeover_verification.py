@@ -13,8 +13,9 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.log_database import LogUnreadableError
-from appliance.audit.signatures import pinned_key_path, write_public_key
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.signatures import pinned_key_path, write_public_key
+from appliance.audit.proof.verification import verify
 from appliance.audit.takeover_verification import (
     PairVerification,
     TakeoverFindingKind,
@@ -22,7 +23,6 @@ from appliance.audit.takeover_verification import (
     verify_alone,
     verify_takeovers,
 )
-from appliance.audit.verification import verify
 from appliance.signing.signed_statements import parse_checkpoint
 from appliance.standby.membership import path_of, save_membership
 from tests.support.appliance_pair import Member, Story, World, four_takeovers, play

@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.log import AuditLog
-from appliance.audit.verification import verify
+from appliance.audit.log.log import AuditLog
+from appliance.audit.proof.verification import verify
 from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up, copy_database

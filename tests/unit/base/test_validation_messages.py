@@ -12,7 +12,7 @@ import pytest
 from fastapi import FastAPI, Request
 from fastapi.routing import iter_route_contexts
 
-from appliance.api.problems import ProblemError
+from appliance.api.front.problems import ProblemError
 from appliance.base.validation_messages import refusal
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings

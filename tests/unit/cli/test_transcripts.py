@@ -10,7 +10,7 @@ import pytest
 import yaml
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.log import AuditLog
+from appliance.audit.log.log import AuditLog
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.recording_answers import Recording, Recordings
 from appliance.network.scan import ScanResult

@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from appliance.audit.budget import Budget
+from appliance.audit.log.budget import Budget
 from appliance.control.bundle_health import RobotHealth, counted_denials
 from appliance.policy.lost_rights import LostRights
 from appliance.policy.model import Decision

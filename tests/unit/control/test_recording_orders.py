@@ -8,7 +8,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
-from appliance.audit.ids import IdSource
+from appliance.audit.log.ids import IdSource
 from appliance.channel import admin, messages
 from appliance.channel.answers.recording_answers import OpenRecording, Recording, Trigger
 from appliance.channel.channel import Channel

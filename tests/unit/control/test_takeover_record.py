@@ -9,9 +9,9 @@ import msgspec
 import pytest
 import structlog
 
-from appliance.audit.copies import SignedCheckpoint, newest_checkpoint
-from appliance.audit.query import Filter
-from appliance.audit.search import search
+from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from tests.support.appliance_pair import Member, World, play
 from tests.support.waiting import eventually
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.log import AuditLog
-from appliance.audit.record import Severity
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.record import Severity
 from appliance.base.clock import wall_ns
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest

@@ -22,10 +22,10 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from appliance.audit.copies import signed_checkpoints
-from appliance.audit.query import Filter
-from appliance.audit.retention import Retention
-from appliance.audit.search import search
+from appliance.audit.log.retention import Retention
+from appliance.audit.proof.copies import signed_checkpoints
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.clock import wall_ns
 from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
@@ -39,7 +39,7 @@ from tests.support.engines import open_log
 from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
-from tests.unit.audit.test_retention import make_old, retain
+from tests.unit.audit.log.test_retention import make_old, retain
 from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
 
 Members = dict[str, bytes]
@@ -601,7 +601,7 @@ def test_a_load_before_the_upgrade_is_listed_as_unproven(
 ) -> None:
     """A bundle of version 0.1.0 is valid; the result says that no checkpoint covers its load."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("appliance.audit.log_writer.record_hash", _as_before)
+        patch.setattr("appliance.audit.log.log_writer.record_hash", _as_before)
         before = Control(make_log(checkpoint_seconds=3600))
         before.load_policy(7, OPEN)
         before.work(5)

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from appliance.audit.events import EVENTS
+from appliance.audit.log.events import EVENTS
 from appliance.telemetry.metrics import METRICS
 
 FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"

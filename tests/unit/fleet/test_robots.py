@@ -31,7 +31,7 @@ from rosrv_fleet.segment_store import SegmentStore
 from rosrv_fleet.tokens import FleetRole, OperatorTokens
 from typer.testing import CliRunner
 
-from appliance.audit.signatures import write_public_key
+from appliance.audit.log.signatures import write_public_key
 from appliance.base.atomic_files import write_whole
 from appliance.base.clock import now, using
 from appliance.signing.own_certificate import make_own_certificate

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosrv_fleet.search_sql import FleetFilter, SearchCursor, parse_cursor, regex_of, search_statement
 
-from appliance.audit.query import Filter, FilterError
+from appliance.audit.search.query import Filter, FilterError
 
 _HOSTILE = "'; DROP TABLE record; -- %s"
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.copies import SYSLOG_ELEMENT, read_copies, signed_checkpoints
-from appliance.audit.log import AuditLog
-from appliance.audit.query import Filter
-from appliance.audit.record import Severity
-from appliance.audit.retention import Retention
-from appliance.audit.search import SearchPage, search
-from appliance.audit.verification import verify
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.record import Severity
+from appliance.audit.log.retention import Retention
+from appliance.audit.proof.copies import SYSLOG_ELEMENT, read_copies, signed_checkpoints
+from appliance.audit.proof.verification import verify
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import SearchPage, search
 from appliance.forwarding.log_forwarder import (
     Chosen,
     ForwardingPosition,

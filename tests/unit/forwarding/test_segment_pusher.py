@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.copies import signed_checkpoints
+from appliance.audit.proof.copies import signed_checkpoints
 from appliance.base.clock import now, using
 from appliance.collector.connection import CollectorConnection, CollectorError
 from appliance.forwarding import segment_pusher

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.record import AuditRecord, RuleReference, Severity
-from appliance.audit.record_format import LogEntry
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.copies import SYSLOG_ELEMENT, SignedCheckpoint
 from appliance.forwarding.syslog import ELEMENT, Formatter
 from tests.support.syslog import parse
 

@@ -20,11 +20,11 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.audit.checkpoints import read_signer_memory
-from appliance.audit.query import Filter
-from appliance.audit.search import search
-from appliance.audit.signatures import read_public_key
-from appliance.audit.verification import verify
+from appliance.audit.log.signatures import read_public_key
+from appliance.audit.proof.checkpoints import read_signer_memory
+from appliance.audit.proof.verification import verify
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
     AuthorityRequest,

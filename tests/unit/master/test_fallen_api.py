@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
-from appliance.control.rest import RestLink
-from appliance.control.token_orders import TokenOrders
+from appliance.control.operators.token_orders import TokenOrders
+from appliance.control.rest.rest import RestLink
 from appliance.signing.request_signing import proof_of, reading_key, statement
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.channel.answers.recording_answers import (
     OPERATORS,
     ROBOT,

@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import LogEntry
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import LogEntry
 from appliance.channel.answers.recording_answers import Recording, Sender, Trigger
 from appliance.recorder.bag_reader import BagReader, MessagePosition
 from appliance.recorder.bag_writer import BagMessage, BagWriter

@@ -4,7 +4,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from appliance.audit.record import AuditRecord, Severity
+from appliance.audit.log.record import AuditRecord, Severity
 from appliance.channel.answers.recording_answers import TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import trigger_of

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit.query import Filter
-from appliance.audit.search import export
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import export
 from appliance.channel.messages import MonitorEvent
 from appliance.specifications.records import MonitorRecords
 from appliance.telemetry.audit_trail import AuditTrail

@@ -21,6 +21,6 @@ def test_rules_on_the_source_run_with_make_check() -> None:
         ["make", "--dry-run", "unit"], cwd=TESTS.parent, capture_output=True, text=True, check=True
     ).stdout
     ignored = [word for word in command.split() if word.startswith("--ignore=")]
-    assert "--ignore=tests/unit/audit/test_log.py" in ignored
+    assert "--ignore=tests/unit/audit/log/test_log.py" in ignored
     rules = ("--ignore=tests/unit/test_", "--ignore=tests/unit/support/")
     assert [word for word in ignored if word.startswith(rules)] == []

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.budget import Budget
-from appliance.audit.ids import IdSource
-from appliance.audit.record import Severity
+from appliance.audit.log.budget import Budget
+from appliance.audit.log.ids import IdSource
+from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.configuration.settings import RecorderRules
 from appliance.quotas.pool import QuotaClass

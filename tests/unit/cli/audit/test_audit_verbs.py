@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import appliance
-from appliance.api.unrecorded import CATEGORIES
+from appliance.api.front.unrecorded import CATEGORIES
 from appliance.cli.audit.audit_verbs import _new_file
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category

@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
-from appliance.audit.chain_findings import Verification
-from appliance.audit.record import AuditRecord
-from appliance.audit.record_format import LogEntry
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.proof.chain_findings import Verification
 from appliance.cli.audit.record_table import print_entries, print_verification
 
 _STYLE = re.compile(r"\x1b\[[\d;]*m")

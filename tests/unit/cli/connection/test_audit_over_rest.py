@@ -7,9 +7,9 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit.query import Filter, FilterError
-from appliance.audit.record import AuditRecord
-from appliance.audit.record_format import LogEntry, as_object
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry, as_object
+from appliance.audit.search.query import Filter, FilterError
 from appliance.cli.connection import audit_over_rest as audit_rest
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_over_rest import RestLog

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.channel.messages import ConnectionOpened
-from appliance.control.overview import graph_of
+from appliance.control.operators.overview import graph_of
 from appliance.master.caller import Caller
 from appliance.master.calls.node_calls import NodeCalls
 from appliance.master.endpoints.traffic import RelayTraffic

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit.record import Severity
+from appliance.audit.log.record import Severity
 from appliance.channel.messages import ConnectionRefused
 from appliance.master.endpoints.traffic import RelayTraffic
 from appliance.master.graph.registry import Incarnation, Kind, Registry

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
-from appliance.audit.record import AuditRecord, Severity
-from appliance.audit.record_format import LogEntry, without_contents
-from appliance.audit.why import lines_of
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.record_format import LogEntry, without_contents
+from appliance.audit.search.why import lines_of
 from appliance.channel.messages import MonitorEvent
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.specifications.records import MonitorRecords

@@ -1,6 +1,6 @@
 /**
  * Equal records as one row. The appliance decides which records are equal and how far apart they may be
- * (`appliance/audit/equality.py`); this only puts them into rows, as `grouped` does there.
+ * (`appliance/audit/search/equality.py`); this only puts them into rows, as `grouped` does there.
  */
 
 import { html } from "../html.js";

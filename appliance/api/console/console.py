@@ -1,0 +1,158 @@
+"""Serve the console: one page for operators, with all its files.
+
+Invariants:
+
+1. The files are part of the program, need no token and contain no secret. Only the site's notice, the robot's name, and
+   the time after which the page locks, are settings. The page requests its content from `/v1` with its reader's token.
+2. Only files that existed when the routes were made are served, by exact name: a request's path never reaches the file
+   system.
+3. The headers restrict the page to this origin, for loading and for connections, and to its own scripts. A string never
+   becomes markup (Trusted Types).
+4. The page names its files by addresses that contain a hash of their content, so browsers keep them without asking. All
+   modules are one script, all style sheets one, both made here: a missing file or name ends the start of the API.
+"""
+
+import gzip
+import hashlib
+import html
+import mimetypes
+import re
+from collections.abc import Iterable
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import NamedTuple
+
+from fastapi import APIRouter, Request
+from starlette.responses import Response
+
+from appliance.api.console.console_bundle import ModuleError, join_modules, join_styles
+from appliance.api.front.problems import ProblemError
+from appliance.configuration.settings import Settings
+
+VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
+_PREFIX = "/console/static/"
+_SERVED = ("css", "icon.svg", "index.html", "js", "vendor")  # the other files of the folder are Python
+_PAGE, _SCRIPT, _STYLE = "index.html", "js/main.js", "css/main.css"
+_ADDRESS = re.compile(rf"{_PREFIX}([\w./-]++)")
+_GZIP = re.compile(r"\bgzip\b(?!\s*+;\s*+q=0(?:\.0*+)?\s*+(?:,|$))", re.IGNORECASE)
+_LEVEL = 9  # of gzip; the files are compressed once
+_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self';"
+        " font-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none';"
+        " require-trusted-types-for 'script'; trusted-types 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
+    "X-Frame-Options": "DENY",
+    "Cache-Control": "no-cache",  # revalidate cached files by ETag, so that an update takes effect at once
+}
+
+
+class _File(NamedTuple):
+    body: bytes
+    media_type: str
+    digest: str
+    packed: bytes | None = None  # gzip, of lasting files that it makes smaller
+    lasting: bool = False  # its address changes with its content
+
+
+def routes(settings: Settings) -> APIRouter:
+    """Return the routes, which are not part of the contract.
+
+    Raise `ModuleError` if the console's modules cannot be joined.
+    """
+    router = APIRouter(include_in_schema=False)
+    served = _collect((files(__package__) / name for name in _SERVED), "")
+    texts = {name: served[name].body.decode() for name in served if name.endswith((".js", ".css", ".html"))}
+    addresses: dict[str, str] = {}
+    joined = {_SCRIPT: join_modules(texts, _SCRIPT), _STYLE: join_styles(texts, _STYLE)}
+
+    def named(found: re.Match[str]) -> str:
+        """Return the lasting address of a file that a text names."""
+        name = found[1]
+        if name not in served:
+            raise ModuleError(f"the console names {_PREFIX}{name}, which does not exist")
+        if name not in addresses:
+            body = _ADDRESS.sub(named, joined[name]).encode() if name in joined else served[name].body
+            lasting = _file(body, served[name].media_type, lasting=True)
+            stem, _, ending = name.rpartition(".")
+            addresses[name] = f"{stem}.{lasting.digest}.{ending}"
+            served[addresses[name]] = lasting
+        return _PREFIX + addresses[name]
+
+    page = served[_PAGE] = _file(
+        _stating(
+            _ADDRESS.sub(named, texts[_PAGE]),
+            {
+                "lock-seconds": f"{settings.api_lock_seconds:g}",
+                "notice": settings.api_notice,
+                "robot": settings.name,
+            },
+        ).encode(),
+        served[_PAGE].media_type,
+    )
+
+    async def index(request: Request) -> Response:
+        return _answer(request, page)
+
+    async def file(request: Request, name: str) -> Response:
+        found = served.get(name)
+        if found is None:
+            raise ProblemError(404, "unknown-path", "the console has no such file")
+        return _answer(request, found)
+
+    methods = ["GET", "HEAD"]
+    router.add_api_route(_PREFIX + "{name:path}", file, methods=methods)
+    for path in ("/", "/console", "/console/"):
+        router.add_api_route(path, index, methods=methods)
+    for view in VIEWS:
+        router.add_api_route(f"/console/{view}", index, methods=methods)
+        router.add_api_route(f"/console/{view}/{{rest:path}}", index, methods=methods)
+    return router
+
+
+def _answer(request: Request, found: _File) -> Response:
+    packed = found.packed if _GZIP.search(request.headers.get("accept-encoding", "")) else None
+    etag = f'"{found.digest}{"-gzip" if packed else ""}"'
+    headers = {**HEADERS, "ETag": etag, "Vary": "Accept-Encoding"}
+    if found.lasting:
+        headers["Cache-Control"] = "public, max-age=31536000, immutable"
+    if request.headers.get("if-none-match") == etag:
+        return Response(status_code=304, headers=headers)
+    if packed:
+        headers["Content-Encoding"] = "gzip"
+    return Response(packed or found.body, headers=headers, media_type=found.media_type)
+
+
+def _collect(entries: Iterable[Traversable], prefix: str) -> dict[str, _File]:
+    found: dict[str, _File] = {}
+    for entry in entries:
+        if entry.is_dir():
+            found |= _collect(entry.iterdir(), f"{prefix}{entry.name}/")
+            continue
+        found[prefix + entry.name] = _file(entry.read_bytes(), _media_type(entry.name))
+    return found
+
+
+def _stating(page: str, said: dict[str, str]) -> str:
+    """Return the page with the site's settings in its `meta` elements."""
+    for name, text in said.items():
+        empty = f'<meta name="rosrv:{name}" content="'
+        before, found, after = page.partition(empty)
+        assert found, name  # noqa: S101  the page has a `meta` element for each setting
+        page = f"{before}{found}{html.escape(text)}{after}"
+    return page
+
+
+def _file(body: bytes, media_type: str, *, lasting: bool = False) -> _File:
+    packed = gzip.compress(body, _LEVEL, mtime=0) if lasting else body
+    digest = hashlib.sha256(body).hexdigest()[:32]
+    return _File(body, media_type, digest, packed if len(packed) < len(body) else None, lasting)
+
+
+def _media_type(name: str) -> str:
+    ending = name[name.rfind(".") :]
+    return _TYPES.get(ending) or mimetypes.guess_type(name)[0] or "application/octet-stream"

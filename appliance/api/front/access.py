@@ -1,0 +1,157 @@
+"""Authenticate bearer tokens.
+
+Invariants:
+
+1. Only a token from control's list that has not expired identifies its owner. Before the first list arrives, clients
+   are asked to try again, because "revoked" would end their sessions.
+2. The costly check (scrypt) runs in a thread, for one request at a time. A peer that keeps sending wrong tokens must
+   wait between checks, so guessing cannot keep the process busy.
+3. A valid token is remembered only as a hash under a random key of this process, never in clear text. A change of the
+   list of tokens clears this memory.
+4. The use of a token is reported at once, and then at most once in `USE_SECONDS`.
+"""
+
+import asyncio
+import hashlib
+import hmac
+import secrets
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import cast
+
+from appliance.api.front.problems import ProblemError, too_many
+from appliance.api.front.rates import Buckets, peer_key
+from appliance.base import clock
+from appliance.base.deadlines import Deadlines
+from appliance.channel.answers.token_answers import TokenRole
+from appliance.channel.messages.api import ClientRequest, TokenKept
+from appliance.configuration.settings import is_loopback
+from appliance.quotas.pool import QuotaClass
+from appliance.signing.request_signing import reading_hash, reading_id
+from appliance.store.access_tokens import is_secret, parse_token
+
+USE_SECONDS = 60.0
+_KNOWN_SECONDS = 900.0
+_MOST_KNOWN = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Bearer:
+    """The holder of a token; `expires` is seconds since the epoch.
+
+    `shown` is the token (or its reading key) that the request carries. `asked` is the request, unless it is a GET.
+    `gone` is set when the client disconnects.
+    """
+
+    id: str
+    name: str
+    role: TokenRole
+    expires: float
+    shown: str
+    asked: ClientRequest | None = None
+    gone: "asyncio.Future[None] | None" = field(default=None, compare=False)
+
+
+class TokenAuthenticator:
+    """Checks tokens; of each peer, at most `failures_per_minute` wrong tokens are checked.
+
+    `used(id)` is called when a token was presented.
+    """
+
+    def __init__(self, failures_per_minute: int, used: Callable[[str], None]) -> None:
+        self._used = used
+        self._reported: dict[str, float] = {}  # by token: the time of the last report
+        self._tokens: dict[str, TokenKept] = {}
+        self._ends = Deadlines()
+        self._stated = False
+        self._recognised: dict[bytes, str] = {}
+        self._key = secrets.token_bytes(32)
+        # Counted separately, so that a peer that tries random ids does not lock out a neighbour with a valid token.
+        self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
+        self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
+        self._checking = asyncio.Lock()
+        self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
+
+    def quota_class(self, peer: str) -> QuotaClass:
+        """Return a peer's class: registered for this machine, or after a recent valid token; else unknown."""
+        shown = self._shown.get(peer)
+        lately = shown is not None and clock.now() - shown < _KNOWN_SECONDS
+        return QuotaClass.REGISTERED if lately or is_loopback(peer) else QuotaClass.UNKNOWN
+
+    def state(self, tokens: Iterable[TokenKept]) -> None:
+        """Accept only these tokens from now on."""
+        self._tokens = {token.id: token for token in tokens}
+        for token in self._tokens.values():
+            self._ends.passed(token.id, token.expires)  # from now on, no step of the clock postpones an end
+        self._stated = True
+        self._recognised.clear()
+        self._reported.clear()
+
+    def still_good(self, bearer: Bearer) -> bool:
+        """Whether a previously valid token may still be used."""
+        kept = self._tokens.get(bearer.id)
+        # A rotation may have brought its end forward.
+        return kept is not None and not self._ends.passed(kept.id, kept.expires)
+
+    async def recognise(self, authorization: str | None, host: str) -> Bearer:
+        """Return the holder of an `Authorization` header. Raises `ProblemError` (401, 429, 503)."""
+        if authorization is None:
+            raise self._refusal("no token: send it as `Authorization: Bearer TOKEN`")
+        if not self._stated:
+            raise ProblemError(503, "not-available", "the appliance is starting: try again", retry_after=1)
+        scheme, _space, text = authorization.partition(" ")
+        text = text.strip() if scheme.lower() == "bearer" else ""
+        parsed = parse_token(text)
+        kept = self._tokens.get(parsed[0] if parsed is not None else reading_id(text) or "")
+        if kept is not None and (
+            hmac.compare_digest(reading_hash(text), kept.reading)
+            if parsed is None
+            else await self._matches(text, parsed[1], kept, host)
+        ):
+            if not self._ends.passed(kept.id, kept.expires):
+                self._remember(peer_key(host))
+                self._report_use(kept.id)
+                return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
+            raise self._refusal("the token has expired: ask for a new one (rosrv token add)")
+        failures = self._unknown if kept is None else self._wrong
+        _require_patience(failures, host)
+        failures.take(host, clock.now())
+        raise self._refusal("the token is wrong or revoked")
+
+    async def _matches(self, text: str, secret: str, kept: TokenKept, host: str) -> bool:
+        digest = hmac.digest(self._key, text.encode("ascii"), hashlib.sha256)
+        if self._recognised.get(digest) == kept.id:
+            return True
+        _require_patience(self._wrong, host)
+        async with self._checking:
+            _require_patience(self._wrong, host)  # others of this host may have failed while it waited
+            if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
+                return False
+        if kept.id in self._tokens:
+            self._recognised[digest] = kept.id
+        return True
+
+    def _remember(self, peer: str) -> None:
+        self._shown[peer] = clock.now()
+        self._shown.move_to_end(peer)
+        if len(self._shown) > _MOST_KNOWN:
+            self._shown.popitem(last=False)
+
+    def _report_use(self, token: str) -> None:
+        now = clock.now()
+        if now - self._reported.get(token, -USE_SECONDS) >= USE_SECONDS:
+            self._reported[token] = now
+            self._used(token)
+
+    def _refusal(self, detail: str) -> ProblemError:
+        return ProblemError(
+            401, "not-recognised", detail, headers={"WWW-Authenticate": 'Bearer realm="rosrv"'}
+        )
+
+
+def _require_patience(failures: Buckets, host: str) -> None:
+    seconds = failures.wait(host, clock.now())
+    if seconds:
+        text = "too many requests from this host came without a valid token"
+        raise too_many("too-many-failures", text, seconds)

@@ -1,0 +1,51 @@
+"""Answer `/healthz` (whether REST answers) and `/readyz` (whether nodes are served).
+
+The probes do not query control. They use the last sampled state, at most `history.IDLE_SECONDS` old. If that state is
+bad, it is sampled again, at a limited rate.
+"""
+
+from typing import Literal
+
+import msgspec
+
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.routing import Responses, Routes
+from appliance.api.front.services import Services
+from appliance.channel.status_summary import unserved
+
+_PATIENCE_SECONDS = 1.0
+
+
+class Health(msgspec.Struct, frozen=True):
+    """The probe's answer."""
+
+    status: Literal["live", "ready"]
+
+
+def routes(services: Services) -> Routes:
+    """Return the routes."""
+    router = Routes(tags=["status"])
+
+    async def live() -> Health:
+        """Whether REST answers at all; no token needed."""
+        return Health("live")
+
+    async def ready() -> Health:
+        """Whether nodes are served: 503 while they are not; no token needed, so it does not say why."""
+        if not services.control.connected:
+            raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
+        seen = services.history.seen
+        if seen.status is None or unserved(seen.status) is not None:
+            seen = await services.history.again(_PATIENCE_SECONDS)
+        if seen.status is None or unserved(seen.status) is not None:
+            raise ProblemError(
+                503, "not-served", "nodes are not served: GET /v1/status says why", retry_after=1
+            )
+        return Health("ready")
+
+    unready: Responses = {503: {"description": "Not in service."}}
+    for prefix, name in (("", ""), ("/v1", "_v1")):
+        router.add_api_route(f"{prefix}/healthz", live, operation_id=f"live{name}")
+        router.add_api_route(f"{prefix}/readyz", ready, operation_id=f"ready{name}", responses=unready)
+
+    return router

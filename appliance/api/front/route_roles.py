@@ -1,0 +1,102 @@
+"""Require roles for routes, and convert control's rejections to problems."""
+
+from typing import Annotated, Any
+
+from fastapi import Depends, Request, Security
+from fastapi.security import HTTPBearer
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.control import ControlLink
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.request_gate import BEARER
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
+from appliance.channel.answers.token_answers import TokenRole, may
+
+_SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
+
+
+class _Requires:
+    """A dependency that returns the bearer and requires at least the role `least`.
+
+    It is asynchronous, like each dependency here: FastAPI would call any other in a thread, for every request.
+    """
+
+    def __init__(self, least: TokenRole) -> None:
+        self.least = least
+
+    async def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
+        bearer: Bearer = request.scope[BEARER]
+        if not may(bearer.role, self.least):
+            text = f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role}"
+            raise problem_of("forbidden", text)
+        return bearer
+
+
+VIEWER = Depends(_Requires("viewer"))
+"""Use it in `dependencies=` of a route that requires the role and does not use the bearer."""
+
+OPERATOR = Depends(_Requires("operator"))
+Viewer = Annotated[Bearer, VIEWER]
+Investigator = Annotated[Bearer, Depends(_Requires("investigator"))]
+Operator = Annotated[Bearer, OPERATOR]
+Admin = Annotated[Bearer, Depends(_Requires("admin"))]
+
+
+def reads_contents(bearer: Bearer) -> bool:
+    """Whether a bearer may read message contents in records of monitors; only viewers may not."""
+    return bearer.role != "viewer"
+
+
+async def _no_viewer(bearer: Viewer) -> Bearer:
+    if not reads_contents(bearer):
+        text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
+        raise problem_of("forbidden", text)
+    return bearer
+
+
+Reader = Annotated[Bearer, Depends(_no_viewer)]
+"""The roles that may read messages in records: investigators, operators and admins."""
+
+_PROBLEMS = {
+    "request": (422, "bad-input"),
+    "refused": (422, "refused"),
+    "conflict": (412, "changed-meanwhile"),
+    "unknown": (404, "unknown"),
+    "forbidden": (403, "not-for-this-role"),
+    "busy": (503, "busy"),
+    "failed": (503, "not-available"),
+}
+_STANDBY_SECONDS = 2  # until a client may ask a standby again
+
+
+async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
+    """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+    return answered(await control.ask(request, bearer))
+
+
+LEAST: dict[str, Any] = {
+    "viewer": Viewer,
+    "investigator": Investigator,
+    "operator": Operator,
+    "admin": Admin,
+}
+
+
+def answered(answer: AdminAnswer[A]) -> A:
+    """Return the body of an answer. Raises `ProblemError` for a rejection."""
+    if answer.ok:
+        return answer.given()
+    if answer.trouble == "standby":
+        raise only_standby(answer.error, answer.active)
+    raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))
+
+
+def problem_of(trouble: Trouble, detail: str) -> ProblemError:
+    """Return the problem for a rejection by control."""
+    status, kind = _PROBLEMS.get(trouble, (503, "not-available"))
+    return ProblemError(status, kind, detail)
+
+
+def only_standby(detail: str, active: str) -> ProblemError:
+    """Return the problem for a request to a standby; `active` is the address of the active appliance."""
+    return ProblemError(503, "standby", detail, retry_after=_STANDBY_SECONDS, active=active)

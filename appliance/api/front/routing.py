@@ -1,0 +1,220 @@
+"""Make routes whose handlers take and return structs (msgspec): parse, encode, and add schemas to the contract.
+
+A handler returns a struct, or `Tagged` with a struct and its ETag; the struct's schema is in the contract. The handler
+declares a body as `Annotated[Kind, body(Kind)]`. If its answer is not a struct, it returns a `Response`.
+"""
+
+import enum
+import functools
+import json
+import typing
+from collections.abc import Awaitable, Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import msgspec
+from fastapi import APIRouter, Depends, Request, Response
+
+from appliance.api.front.etags import etag
+from appliance.api.front.moments import in_full
+from appliance.api.front.problems import BadInput, ProblemError, bad_input
+from appliance.base.validation_messages import body_refusal, meant
+
+A = TypeVar("A")
+Responses = dict[int | str, dict[str, Any]]
+ETAG = {"ETag": {"description": "the ETag for If-Match of the next change", "schema": {"type": "string"}}}
+_JSON = "application/json"
+_MOST_ERRORS = 50
+
+
+class Tagged(NamedTuple, Generic[A]):
+    """An answer with the revision or tag that becomes its ETag."""
+
+    body: A
+    tag: int | str
+
+
+def tagged(body: A) -> Tagged[A]:
+    """Return an answer with its own tag; without a tag, with its revision."""
+    return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # each versioned answer has a revision
+
+
+def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
+    """Return a JSON response with a struct."""
+    headers = None if tag is None else {"ETag": etag(tag)}
+    return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
+
+
+class Contract:
+    """The structs in the contract."""
+
+    def __init__(self) -> None:
+        self.kinds: set[Any] = set()
+
+    def reference(self, kind: Any) -> dict[str, Any]:
+        """Return the reference to a struct's schema, and add the schema to the contract."""
+        self.kinds.add(kind)
+        return {"$ref": f"#/components/schemas/{kind.__name__}"}
+
+    def components(self) -> dict[str, Any]:
+        """Return the schemas of all added structs and of the structs within them."""
+        kinds = sorted(self.kinds, key=lambda kind: str(kind.__name__))
+        return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
+
+
+CONTRACT = Contract()
+
+
+def content(kind: Any) -> dict[str, Any]:
+    """Describe an answer of this kind, for `responses=` of a route."""
+    return {_JSON: {"schema": CONTRACT.reference(kind)}}
+
+
+def file(media_type: str, description: str, *, binary: bool = False) -> Responses:
+    """Describe an answer that is not JSON, for `responses=` of a route."""
+    schema = {"type": "string"} | ({"format": "binary"} if binary else {})
+    return {200: {"description": description, "content": {media_type: {"schema": schema}}}}
+
+
+class _Body:
+    """A dependency that reads a body of one kind; if text/plain is also accepted, `text` describes the field `text`."""
+
+    def __init__(self, kind: Any, text: str | None) -> None:
+        self.kind = kind
+        self.text = text
+
+    async def __call__(self, request: Request) -> Any:
+        """Return the body. Raises `ProblemError` (415, 422)."""
+        content_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+        if content_type == "text/plain" and self.text is not None:
+            return self._of_text(_text(await request.body()))
+        if content_type == _JSON:
+            return self._of_json(_text(await request.body()))
+        if self.text is None:
+            raise ProblemError(422, "bad-input", "send a JSON object, as Content-Type application/json")
+        what = f'send {self.text} as Content-Type text/plain, or as JSON {{"text": …}}'
+        raise ProblemError(415, "wrong-type", what)
+
+    def _of_text(self, text: str) -> Any:
+        try:
+            return msgspec.convert({"text": text}, self.kind)
+        except msgspec.ValidationError as error:
+            raise bad_input([_bad(error)]) from None
+
+    def _of_json(self, text: str) -> Any:
+        try:
+            try:
+                return msgspec.json.decode(text, type=self.kind)
+            except msgspec.ValidationError as error:
+                # msgspec reports the first wrong field; invalid JSON may follow this field.
+                wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [_bad(error)]
+        except (ValueError, RecursionError) as error:
+            raise _not_json(text, error) from None
+        raise bad_input(wrong)
+
+    def schema(self) -> dict[str, Any]:
+        kinds = content(self.kind)
+        if self.text is not None:
+            kinds["text/plain"] = {"schema": {"type": "string", "minLength": 1}}
+        return {"requestBody": {"required": True, "content": kinds}}
+
+    def responses(self) -> Responses:
+        wrong: Responses = {422: {"description": "A parameter or the body is invalid."}}
+        if self.text is not None:
+            wrong[415] = {"description": "The body is neither text/plain nor JSON."}
+        return wrong
+
+
+def _text(data: bytes) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ProblemError(422, "bad-input", f"the body is not UTF-8 (byte {error.start})") from None
+
+
+def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
+    """Return the errors of all fields of a body; msgspec stops at the first."""
+    if not isinstance(given, dict):
+        return []
+    known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+    wrong = [
+        BadInput("body", f"the field `{name}` must be given")
+        for name, field in known.items()
+        if field.required and name not in given
+    ]
+    for name, value in given.items():
+        if name not in known:
+            wrong.append(BadInput("body", f"there is no field `{name[:100]}`{meant(name, known)}"))
+            continue
+        try:
+            msgspec.convert(value, known[name].type)
+        except msgspec.ValidationError as error:
+            wrong.append(_bad(error, f"body.{name}", known[name].type))
+    return wrong[:_MOST_ERRORS]
+
+
+def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
+    """Return the error of one part of a body of this kind, with the part's place."""
+    text, at, place = str(error).rpartition(" - at `")
+    if not at:
+        text, place = place, ""
+    where += place.removeprefix("key` in `").removeprefix("$").removesuffix("`")
+    return BadInput(where, body_refusal(text, _choices(kind)))
+
+
+def _choices(kind: Any) -> tuple[str, ...]:
+    """Return the permitted strings of a kind with a fixed set of values; empty for any other kind."""
+    parts = typing.get_args(kind)
+    if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
+        return tuple(kind)
+    if typing.get_origin(kind) is typing.Literal:
+        return parts
+    return next(filter(None, map(_choices, parts)), ())
+
+
+def _not_json(text: str, error: Exception) -> ProblemError:
+    """Return the problem of invalid JSON, with the place and the message of Python's parser."""
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as found:
+        detail = f"the body is not JSON: {found.msg}"
+        return ProblemError(422, "not-json", detail, line=found.lineno, column=found.colno)
+    except (RecursionError, ValueError):  # a number with thousands of digits
+        pass
+    return ProblemError(422, "not-json", f"the body is not JSON: {error}")
+
+
+def body(kind: type, *, text: str | None = None) -> Any:
+    """Return the annotation of a handler's parameter for a body of this kind; with `text`, also for a plain text."""
+    return Depends(_Body(kind, text))
+
+
+class Routes(APIRouter):
+    """FastAPI's router, for handlers that take and return structs."""
+
+    def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
+        """Add a handler, and add its name, answer, ETag and body to the contract."""
+        options["operation_id"] = options.get("operation_id") or endpoint.__name__
+        hints = typing.get_type_hints(endpoint, include_extras=True)
+        for hint in hints.values():
+            for part in getattr(hint, "__metadata__", ()):
+                if isinstance(getattr(part, "dependency", None), _Body):
+                    options["openapi_extra"] = part.dependency.schema()
+                    options["responses"] = part.dependency.responses() | (options.get("responses") or {})
+        given = hints.get("return")
+        tagged = typing.get_origin(given) is Tagged
+        kind = typing.get_args(given)[0] if tagged else given
+        if tagged or (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+            good = {"content": content(kind), **({"headers": ETAG} if tagged else {})}
+            options["responses"] = {200: {"description": "OK", **good}} | (options.get("responses") or {})
+            options["response_model"] = None
+            endpoint = _encoded(endpoint)
+        super().add_api_route(path, endpoint, **options)
+
+
+def _encoded(endpoint: Callable[..., Awaitable[Any]]) -> Callable[..., Awaitable[Response]]:
+    @functools.wraps(endpoint)
+    async def answered(*arguments: Any, **named: Any) -> Response:
+        given = await endpoint(*arguments, **named)
+        return answer(given.body, tag=given.tag) if isinstance(given, Tagged) else answer(given)
+
+    return answered

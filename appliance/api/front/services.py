@@ -1,0 +1,39 @@
+"""Define the parts that the routes share."""
+
+import asyncio
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from appliance.api.front.access import TokenAuthenticator
+from appliance.api.front.control import ControlLink
+from appliance.api.front.history import SampleHistory
+from appliance.api.front.journal import Journal
+from appliance.api.front.streams import Streams, Work
+from appliance.configuration.settings import Settings
+from appliance.quotas.table import REST_EXPORTS, REST_WORK
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """The parts that the routes share; `stopping` is set when the process must end.
+
+    `judging` shares the compiling of texts for queries and dry runs among tokens. `ordering` limits the same for
+    orders, so that orders never wait for queries. `exports` limits the exports of the audit log.
+    """
+
+    settings: Settings
+    control: ControlLink
+    doorkeeper: TokenAuthenticator
+    journal: Journal
+    stopping: asyncio.Event
+    history: SampleHistory
+    judging: Work = field(default_factory=lambda: Work("dry runs and explanations", REST_WORK.bounds.whole))
+    ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    exports: Streams = field(
+        default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
+    )
+
+    @property
+    def audit_log(self) -> Path:
+        """Return the path of the audit log, which is read-only here."""
+        return self.settings.state / "control" / "audit.db"

@@ -1,0 +1,126 @@
+"""Limit long answers, which are streams and exports, by quotas.
+
+A long answer counts for its token and for its peer, and each has a quota. So neither a viewer's token with many
+connections nor a machine with many tokens can take the places of others, in particular of operators and admins. When
+the response ends, for any reason, its place is free again. `Work` does the same for answers that need much time.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import TypeVar
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import Receive, Scope, Send
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.problems import ProblemError
+from appliance.channel.answers.token_answers import TokenRole
+from appliance.quotas.pool import Pool, QuotaClass
+from appliance.quotas.table import REST_WORK, QuotaRow
+from appliance.rpc.fair_queue import Turns
+
+_PATIENCE_SECONDS = 5.0
+A = TypeVar("A", str, bytes)
+
+
+def peer_of(request: Request) -> str:
+    """Return the address that a request comes from."""
+    return request.client.host if request.client is not None else ""
+
+
+class Streams:
+    """The places for long answers of one kind: `whole` places, with quotas for `tokens` and `peers`."""
+
+    def __init__(self, tokens: QuotaRow, peers: QuotaRow, whole: int) -> None:
+        self.roles: dict[str, TokenRole] = {}
+        part = whole / tokens.bounds.whole
+        self._tokens: Pool[str] = Pool(
+            "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._quota_class
+        )
+        self._peers: Pool[str] = Pool(
+            "of these",
+            peers.bounds.sized(whole, max(1, int(peers.bounds.host * part))),
+            lambda _peer: QuotaClass.REGISTERED,
+        )
+
+    def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
+        """Take a place; return the function that releases it. Raises `ProblemError` (503)."""
+        self.roles[bearer.id] = bearer.role
+        busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
+        if busy:
+            self._forget(bearer.id)
+            mine, here = self._tokens.held(bearer.id), self._peers.held(peer)
+            text = f"too many {what}: of {self._tokens.total} the token {bearer.name} has {mine}, your machine {here}"
+            raise ProblemError(503, "busy", text, retry_after=10)
+        self._tokens.charge(bearer.id)
+        self._peers.charge(peer)
+
+        def give_back() -> None:
+            self._tokens.give_back(bearer.id)
+            self._peers.give_back(peer)
+            self._forget(bearer.id)
+
+        return give_back
+
+    def _quota_class(self, token: str) -> QuotaClass:
+        return QuotaClass.NAMED if self.roles[token] == "viewer" else QuotaClass.REGISTERED
+
+    def _forget(self, token: str) -> None:
+        if not self._tokens.held(token):
+            self.roles.pop(token, None)
+
+
+class Work:
+    """Slow answers of one kind, `whole` at once, in turns of tokens. `what` names them in the refusal."""
+
+    def __init__(self, what: str, whole: int) -> None:
+        self._what = what
+        self._turns: Turns[tuple[str, TokenRole]] = Turns(
+            REST_WORK.bounds.sized(whole, max(1, whole // 2)), _class_of
+        )
+
+    @contextlib.asynccontextmanager
+    async def turn(self, bearer: Bearer) -> AsyncIterator[None]:
+        """Wait briefly for the token's turn, and keep it during the block. Raises `ProblemError` (503)."""
+        token = bearer.id, bearer.role
+        try:
+            async with asyncio.timeout(_PATIENCE_SECONDS):
+                await self._turns.enter(token)
+        except TimeoutError:
+            raise ProblemError(
+                503, "busy", f"too many {self._what} at once: try again", retry_after=5
+            ) from None
+        try:
+            yield
+        finally:
+            self._turns.leave(token)
+
+
+def _class_of(token: tuple[str, TokenRole]) -> QuotaClass:
+    return QuotaClass.NAMED if token[1] == "viewer" else QuotaClass.REGISTERED
+
+
+async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
+    """Read a slow iterator in a thread; yield its pieces, except empty ones."""
+    while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+        if piece:
+            yield piece
+
+
+class StreamResponse(Response):
+    """A long response that releases its place when it ends."""
+
+    def __init__(self, response: Response, give_back: Callable[[], None]) -> None:
+        self._response = response
+        self._give_back = give_back
+        self.status_code = response.status_code
+        self.background = response.background
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the response, then release its place."""
+        try:
+            await self._response(scope, receive, send)
+        finally:
+            self._give_back()

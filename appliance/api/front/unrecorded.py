@@ -1,0 +1,18 @@
+"""Find names in an audit search that this version never records: misspelt names, or names of another version."""
+
+from appliance.audit.log.events import EVENTS
+from appliance.audit.search.query import Filter
+from appliance.base.validation_messages import meant
+from appliance.policy.model import Category
+
+CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
+"""The categories of records, whether the policy decides them or not."""
+
+
+def unrecorded(wanted: Filter) -> list[str]:
+    """Return a sentence for each name that no record can have, with the nearest known name; globs are not checked."""
+    return [
+        f"this version records no {what} {name!r}{meant(name, known)}"
+        for what, name, known in (("event", wanted.event, EVENTS), ("category", wanted.category, CATEGORIES))
+        if name is not None and not set(name) & set("*?[") and name not in known
+    ]

@@ -1,0 +1,1 @@
+"""Answer the calls of REST: the routes, and the contract that describes them."""

@@ -1,0 +1,379 @@
+"""`/v1/audit`: search, one record, follow live, verify, export. The api reads the log's file, but cannot write it.
+
+Costly work is limited: the numbers of searches, exports and followers have limits, and only one verification runs at a
+time. A request above a limit waits briefly; then the answer is 503.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import pathlib
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from fastapi import Depends, Header, Path, Query, Request, Response
+from sse_starlette import EventSourceResponse, ServerSentEvent
+from starlette.responses import JSONResponse, StreamingResponse
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.moments import given
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Operator, Viewer, ask, reads_contents
+from appliance.api.front.routing import Responses, Routes, file
+from appliance.api.front.services import Services
+from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
+from appliance.api.routes.denials import asks_policy
+from appliance.api.routes.dry_run_policy import explained, granted
+from appliance.api.routes.named_hosts import has_name, with_networks
+from appliance.api.routes.shown_records import (
+    PAGE,
+    RECORD_REFERENCE,
+    page_of,
+    readable,
+    readable_by,
+    streamed,
+)
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record import Severity
+from appliance.audit.log.record_format import as_object
+from appliance.audit.log.signatures import KeyUnreadableError
+from appliance.audit.proof.chain_findings import Verification
+from appliance.audit.proof.chain_proofs import evidence, evidence_line
+from appliance.audit.proof.copies import SignedCheckpoint, signed_checkpoints
+from appliance.audit.proof.verification import verify
+from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.search import Follower, RecordInContext, export, recorded_in_full, show
+from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.policy.grant import UngrantableError
+from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
+
+_T = TypeVar("_T")
+_SEARCHES = 4
+_POLL_SECONDS = 0.2
+_PING_SECONDS = 15
+_STREAM_PAGE = 500
+_LARGEST_PAGE = 1000
+_MOST_NEIGHBOURS = 1000  # the same limit as on the command line
+
+_ONE = {
+    "type": "object",
+    "properties": {
+        "record": RECORD_REFERENCE,
+        "before": {"type": "array", "items": RECORD_REFERENCE},
+        "after": {"type": "array", "items": RECORD_REFERENCE},
+    },
+    "required": ["record", "before", "after"],
+    "additionalProperties": False,
+}
+
+
+class LogCheckpoints(msgspec.Struct, frozen=True):
+    """Signed checkpoints in order; ask again after the last number for more."""
+
+    checkpoints: list[SignedCheckpoint]
+
+
+def _wanted(
+    *,
+    decision: Annotated[list[Literal["allow", "deny", "would deny"]] | None, Query()] = None,
+    since: Annotated[str | None, Query(max_length=64, description="1h (ago), a date, or RFC 3339")] = None,
+    until: Annotated[str | None, Query(max_length=64, description="before this time")] = None,
+    host: Annotated[
+        str | None,
+        Query(
+            max_length=256,
+            description="the peer: an address, a glob, a network, or a name (of a group, robot, or an enrolled host)",
+        ),
+    ] = None,
+    caller_id: Annotated[
+        str | None, Query(max_length=256, description="the name that the peer gave; a glob")
+    ] = None,
+    resource: Annotated[
+        str | None, Query(max_length=256, description="topic, service, call…; a glob")
+    ] = None,
+    category: Annotated[str | None, Query(max_length=256)] = None,
+    event: Annotated[str | None, Query(max_length=256)] = None,
+    severity: Annotated[Severity | None, Query(description="this severity or a higher one")] = None,
+    rule: Annotated[
+        str | None, Query(max_length=256, description="section or key of the rule; a glob")
+    ] = None,
+    text: Annotated[
+        str | None, Query(max_length=256, description="anywhere in names, reason, details")
+    ] = None,
+    who: Annotated[
+        str | None, Query(max_length=256, description="the token's name, or `operator`; a glob")
+    ] = None,
+    deny: Annotated[bool, Query(description="only denials: the same as decision=deny")] = False,
+    topic: Annotated[str | None, Query(max_length=256, description="another word for resource")] = None,
+    looks: Annotated[bool, Query(description="0: leave out allowed REST calls that only read")] = True,
+) -> Filter:
+    if resource is not None and topic is not None:
+        raise ProblemError(422, "bad-input", "resource and topic mean the same: give one")
+    return Filter(
+        decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
+        since=None if since is None else given(since),
+        until=None if until is None else given(until),
+        host=host,
+        caller_id=caller_id,
+        resource=resource if topic is None else topic,
+        category=category,
+        event=event,
+        severity=severity,
+        rule=rule,
+        text=text,
+        who=who,
+        without_looks=not looks,
+    )
+
+
+Wanted = Annotated[Filter, Depends(_wanted)]
+Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
+WithEquality = Annotated[bool, Query(description="1: also what makes equal records one row")]
+OneRecord = Annotated[
+    str,
+    Path(
+        min_length=1,
+        max_length=20,
+        pattern="^[0-9a-f]+$",
+        description="id of a record, or its sequence",
+        examples=["812"],
+    ),
+]
+
+
+class LogReader:
+    """Reads the log in threads; the number of threads is limited."""
+
+    def __init__(self, services: Services) -> None:
+        self.path = services.audit_log
+        self._control = services.control
+        self.searches = Work("searches of the audit log", _SEARCHES)
+        self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
+        self.verification = Work("verifications", 1)
+
+    async def read(self, bearer: Bearer, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        """Wait for a turn and call a function of `appliance.audit` in a thread. Raises `ProblemError`."""
+        async with self.searches.turn(bearer):
+            return await self.in_thread(function, *arguments, **named)
+
+    async def named(self, bearer: Bearer, wanted: Filter) -> Filter:
+        """Replace the name of the filter's host by its networks. Raises `ProblemError`."""
+        if not has_name(wanted):
+            return wanted
+        return await self.in_thread(with_networks, wanted, await ask(self._control, PolicyWanted(), bearer))
+
+    async def record(self, bearer: Bearer, record_id: str, neighbours: int) -> RecordInContext:
+        """Return a record with its neighbours. Raises `ProblemError`."""
+        shown = await self.read(bearer, show, self.path, record_id, neighbours)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        return shown
+
+    async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
+        """Call a function as `read` does, without waiting for a turn."""
+        try:
+            return await asyncio.to_thread(function, *arguments, **named)
+        except FilterError as error:
+            raise ProblemError(422, "bad-input", str(error)) from error
+        except (LogUnreadableError, KeyUnreadableError) as error:
+            raise ProblemError(503, "log-unreadable", str(error)) from error
+
+
+_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
+_UNKNOWN: Responses = {404: {"description": "There is no such record."}}
+
+
+def _json(schema: dict[str, Any]) -> Responses:
+    return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
+
+
+def routes(services: Services) -> Routes:
+    """Return the routes."""
+    router = Routes(prefix="/v1/audit", tags=["audit"])
+    desk = LogReader(services)
+    _add_searches(router, services, desk)
+    _add_proofs(router, services, desk)
+    _add_one(router, services, desk)
+    return router
+
+
+def _add_searches(router: Routes, services: Services, desk: LogReader) -> None:
+    @router.get("", responses=_json(PAGE))
+    async def search_audit(
+        bearer: Viewer,
+        wanted: Wanted,
+        *,
+        cursor: Annotated[str | None, Query(max_length=18, description="cursor of the previous page")] = None,
+        limit: Limit = 100,
+        order: Annotated[Literal["newest", "oldest"], Query(description="order of the records")] = "newest",
+        equality: WithEquality = False,
+    ) -> JSONResponse:
+        """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
+        newest = order == "newest"
+        wanted = await desk.named(bearer, wanted)
+        return JSONResponse(
+            await desk.read(
+                bearer,
+                page_of,
+                desk.path,
+                wanted,
+                cursor,
+                limit,
+                bearer,
+                newest_first=newest,
+                equality=equality,
+            )
+        )
+
+    @router.get("/stream", responses=file("text/event-stream", "Events `record`."), response_class=Response)
+    async def follow_audit(
+        request: Request,
+        bearer: Viewer,
+        wanted: Wanted,
+        *,
+        after: Annotated[
+            int | None, Query(ge=0, le=10**18, description="start after the record with this sequence")
+        ] = None,
+        last_event_id: Annotated[str | None, Header(alias="Last-Event-ID", pattern="^[0-9]{1,18}$")] = None,
+        equality: WithEquality = False,
+    ) -> Response:
+        """Records as they are made (server-sent events): each is an event `record`, its id the sequence.
+
+        Ends when the token does. A browser that reconnects goes on where it was.
+        """
+        wanted = await desk.named(bearer, wanted)
+        start = int(last_event_id) if last_event_id is not None else after
+        follower = await desk.read(bearer, Follower, desk.path, wanted, start)
+        give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
+        following = _follow(services, desk, follower, bearer, wanted.text, equality=equality)
+        return StreamResponse(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
+
+
+def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
+    @router.get("/verify")
+    async def verify_audit(bearer: Operator) -> Verification:
+        """Prove that the log is complete and unchanged; for operators, one at a time.
+
+        The checkpoints of the signer are not compared; `rosrv audit verify` on the machine also does that.
+        """
+        async with desk.verification.turn(bearer):
+            return await desk.in_thread(verify, desk.path)
+
+    @router.get("/checkpoints")
+    async def audit_checkpoints(
+        bearer: Viewer,
+        after: Annotated[int, Query(ge=0, le=10**18, description="only records with a greater number")] = 0,
+        limit: Limit = 1000,
+    ) -> LogCheckpoints:
+        """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
+        return LogCheckpoints(await desk.read(bearer, signed_checkpoints, desk.path, after, limit))
+
+    @router.get(
+        "/export", responses=file("application/x-ndjson", "One record per line."), response_class=Response
+    )
+    async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
+        """Return all records that match, oldest first, one JSON object a line.
+
+        Each has in `chain` its place in the hash chain, as far as a signed checkpoint. Viewers get records as a search
+        shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
+        """
+        wanted = await desk.named(bearer, wanted)
+        found = await desk.read(bearer, _exported, desk.path, wanted, bearer)
+        give_back = services.exports.take(bearer, peer_of(request), "exports")
+        return StreamResponse(
+            StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
+        )
+
+
+def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
+    """Add the routes of one record."""
+
+    @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
+    async def audit_record(
+        bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5
+    ) -> JSONResponse:
+        """One record (by id, or by sequence), and what the same host or caller did around it."""
+        shown = await desk.record(bearer, record_id, neighbours)
+        around = {"before": shown.before, "after": shown.after}
+        answer = {
+            name: [as_object(readable_by(one, bearer)) for one in some] for name, some in around.items()
+        }
+        return JSONResponse({"record": as_object(readable_by(shown.entry, bearer)), **answer})
+
+    @router.get("/{record_id}/why", responses=_UNKNOWN)
+    async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
+        """Explain a record: its cause, the deciding events and values (not for viewers), and the places in the text.
+        For a monitor's verdict, these events alone lead to it. For a denial, the answer has the smallest change of the
+        policy in force that would allow it.
+        """
+        shown = await desk.record(bearer, record_id, 0)
+        record = readable_by(shown.entry, bearer).record
+        known, first = None, await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
+        in_full = None if first is None else readable_by(first, bearer)
+        if asks_policy(record):
+            known = await ask(services.control, PolicyWanted(), bearer)
+        async with services.judging.turn(bearer):
+            return await asyncio.to_thread(explained, record, known, in_full)
+
+    @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
+    async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
+        """Return the smallest change of the policy in force that grants what this record says was refused.
+
+        `tool`: the change also has all other rights that the stock tool of the record needs, such as rostopic.
+        """
+        shown = await desk.record(bearer, record_id, 0)
+        known = await ask(services.control, PolicyWanted(), bearer)
+        async with services.judging.turn(bearer):
+            try:
+                return await asyncio.to_thread(granted, shown.entry.record, known, whole_tool=tool)
+            except UngrantableError as error:
+                raise ProblemError(409, "not-by-a-policy", str(error)) from None
+
+
+async def _follow(
+    services: Services,
+    desk: LogReader,
+    follower: Follower,
+    bearer: Bearer,
+    text: str | None,
+    *,
+    equality: bool,
+) -> AsyncIterator[ServerSentEvent]:
+    while not services.stopping.is_set():
+        if not services.doorkeeper.still_good(bearer):
+            yield ServerSentEvent(event="end", data=json.dumps({"reason": "the token has expired"}))
+            return
+        entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
+        for entry in readable(entries, bearer, text):
+            yield ServerSentEvent(
+                event="record", id=str(entry.sequence), data=_as_line(streamed(entry, equality=equality))
+            )
+        if not entries:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+
+
+def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[str]:
+    if reads_contents(bearer):
+        return _begun(evidence_line(*record) for record in evidence(path, wanted))
+    shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
+    return _begun(_as_line(as_object(entry)) for entries in shown for entry in entries)
+
+
+def _begun(entries: Iterator[_T]) -> Iterator[_T]:
+    """Read the first entry now and return all entries, so that an invalid search fails before the answer begins."""
+    first = next(entries, None)
+    return iter(()) if first is None else itertools.chain((first,), entries)
+
+
+def _joined(lines: Iterator[str]) -> Iterator[str]:
+    """Join lines into larger pieces."""
+    while piece := "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE)):
+        yield piece
+
+
+def _as_line(record: dict[str, Any]) -> str:
+    return json.dumps(record, separators=(",", ":"))

@@ -1,0 +1,127 @@
+"""Build the contract: FastAPI's OpenAPI document, corrected where this application differs."""
+
+import json
+from importlib.resources import files
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from appliance.api.front import moments
+from appliance.api.front.problems import MEDIA_TYPE, Problem
+from appliance.api.front.routing import CONTRACT
+from appliance.api.routes.shown_records import RECORD
+
+# Answers that the request gate may give to any call.
+_ALWAYS = {
+    "403": "The request is from a page of another site, or not for this role.",
+    "408": "The body did not arrive in time.",
+    "413": "The body is too large.",
+    "421": "The appliance does not answer to this host name.",
+    "429": "Too many requests from this host.",
+}
+_WITH_TOKEN = {
+    "401": "No token, or a wrong, expired or revoked one.",
+    "503": "The appliance cannot answer now.",
+}
+_NOT_HTTP = "The request is not HTTP, or its first line or headers are too long (64 KiB); the text is the server's own."
+_HASH = {"description": "ETag of this body; If-None-Match takes it", "schema": {"type": "string"}}
+_REFERENCE = CONTRACT.reference(Problem)
+# Requests and answers of a real appliance, with long texts and lists cut. The key is the kind of the body, or the
+# operation for a body without a kind. tests/integration/api/test_examples.py compares the examples with real answers.
+EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
+# Descriptions by field name, for fields that their structs do not describe. If a name has another meaning in one kind,
+# the key for that kind is `Kind.name`.
+WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json").read_text("utf-8"))
+
+
+def contract_of(app: FastAPI) -> dict[str, Any]:
+    """Return the OpenAPI document, which is made only once."""
+    if app.openapi_schema is None:
+        app.openapi_schema = _made(app)
+    return app.openapi_schema
+
+
+def _made(app: FastAPI) -> dict[str, Any]:
+    document = get_openapi(
+        title=app.title,
+        version=app.version,
+        description=app.description,
+        routes=app.routes,
+        separate_input_output_schemas=False,
+    )
+    components = document.setdefault("components", {}).setdefault("schemas", {})
+    for name in ("HTTPValidationError", "ValidationError"):
+        components.pop(name, None)
+    components |= _plain(CONTRACT.components())
+    components["AuditRecord"] = RECORD
+    for kind, schema in components.items():
+        _described(kind, schema)
+        moments.describe(schema)
+        if kind in EXAMPLES:
+            schema["examples"] = [EXAMPLES[kind]]
+    for path in document["paths"].values():
+        for method, operation in path.items():
+            _complete(operation)
+            _exemplified(operation)
+            if method == "get":
+                _tagged(operation["responses"])
+    return document
+
+
+def _plain(schema: Any) -> Any:
+    """Return the schema in a form that client generators understand: only `maxItems` gives a tuple's length."""
+    if isinstance(schema, list):
+        return [_plain(part) for part in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
+
+
+def _described(kind: str, schema: dict[str, Any]) -> None:
+    """Describe the fields that lack a description. A field that refers to a kind uses the kind's description."""
+    for name, field in schema.get("properties", {}).items():
+        words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
+        if words is not None and "$ref" not in field and not is_described(field):
+            field["description"] = words
+
+
+def is_described(field: dict[str, Any]) -> bool:
+    """Whether the field or one of its possible types has a description."""
+    return "description" in field or any(map(is_described, field.get("anyOf", ())))
+
+
+def _tagged(responses: dict[str, Any]) -> None:
+    """Describe the ETags of `ConditionalGet`."""
+    good = responses["200"]
+    if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
+        good.setdefault("headers", {})["ETag"] = _HASH
+        responses["304"] = {
+            "description": "The body has the ETag in If-None-Match.",
+            "headers": {"ETag": _HASH},
+        }
+
+
+def _exemplified(operation: dict[str, Any]) -> None:
+    name = operation["operationId"]
+    if name in EXAMPLES:
+        (answer,) = operation["responses"]["200"]["content"].values()
+        answer["example"] = EXAMPLES[name]
+    body = operation.get("requestBody", {}).get("content", {})
+    if "text/plain" in body:
+        kind = body["application/json"]["schema"]["$ref"].rpartition("/")[2]
+        body["text/plain"]["example"] = EXAMPLES[kind]["text"]
+
+
+def _complete(operation: dict[str, Any]) -> None:
+    responses = operation["responses"]
+    more = _ALWAYS | (_WITH_TOKEN if operation.get("security") else {})
+    for status, text in more.items():
+        responses.setdefault(status, {"description": text})
+    for status, response in responses.items():
+        if int(status) >= 400:
+            if response["description"] == "Validation Error":
+                response["description"] = "A parameter or the body is invalid."
+            response["content"] = {MEDIA_TYPE: {"schema": _REFERENCE}}
+    words = responses.setdefault("400", {"description": _NOT_HTTP}).setdefault("content", {})
+    words["text/plain"] = {"schema": {"type": "string"}}

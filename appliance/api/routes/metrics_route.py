@@ -1,0 +1,265 @@
+"""Answer `/metrics` in Prometheus's format."""
+
+import math
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.core import Metric as Family
+from prometheus_client.registry import Collector
+from prometheus_client.utils import floatToGoString
+from starlette.responses import Response
+
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Viewer, ask
+from appliance.api.front.routing import Routes, file
+from appliance.api.front.services import Services
+from appliance.base import clock
+from appliance.channel.admin import MetricsWanted, StandbyWanted
+from appliance.channel.answers.host_answers import Host
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.standby_answers import StandbyState
+from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo
+from appliance.channel.standby_summary import both_active
+from appliance.channel.status_summary import no_relay, probe_failed, process_names
+from appliance.telemetry.metrics import METRICS, Metric
+
+_PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
+_Samples = Iterable[tuple[tuple[str, ...], Any]]
+_TEXT = file("text/plain", "Prometheus's text format")
+
+
+def routes(services: Services) -> Routes:
+    """Return the route, which has two paths."""
+    router = Routes(tags=["metrics"])
+
+    async def metrics(bearer: Viewer) -> Response:
+        """Return the metrics in Prometheus's text format; docs/reference/metrics.md lists them."""
+        calls = services.journal.calls
+        try:
+            page = rendered(await ask(services.control, MetricsWanted(), bearer), calls)
+        except ProblemError as problem:
+            if problem.kind != "standby":
+                raise
+            page = rendered_standby(await ask(services.control, StandbyWanted(), bearer), calls)
+        return Response(page, media_type=CONTENT_TYPE_LATEST)
+
+    for prefix, name in (("", ""), ("/v1", "_v1")):
+        router.add_api_route(
+            f"{prefix}/metrics",
+            metrics,
+            operation_id=f"metrics{name}",
+            responses=_TEXT,
+            response_class=Response,
+        )
+    return router
+
+
+def rendered(body: Measures, calls: Mapping[tuple[str, str], int]) -> bytes:
+    """Return control's measures and the numbers of REST calls by method and status, in Prometheus's format."""
+    return _page({**_samples(body), "rosrv_rest_calls_total": calls.items()}, METRICS)
+
+
+def rendered_standby(state: StandbyState, calls: Mapping[tuple[str, str], int]) -> bytes:
+    """Return the metrics of a standby, which has only its own state and the numbers of REST calls."""
+    samples = {**_standby(state), "rosrv_rest_calls_total": calls.items()}
+    return _page(samples, [metric for metric in METRICS if metric.name in samples])
+
+
+def _page(samples: Mapping[str, _Samples], metrics: Iterable[Metric]) -> bytes:
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Once([_family(metric, samples[metric.name]) for metric in metrics]))
+    return generate_latest(registry)
+
+
+class _Once(Collector):
+    """A collector of the metrics of one answer."""
+
+    def __init__(self, families: Sequence[Family]) -> None:
+        self._families = families
+
+    def collect(self) -> Iterator[Family]:
+        yield from self._families
+
+
+def _family(metric: Metric, samples: _Samples) -> Family:
+    if metric.kind == "histogram":
+        histogram = HistogramMetricFamily(metric.name, metric.help, labels=metric.labels)
+        for labels, (counts, total) in samples:
+            histogram.add_metric(labels, _buckets(metric.bounds, counts), total)
+        return histogram
+    kind = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
+    family = kind(metric.name, metric.help, labels=metric.labels)
+    for labels, value in samples:
+        family.add_metric(labels, float(value))
+    return family
+
+
+def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str, float]]:
+    total: float = 0
+    buckets = []
+    for bound, count in zip([*map(floatToGoString, bounds), "+Inf"], counts, strict=True):
+        total += count
+        buckets.append((bound, float(total)))
+    return buckets
+
+
+def _samples(body: Measures) -> dict[str, _Samples]:
+    status = body.status
+    policy, audit, monitors, clock = status.policy, status.audit, status.monitors, status.clock
+    relayed, recorder = body.relayed, status.recorder
+    return {
+        "rosrv_info": [((status.version, status.name), 1)],
+        "rosrv_start_time_seconds": [((), status.since)],
+        "rosrv_decisions_total": [
+            ((category, outcome), count) for category, outcome, count in body.decisions
+        ],
+        "rosrv_decision_seconds": [((), body.decision_seconds)],
+        "rosrv_master_call_seconds": [((call,), observed) for call, observed in body.calls],
+        "rosrv_probe_failed": [((), probe_failed(status))],
+        "rosrv_relay_connected": [((), no_relay(status.relay) is None)],
+        "rosrv_relay_connections": [((kind,), count) for kind, count in body.connections.items()],
+        "rosrv_relay_messages_total": [((name,), row[0]) for name, row in relayed.items()],
+        "rosrv_relay_bytes_total": [((name,), row[1]) for name, row in relayed.items()],
+        "rosrv_relay_dropped_total": [((name,), row[2]) for name, row in relayed.items()],
+        "rosrv_relay_limited_total": [((name, part), count) for name, part, count in body.limited],
+        "rosrv_relay_memory_bytes": [((what,), size) for what, size in body.memory.items()],
+        "rosrv_relay_delay_seconds": [((name,), (row[:-1], row[-1])) for name, row in body.delayed.items()],
+        "rosrv_monitor_dropped_total": [((name,), count) for name, count in body.drop_at.items()],
+        "rosrv_monitor_changed_total": [((name,), count) for name, count in body.change_at.items()],
+        "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body.monitors],
+        "rosrv_monitor_slices": [((name,), count) for name, (count, _) in body.slices.items()],
+        "rosrv_monitor_slice_limit": [((name,), most) for name, (_, most) in body.slices.items()],
+        "rosrv_switched_off": [
+            (
+                (about, state),
+                sum((off.about, off.forgotten) == (about, forgotten) for off in status.switched_off),
+            )
+            for about in ("monitors", "policy")
+            for state, forgotten in (("recent", False), ("forgotten", True))
+        ],
+        "rosrv_monitors": [
+            (("enabled",), monitors.enabled),
+            (("shadow",), len(monitors.shadow)),
+            (("disabled",), monitors.loaded - monitors.enabled - len(monitors.shadow)),
+            (("holding",), len(monitors.held)),
+            (("failing",), len(monitors.failing)),
+        ],
+        "rosrv_nodes": [((state,), count) for state, count in body.nodes.items()],
+        "rosrv_registrations": [((kind,), count) for kind, count in body.registrations.items()],
+        "rosrv_rosmaster_reachable": [((), status.rosmaster == "reachable")],
+        "rosrv_delivery_queue": [((), body.queued_deliveries)],
+        **_tunnels(body.hosts),
+        "rosrv_hosts_blocked": [((), status.blocks.hosts)],
+        "rosrv_ipsec_troubles": [((), len(status.ipsec.troubles))],
+        "rosrv_audit_queue": [((), audit.lag_records)],
+        "rosrv_audit_lag_seconds": [((), audit.lag_seconds)],
+        "rosrv_audit_failed": [((), audit.failed is not None)],
+        "rosrv_audit_degraded": [((), audit.degraded is not None)],
+        **_forwarding("syslog", audit.forwarding),
+        **_forwarding("collector", audit.collector),
+        **_bundles(status.bundles),
+        "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
+        "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
+        "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
+        "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
+        "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
+        **_standby(status.standby),
+        "rosrv_policy_revision": [((), policy.revision)],
+        "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
+        "rosrv_process_restarts_total": [
+            ((name,), process.restarts) for name, process in _named(status.processes)
+        ],
+        "rosrv_process_resident_bytes": list(_memory(status.processes)),
+    }
+
+
+def _forwarding(to: str, forwarding: ForwardingState | None) -> dict[str, _Samples]:
+    if forwarding is None:
+        names = ("up", "sent_total", "lag_records", "lag_seconds", "missed_total")
+        return {f"rosrv_{to}_{name}": [] for name in names}
+    return {
+        f"rosrv_{to}_up": [((), not forwarding.trouble)],
+        f"rosrv_{to}_sent_total": [((), forwarding.sent)],
+        f"rosrv_{to}_lag_records": [((), forwarding.behind)],
+        f"rosrv_{to}_lag_seconds": [((), forwarding.seconds)],
+        f"rosrv_{to}_missed_total": [((), forwarding.missed)],
+    }
+
+
+def _standby(state: StandbyState | None) -> dict[str, _Samples]:
+    if state is None:
+        return {metric.name: [] for metric in METRICS if metric.name.startswith("rosrv_standby_")}
+    other, answered, active = state.other, state.witness.answered_seconds, state.role == "active"
+    return {
+        "rosrv_standby_role": [((role,), state.role == role) for role in ("active", "standby")],
+        "rosrv_standby_connected": [((), other.connected)],
+        "rosrv_standby_in_sync": [((), other.in_sync)] if active else [],
+        "rosrv_standby_obstacle": [((), bool(state.obstacle))],
+        "rosrv_standby_behind_changes": [((), other.behind_changes)] if active else [],
+        "rosrv_standby_behind_bytes": [((), other.behind_bytes)] if active else [],
+        "rosrv_standby_witness_age_seconds": [((), math.inf if answered is None else answered)],
+        "rosrv_standby_other_witness_age_seconds": [((), seen)]
+        if (seen := other.witness_seconds) is not None
+        else [],
+        "rosrv_standby_witness_trouble": [((), bool(state.witness.trouble))],
+        "rosrv_standby_both_active": [((), both_active(state))] if active else [],
+        # Until the epoch is known after a restart: a counter that falls to 0 and returns would look like takeovers.
+        "rosrv_standby_takeovers_total": [((), state.epoch)] if state.epoch else [],
+    }
+
+
+def _bundles(bundles: BundlesState | None) -> dict[str, _Samples]:
+    if bundles is None:
+        names = ("version", "refused", "changed", "checked_seconds", "rejected")
+        return {f"rosrv_bundle_{name}": [] for name in names}
+    number = bundles.in_force.rpartition("/")[2].removesuffix(".tar")
+    checked = -1.0 if bundles.checked is None else clock.wall() - bundles.checked
+    return {
+        "rosrv_bundle_version": [((), int(number or 0))],
+        "rosrv_bundle_refused": [((), bool(bundles.refused))],
+        "rosrv_bundle_changed": [((), bundles.changed)],
+        "rosrv_bundle_checked_seconds": [((), checked)],
+        "rosrv_bundle_rejected": [((), bundles.rejected)],
+    }
+
+
+_PORTS = {"open": 1, "closed": 0, "unknown": -1}
+
+
+def _tunnels(hosts: list[Host]) -> dict[str, _Samples]:
+    """Return the samples of hosts with tunnels; revoked hosts are only counted."""
+    enrolled = [host for host in hosts if host.serial is not None and host.revoked is None]
+    now = clock.wall()
+    return {
+        "rosrv_tunnel_up": [((host.name,), host.remote is not None) for host in enrolled],
+        "rosrv_tunnel_age_seconds": [((host.name,), host.seconds or 0) for host in enrolled],
+        "rosrv_tunnel_bytes": [
+            ((host.name, direction), count or 0)
+            for host in enrolled
+            for direction, count in (("in", host.bytes_in), ("out", host.bytes_out))
+        ],
+        "rosrv_host_certificate_expiry_seconds": [
+            ((host.name,), host.expires - now) for host in enrolled if host.expires is not None
+        ],
+        "rosrv_host_ports_open": [((host.name,), _PORTS[host.ports.state]) for host in enrolled],
+        "rosrv_hosts": [((state,), count) for state, count in Counter(host.state for host in hosts).items()],
+    }
+
+
+def _named(processes: Sequence[ProcessInfo]) -> Iterator[tuple[str, ProcessInfo]]:
+    """Yield each process with a unique name, so that two processes of one role are two series."""
+    return zip(process_names(processes), processes, strict=True)
+
+
+def _memory(processes: Sequence[ProcessInfo]) -> Iterator[tuple[tuple[str, ...], float]]:
+    for name, process in _named(processes):
+        try:
+            pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
+        except OSError:
+            continue  # the process has just ended
+        yield (name,), float(int(pages) * _PAGE_BYTES)

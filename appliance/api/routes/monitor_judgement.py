@@ -1,0 +1,107 @@
+"""Compile the specifications in force from their texts, and convert findings to structures.
+
+Every function here is pure, takes texts, and runs in a thread. The compiler is imported when it is first needed, so
+that an unused api starts without it.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from appliance.api.front.problems import Finding, ProblemError
+from appliance.api.routes.monitor_models import EventShown, PropertyShown
+from appliance.channel.answers.monitor_answers import Monitors
+
+if TYPE_CHECKING:
+    from rosmop.run.engine import MonitorSet
+
+_PLACE = re.compile(r"(?s)([^:]*+):([0-9]{1,9}+):([0-9]{1,9}+): (error|warning): (.*+)")
+
+
+def findings_of(texts: list[str]) -> list[Finding]:
+    """Return findings as structures; skip findings that do not have the form `file:line:column: error: text`."""
+    return [
+        Finding(file=file, line=int(line), column=int(column), severity=severity, text=text)
+        for file, line, column, severity, text in (
+            found.groups() for found in map(_PLACE.fullmatch, texts) if found is not None
+        )
+    ]
+
+
+def refusal(error: str, findings: list[str]) -> ProblemError:
+    """Return a rejection of specifications as a problem; its detail has each finding on a separate line."""
+    return ProblemError(
+        422,
+        "specifications-refused",
+        "\n".join([error, *findings[:200]]),
+        findings=findings_of(findings) or None,
+    )
+
+
+class Described(NamedTuple):
+    """A monitor's events and properties, the monitors whose variables it uses, and whether it is declared `hold`."""
+
+    events: list[EventShown]
+    properties: list[PropertyShown]
+    uses: list[str]
+    hold: bool
+
+
+class Compiler:
+    """The compiler of the specifications in force; it keeps the last result, so repeated queries compile only once."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, MonitorSet] | None = None
+
+    def _set(self, loaded: Monitors) -> MonitorSet:
+        if self._last is None or self._last[0] != loaded.revision:
+            self._last = (loaded.revision, _compiled(loaded.files or {}, loaded.definitions or {}))
+        return self._last[1]
+
+    def described(self, loaded: Monitors, name: str) -> Described:
+        """Describe a monitor of the loaded texts. Raises KeyError."""
+        monitor = self._set(loaded).monitor(name)
+        events = [
+            EventShown(
+                name=event.name,
+                line=event.position.line,
+                topic=event.topic,
+                type=event.service_type or event.type,
+                part=event.part,
+                every=None if event.period_ns is None else event.period_ns / 1e9,
+            )
+            for event in monitor.code.events
+        ]
+        properties = [
+            PropertyShown(
+                logic=running.code.property.logic,
+                formula=running.code.property.formula.strip(),
+                categories=list(running.code.property.categories),
+                handled=list(running.code.order),
+                drawn=running.drawable,
+            )
+            for running in monitor.properties
+        ]
+        return Described(events, properties, sorted(monitor.code.uses), monitor.code.hold)
+
+    def picture(self, loaded: Monitors, name: str) -> str | None:
+        """Return the automata of a monitor's properties (SVG); None if no automaton is finite. Raises KeyError."""
+        return self._set(loaded).monitor(name).picture()
+
+    def warnings(self, file: str) -> list[Finding]:
+        """Return the warnings about a file of the last compilation."""
+        assert self._last is not None  # noqa: S101  callers compile by `described` first
+        return findings_of(
+            [str(warning) for warning in self._last[1].warnings if warning.position.file == file]
+        )
+
+
+def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
+    from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: see the head
+    from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
+    from roswire.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
+    from roswire.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
+
+    known = standard_definitions().extended(Definitions.from_files(definitions))
+    return MonitorSet.of(compiled_from(files, known))

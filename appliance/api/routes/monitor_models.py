@@ -1,0 +1,88 @@
+"""Structs of `/v1/monitors` besides control's answers."""
+
+from typing import Annotated
+
+import msgspec
+
+from appliance.api.front.problems import Finding
+from appliance.channel.answers.field_docs import RollbackDue, doc
+from appliance.channel.answers.monitor_answers import MonitorState, Tag
+
+
+class EventShown(msgspec.Struct, frozen=True, kw_only=True):
+    """An event of a specification: on a topic, in a service's request or response, or a timer (`every`, in seconds)."""
+
+    name: str
+    line: int
+    topic: str | None
+    type: str | None
+    part: Annotated[str | None, doc("for a service: request or response")]
+    every: Annotated[float | None, doc("interval in seconds; null: not periodic")]
+
+
+class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
+    """A property of a specification; `drawn`: `…/picture` shows its automaton."""
+
+    logic: str
+    formula: str
+    categories: list[str]
+    handled: list[str]
+    drawn: bool
+
+
+class Happened(msgspec.Struct, frozen=True, kw_only=True):
+    """Something a monitor did, as it is in the audit log under this sequence; `count`: more of the same."""
+
+    sequence: int
+    time: Annotated[str, doc("RFC 3339, UTC, nanoseconds")]
+    event: str
+    resource: str | None
+    reason: str
+    category: Annotated[str | None, doc("the events of the verdict")]
+    count: int | None
+
+
+class Monitor(MonitorState, frozen=True, kw_only=True):
+    """A monitor with its source text."""
+
+    revision: int
+    tag: Tag
+    text: Annotated[str, doc("text of its whole file")]
+    alphabet: Annotated[list[EventShown], doc("its events")]
+    properties: list[PropertyShown]
+    warnings: Annotated[list[Finding], doc("name of its file")]
+    uses: Annotated[list[str], doc("monitors whose variables it uses")]
+    hold: Annotated[bool, doc("declared `hold`: blocks its topics after a restart of the relay")]
+
+
+class History(msgspec.Struct, frozen=True):
+    """The latest actions of a monitor, the newest first."""
+
+    name: str
+    happened: list[Happened]
+    cursor: Annotated[str | None, doc("cursor of the next page; null: this is the last page")]
+
+
+class Replaced(msgspec.Struct, frozen=True, kw_only=True):
+    """The effect of a change, or of the dry run of one (`loaded` false); `replaced` is the revision before."""
+
+    loaded: bool
+    revision: Annotated[int, doc("in force now")]
+    tag: Tag
+    replaced: int | None = None
+    added: list[str]
+    changed: list[str]
+    removed: list[str]
+    warnings: list[Finding]
+    monitors: Annotated[list[str], doc("the resulting monitors, in order")]
+    moved: Annotated[
+        list[str], doc("monitors in their initial state because they moved to another relay process")
+    ] = []
+    began: Annotated[
+        list[str],
+        doc("all monitors that are in their initial state because of this change, including new ones"),
+    ] = []
+    kept: Annotated[
+        list[str], doc("files that a reload left in force although the folder does not have them")
+    ] = []
+    confirm_by: RollbackDue = None

@@ -1,0 +1,211 @@
+"""Routes of `/v1/monitors`: the monitors, their specifications and history, and changes with our own answers."""
+
+import asyncio
+from pathlib import Path as FilePath
+from typing import Annotated, Any
+
+from fastapi import Path, Query, Response
+from msgspec.structs import asdict
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.route_roles import Viewer, ask, reads_contents
+from appliance.api.front.routing import Responses, Routes, Tagged, file, tagged
+from appliance.api.front.services import Services
+from appliance.api.routes.audit import LogReader
+from appliance.api.routes.monitor_judgement import Compiler, Described, findings_of
+from appliance.api.routes.monitor_models import Happened, History, Monitor, Replaced
+from appliance.api.routes.operation_routes import Answer, OperationCall
+from appliance.audit.log.record_format import LogEntry, rfc3339, without_contents
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
+from appliance.channel import admin
+from appliance.channel.answers.monitor_answers import (
+    Monitors,
+    MonitorState,
+)
+
+UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
+_PICTURE = file("image/svg+xml", "OK")
+OneName = Annotated[
+    str, Path(min_length=1, max_length=256, description="name of the monitor", examples=["censor"])
+]
+
+
+class _Looking:
+    """Answers queries for monitors: reads and compiles the specifications in force, a limited number at once."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self.compiler = Compiler()
+        self.desk = LogReader(services)
+
+    async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
+        """Return the specifications in force with their texts, and a monitor's row. Raises `ProblemError` (404)."""
+        loaded = await ask(self._services.control, admin.MonitorsWanted(texts=True), bearer)
+        row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
+        if row is None:
+            raise unknown_monitor(name, loaded)
+        return loaded, row
+
+    async def described(self, bearer: Bearer, loaded: Monitors, name: str) -> Described:
+        async with self._services.judging.turn(bearer):
+            return await asyncio.to_thread(self.compiler.described, loaded, name)
+
+    async def picture(self, bearer: Bearer, loaded: Monitors, name: str) -> str | None:
+        async with self._services.judging.turn(bearer):
+            return await asyncio.to_thread(self.compiler.picture, loaded, name)
+
+
+def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
+    """Return the problem of an unknown monitor, which lists the known ones."""
+    known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
+    return ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+
+
+def routes(services: Services) -> Routes:
+    """Return the routes."""
+    router = Routes(prefix="/v1/monitors", tags=["monitors"])
+    looking = _Looking(services)
+
+    @router.get("/{name}", responses=UNKNOWN)
+    async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
+        """One monitor: state, counters, the text of its file, its events and properties."""
+        loaded, state = await looking.state(bearer, name)
+        found = await looking.described(bearer, loaded, name)
+        shown = Monitor(
+            **asdict(state),
+            revision=loaded.revision,
+            tag=loaded.tag,
+            text=(loaded.files or {})[state.file],
+            alphabet=found.events,
+            properties=found.properties,
+            warnings=looking.compiler.warnings(state.file),
+            uses=found.uses,
+            hold=found.hold,
+        )
+        return tagged(shown)
+
+    @router.get("/{name}/picture", responses=_PICTURE | UNKNOWN, response_class=Response)
+    async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
+        """Return the automata of its properties (SVG); 404 when it has none that is finite."""
+        loaded, _state = await looking.state(bearer, name)
+        drawn = await looking.picture(bearer, loaded, name)
+        if drawn is None:
+            raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
+        return Response(drawn, media_type="image/svg+xml")
+
+    @router.get("/{name}/history")
+    async def monitor_history(
+        name: OneName,
+        bearer: Viewer,
+        cursor: Annotated[str | None, Query(max_length=18, description="cursor of the previous page")] = None,
+        limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    ) -> History:
+        """Return the monitor's latest actions: verdicts, drops, changes, faults, output, switches; from the audit log.
+
+        A monitor that no longer exists also has its history.
+        """
+        found: list[LogEntry] = await looking.desk.read(
+            bearer, records_of, looking.desk.path, name, cursor, limit + 1
+        )
+        happened = [
+            _happened(entry if reads_contents(bearer) else without_contents(entry)) for entry in found[:limit]
+        ]
+        return History(name, happened, str(found[limit - 1].sequence) if len(found) > limit else None)
+
+    return router
+
+
+def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[LogEntry]:
+    """Return the last `count` records about a monitor; skip other records that only contain its name."""
+    found: list[LogEntry] = []
+    more: str | None = cursor
+    while len(found) < count:
+        page = search(path, Filter(category="monitor", text=name), more, count)
+        found += [entry for entry in page.entries if _of(entry, name)]
+        more = page.cursor
+        if more is None:
+            break
+    return found[:count]
+
+
+def _of(entry: LogEntry, name: str) -> bool:
+    """Whether a record is about this monitor, and not only about a name or topic that contains the monitor's name."""
+    record = entry.record
+    return record.detail.get("monitor") == name or (
+        record.event.startswith("monitor ") and record.resource == name
+    )
+
+
+def _happened(entry: LogEntry) -> Happened:
+    record, detail = entry.record, entry.record.detail
+    category, count = detail.get("category"), detail.get("count")
+    return Happened(
+        sequence=entry.sequence,
+        time=rfc3339(record.time),
+        event=record.event,
+        resource=record.resource,
+        reason=record.reason,
+        category=category if isinstance(category, str) else None,
+        count=count if isinstance(count, int) else None,
+    )
+
+
+async def _load(call: OperationCall[admin.MonitorLoad]) -> Tagged[Replaced]:
+    if not call.dry_run:
+        return await _change(call)
+    new = call.order
+    return await _try(
+        call,
+        admin.MonitorTry(
+            new.files, new.definitions, new.signatures, new.expected, new.force, new.shadow, new.hold
+        ),
+    )
+
+
+async def _replace(call: OperationCall[admin.MonitorReplace]) -> Tagged[Replaced]:
+    if not call.dry_run:
+        return await _change(call)
+    new, file = call.order, await _file_of(call)
+    signatures = {**new.signatures, file: new.signature}
+    return await _try(
+        call,
+        admin.MonitorTry(
+            {file: new.text}, new.definitions, signatures, new.expected, new.force, new.shadow, new.hold
+        ),
+    )
+
+
+async def _change(call: OperationCall[Any]) -> Tagged[Replaced]:
+    done = await call.ask(call.order)
+    monitors = (await call.ask(admin.MonitorsWanted())).monitors
+    fields = asdict(done) | {"warnings": findings_of(done.warnings)}
+    return tagged(Replaced(**fields, loaded=True, monitors=[monitor.name for monitor in monitors]))
+
+
+async def _try(call: OperationCall[Any], order: admin.MonitorTry) -> Tagged[Replaced]:
+    """Answer a dry run; control and the compiler limit the number of dry runs."""
+    done = await call.ask(order)
+    return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
+
+
+async def _file_of(call: OperationCall[admin.MonitorReplace]) -> str:
+    """Return the name of a monitor's file. Raises `ProblemError` (404)."""
+    name, loaded = call.order.name, await call.ask(admin.MonitorsWanted(texts=True))
+    files = {monitor.name: monitor.file for monitor in loaded.monitors}
+    if name in (loaded.files or {}):
+        return name
+    if name not in files:
+        raise unknown_monitor(name, loaded)
+    return files[name]
+
+
+ANSWERS = {
+    "load_monitors": Answer(_load),
+    "replace_monitor": Answer(_replace),
+    "reload_monitors": Answer(_change),
+    "remove_monitor": Answer(_change),
+    "remove_monitors": Answer(_change),
+    "roll_back_monitors": Answer(_change),
+}

@@ -1,0 +1,60 @@
+"""Hosts by their names: what a search for a name means, and the labels of addresses, by the policy in force."""
+
+import ipaddress
+from typing import Annotated
+
+import msgspec
+
+from appliance.audit.search.query import Filter, FilterError
+from appliance.channel.answers.policy_answers import PolicyInForce
+from appliance.policy.host_names import HostNames, UnknownHostNameError
+from appliance.policy.model import address_of
+
+_GLOB = frozenset("*?[")
+
+
+class HostLabel(msgspec.Struct, frozen=True):
+    """The name of the addresses in a network."""
+
+    network: Annotated[str, msgspec.Meta(description="an address with its prefix length")]
+    name: Annotated[str, msgspec.Meta(description="an enrolled host, `robot`, or a group of the policy")]
+
+
+class HostLabels(msgspec.Struct, frozen=True):
+    """The names of hosts by the policy in force: the first network that contains an address gives its name."""
+
+    labels: Annotated[list[HostLabel], msgspec.Meta(description="the smallest network first")]
+
+
+def names_of(known: PolicyInForce) -> HostNames:
+    """Return the names of hosts that the policy in force knows."""
+    enrolled = {name: address_of(address) for name, address in known.hosts.items()}
+    return HostNames.of(known.text, enrolled, map(ipaddress.ip_network, known.robot))
+
+
+def labels_of(known: PolicyInForce) -> HostLabels:
+    """Return the labels of addresses."""
+    return HostLabels([HostLabel(str(network), name) for network, name in names_of(known).labels()])
+
+
+def has_name(wanted: Filter) -> bool:
+    """Whether a search names its host, or gives a network: addresses and globs need no policy."""
+    if wanted.host is None or not _GLOB.isdisjoint(wanted.host):
+        return False
+    try:
+        wanted.host.encode()
+        ipaddress.ip_address(wanted.host)
+    except UnicodeEncodeError:
+        return False  # the search rejects it
+    except ValueError:
+        return True
+    return False
+
+
+def with_networks(wanted: Filter, known: PolicyInForce) -> Filter:
+    """Replace the name of a search's host by its networks. Raises `FilterError` for an unknown name."""
+    try:
+        networks = names_of(known).networks(wanted.host or "")
+    except UnknownHostNameError as error:
+        raise FilterError(f"host: {error}") from None
+    return msgspec.structs.replace(wanted, host=None, hosts=tuple(map(str, networks)))

@@ -1,0 +1,207 @@
+"""Derive routes from the table of operations (`channel/admin.py`): parameters, role, ETag, answer, contract.
+
+A route reads its order with the function that control also uses (`channel/rest_meaning.py`), so that both understand a
+request in the same way. Before that, FastAPI only checks parameters and body. The answer is control's, unless the
+operation's module has an `Answer` for the request.
+"""
+
+import inspect
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
+
+from fastapi import Header, Path, Query, Request, Response
+from pydantic import StringConstraints
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.etags import etag
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.request_gate import asked_of
+from appliance.api.front.route_roles import LEAST, answered, problem_of
+from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
+from appliance.api.front.services import Services
+from appliance.api.routes.monitor_judgement import refusal
+from appliance.channel.admin import MONITORS, OPERATIONS, A, AdminAnswer, AdminRequest, answer_to
+from appliance.channel.answers.token_answers import may
+from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
+from appliance.channel.rest_operation import Operation, parameter_of, plain
+
+Q = TypeVar("Q", bound=AdminRequest[Any])
+DryRun = Annotated[bool, Query(description="only report the effect; for operators, without If-Match")]
+IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        max_length=100,
+        description="The ETag of the state that the change is for, or `*` for any state.",
+    ),
+]
+_CONVERTORS = {"{recording_id}": "{recording_id:recording}"}  # of Starlette
+
+
+@dataclass(frozen=True)
+class OperationCall(Generic[Q]):
+    """An operation that a bearer requests; `body` is the body as sent."""
+
+    services: Services
+    operation: Operation
+    bearer: Bearer
+    order: Q
+    body: Any
+    dry_run: bool
+
+    async def ask(self, request: AdminRequest[A]) -> A:
+        """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
+        control = self.services.control
+        return self._answered(await control.ask(request, self.bearer))
+
+    def _answered(self, done: AdminAnswer[A]) -> A:
+        if self.operation.of is MONITORS and done.trouble == "refused":
+            raise refusal(done.error, done.findings)
+        if done.trouble == "conflict" and done.tag:  # the present ETag is in the answer
+            raise ProblemError(412, "changed-meanwhile", done.error, headers={"ETag": etag(done.tag)})
+        return answered(done)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer that replaces control's; the contract has the return type of `function`.
+
+    If the answer is not a struct, `success` describes it in the contract.
+    """
+
+    function: Callable[[OperationCall[Any]], Awaitable[Any]]
+    success: Mapping[str, Any] | None = None
+
+
+def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
+    """Return the routes of all operations with a name; `answers` has our own answers by operation name."""
+    router = Routes()
+    assert answers.keys() <= {one.name for one in OPERATIONS}  # noqa: S101  no name is misspelt
+    for operation in sorted(OPERATIONS, key=lambda one: "{" in one.path):  # literal paths before parameters
+        if operation.name:
+            _add(router, services, operation, answers.get(operation.name))
+    return router
+
+
+def _add(router: Routes, services: Services, operation: Operation, own: Answer | None) -> None:
+    parameters, given = _parameters(operation), _answer_type(operation, own)
+
+    async def endpoint(**received: Any) -> Any:
+        call = _call(services, operation, received)
+        if own is not None:
+            return await own.function(call)
+        done = await call.ask(call.order)
+        if operation.status != 200:
+            return answer(done, operation.status)
+        return tagged(done) if operation.of is not None else done
+
+    endpoint.__name__ = operation.name
+    endpoint.__doc__ = inspect.cleandoc(operation.words)
+    endpoint.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # FastAPI reads it
+    endpoint.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": given}
+    path = operation.path
+    for name, converted in _CONVERTORS.items():
+        path = path.replace(name, converted)
+    options: dict[str, Any] = {"response_class": Response} if given is Response else {}
+    router.add_api_route(
+        path,
+        endpoint,
+        methods=[operation.method],
+        tags=[operation.tag],
+        status_code=operation.status,
+        responses=_responses(operation, own),
+        **options,
+    )
+
+
+def _call(services: Services, operation: Operation, received: Mapping[str, Any]) -> OperationCall[Any]:
+    """Return the requested operation. Raises `ProblemError` if the role, `If-Match` or the request is invalid."""
+    bearer, request = received["bearer"], received["request"]
+    dry_run, if_match = received.get("dry_run", False), received.get("if_match")
+    role, reason = operation.least(received, dry_run=dry_run)
+    if not may(bearer.role, role):
+        raise problem_of("forbidden", reason)
+    if operation.is_change and operation.of is not None and if_match is None and not dry_run:
+        seen = f"the ETag of the {operation.of.what} that you have seen"
+        text = f"If-Match is missing: send {seen}, from GET {operation.of.where}"
+        raise ProblemError(428, "precondition-required", text)
+    try:
+        order = meant(bearer.asked or asked_of(request.scope, request.headers, b""), dry_run=dry_run)
+    except BadTagError as error:
+        raise ProblemError(412, "changed-meanwhile", str(error)) from None
+    except NoOrderError as error:
+        raise ProblemError(422, "bad-input", str(error)) from None
+    return OperationCall(services, operation, bearer, order, received.get("body"), dry_run)
+
+
+def _answer_type(operation: Operation, own: Answer | None) -> Any:
+    if own is not None:
+        return get_type_hints(own.function)["return"]
+    kind = answer_to(operation.request)
+    if operation.status != 200:
+        return Response
+    return Tagged[kind] if operation.of is not None else kind  # type: ignore[valid-type]  # a type at run time
+
+
+def _parameters(operation: Operation) -> list[inspect.Parameter]:
+    same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
+    found: dict[str, tuple[Any, Any]] = {"request": (Request, inspect.Parameter.empty)}
+    for name, field in operation.fields().items():
+        if f"{{{name}}}" in operation.path:
+            kind, rules = _of_path(field.type)
+            found[name] = (Annotated[kind, Path(**rules)], inspect.Parameter.empty)
+    if operation.body is not None:
+        kind = Annotated[operation.body, body(operation.body, text=operation.text or None)]
+        found["body"] = (kind, inspect.Parameter.empty)
+    found["bearer"] = (
+        LEAST["operator" if operation.dry_run else operation.role or ""],
+        inspect.Parameter.empty,
+    )
+    if operation.is_change and operation.of is not None:
+        found["if_match"] = (IfMatch, None)
+    if operation.dry_run:
+        found["dry_run"] = (DryRun, False)
+    for one in same:
+        for wanted in one.query:
+            name, field = next((name, field) for name, field in one.fields().items() if field.name == wanted)
+            default = inspect.Parameter.empty if field.required else field.default
+            found[name] = (_of_query(field.type), default)
+    return [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
+        for name, (kind, default) in found.items()
+    ]
+
+
+def _of_path(kind: Any) -> tuple[Any, Mapping[str, Any]]:
+    """Return the type and the bounds of a field in a path; for a list, those of its only element."""
+    base = plain(kind)
+    if get_origin(base) is list:
+        (kind,) = get_args(base)
+    return plain(kind), parameter_of(kind).rules
+
+
+def _of_query(kind: Any) -> Any:
+    base = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if get_origin(base) is list:
+        (element,) = get_args(base)
+        rules = parameter_of(element).rules
+        bounds = {name: rules[name] for name in ("min_length", "max_length") if name in rules}
+        base = list[Annotated[plain(element), StringConstraints(**bounds)]]  # type: ignore[misc]  # a type at run time
+    return Annotated[base, Query(**parameter_of(kind).rules)]
+
+
+def _responses(operation: Operation, own: Answer | None) -> Responses:
+    found: Responses = {status: {"description": text} for status, text in operation.problems.items()}
+    if operation.is_change and operation.of is not None:
+        found[412] = {
+            "description": operation.of.changed,
+            **({"headers": ETAG} if operation.of is MONITORS else {}),
+        }
+        found[428] = {"description": "If-Match is missing."}
+    if own is not None and own.success is not None:
+        found[operation.status] = {"description": operation.good, **own.success}
+    elif operation.status != 200:
+        kind = answer_to(operation.request)
+        found[operation.status] = {"description": operation.good, "content": content(kind)}
+    return found

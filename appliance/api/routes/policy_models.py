@@ -1,0 +1,102 @@
+"""Structs of `/v1/policy` besides control's answers."""
+
+from typing import Annotated, Literal
+
+import msgspec
+from fastapi import Path
+
+from appliance.api.front.problems import Finding
+from appliance.channel.answers.field_docs import Moment, doc
+from appliance.channel.rest_bodies import LONGEST_REVISION
+from appliance.policy.model import Category
+
+OneRevision = Annotated[
+    int, Path(ge=1, le=LONGEST_REVISION, description="number of the revision", examples=[1])
+]
+Decided = Literal["allow", "deny", "would deny"]
+
+
+class Change(msgspec.Struct, frozen=True):
+    """Something that is registered now and would be decided differently."""
+
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    now: Decided
+    then: Decided
+    reason: Annotated[str, doc("of the new policy")]
+
+
+class Ended(msgspec.Struct, frozen=True):
+    """Something live that the policy ends."""
+
+    host: str
+    caller_id: Annotated[str, doc("empty: the client gave no name")]
+    what: Literal["publication", "subscription", "service", "call", "parameter"]
+    resource: str
+    reason: str
+
+
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """The effect of a new policy; `loaded` is false after a dry run, and the values that only a load can find are then
+    null.
+    """
+
+    loaded: bool
+    revision: Annotated[int, doc("in force now")]
+    replaced: int | None = None
+    revoked: Annotated[int | None, doc("number of registrations and connections that were revoked")] = None
+    confirm_by: Moment | None = None
+    warnings: list[Finding]
+    changes: list[Change]
+    ends: Annotated[list[Ended], doc("live registrations and connections that end with the change")]
+
+
+class RuleText(msgspec.Struct, frozen=True):
+    """Where a rule stands."""
+
+    section: str
+    key: str
+    file: str
+    line: int
+
+
+class LostRule(msgspec.Struct, frozen=True):
+    """A rule that speaks of the resource and does not decide."""
+
+    rule: RuleText
+    would: Literal["allow", "deny"]
+    why: str
+
+
+class Explained(msgspec.Struct, frozen=True, kw_only=True):
+    """Why a request is decided as it is; `node` is the right to the node's name, where that is needed too."""
+
+    host: str
+    caller_id: str
+    category: str
+    resource: str
+    decision: Decided
+    rule: RuleText | None
+    reason: str
+    told: Annotated[str | None, doc("text of the answer to a denied host ([Options] tell); null: allowed")]
+    through: Annotated[list[str], doc("words of the rule that match the host")]
+    limit: Annotated[str, doc("the limit on allowed messages, and its line of [Limits]; empty: none")]
+    lost: list[LostRule]
+    node: Annotated["Explained | None", doc("the node name that the host gives, if the action needs a node")]
+    command: Annotated[
+        "Explained | None",
+        doc("the rule for the command that does it: `lookupService`, `getParam`, `setParam`"),
+    ]
+    allowed: Annotated[bool, doc("the decision on the whole call")]
+
+
+class Question(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A request to explain; `text`: under this policy instead of the one in force."""
+
+    host: Annotated[str, doc("an address, or `robot`", min_length=1, max_length=100)]
+    node: Annotated[str, msgspec.Meta(max_length=256)] = ""
+    category: Category
+    resource: Annotated[str, msgspec.Meta(min_length=1, max_length=256)]
+    text: Annotated[str, msgspec.Meta(max_length=1 << 20)] | None = None

@@ -1,0 +1,134 @@
+"""Limit the bytes of audit records that each host causes over time, and more strictly on a nearly full disk. No I/O.
+
+Each record is charged to its host, and the debt shrinks by `RATE` bytes a second. Only the calls of a host above its
+quota (`AUDIT_BYTES`) wait. While only the reserve of the disk is left (`AUDIT_RESERVE`), quotas and rates are smaller,
+and the last part of the reserve is kept for the robot and for hosts that the policy names. After a restart no host
+has a registration, so registrations do not matter. Unknown hosts are not charged: their denials are folded.
+
+Use this module from one thread only; `folded`, `summarised` and `room` may be called from any thread.
+"""
+
+import dataclasses
+from collections import deque
+from collections.abc import Callable
+
+from appliance.audit.log.record import AuditRecord
+from appliance.base import clock
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
+from appliance.quotas.table import AUDIT_BYTES, AUDIT_RESERVE
+
+RATE = 64 << 10
+"""The bytes by which a host's debt shrinks per second; divided by `_SCARCE` on a nearly full disk."""
+
+_SCARCE = 8
+_RECORD_BYTES = 400  # on disk, with its entries in the indices
+_BYTES_PER_CHARACTER = 2  # the text, and its entry in the full-text index
+_PAID_EVERY_SECONDS = 0.1
+_LONGEST_PAUSE_SECONDS = 1.0
+
+
+def weight(record: AuditRecord) -> int:
+    """Return the approximate size of a record on disk."""
+    size = len(record.caller_id or "") + len(record.resource or "") + len(record.reason)
+    for value in record.detail.values():
+        size += len(value if type(value) is str else str(value))
+    return _RECORD_BYTES + _BYTES_PER_CHARACTER * size
+
+
+class Budget:
+    """The debts of hosts. `quota_class` returns the class of a host; `clock` returns monotonic seconds.
+
+    `reserve` has the bounds that apply while only the reserve of the disk is left. `kept_for` returns whether the last
+    part of the reserve is kept for a host.
+    """
+
+    def __init__(
+        self,
+        quota_class: Callable[[str], QuotaClass],
+        *,
+        bounds: Bounds = AUDIT_BYTES.bounds,
+        reserve: Bounds = AUDIT_RESERVE.bounds,
+        kept_for: Callable[[str], bool] = lambda _host: False,
+        clock: Callable[[], float] = clock.now,
+    ) -> None:
+        self.quota_class = quota_class
+        self._plenty, self._scarce = (
+            bounds,
+            dataclasses.replace(bounds, host=reserve.host, unknown=reserve.host),
+        )
+        self._kept, self._kept_for = reserve.kept, kept_for
+        self._clock = clock
+        self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, quota_class)
+        self._paid = clock()
+        self._changes: deque[tuple[str, int]] = deque()
+        self._left: int | None = None
+
+    def charge(self, record: AuditRecord) -> None:
+        """Charge a record to its host; `folded` undoes the charge."""
+        if record.host is not None and not record.unknown:
+            self.owed.charge(record.host, weight(record))
+
+    def folded(self, record: AuditRecord) -> None:
+        """Undo the charge for a record that was only counted."""
+        if record.host is not None and not record.unknown:
+            self._changes.append((record.host, -weight(record)))
+
+    def summarised(self, record: AuditRecord) -> None:
+        """Charge a summary of counted records."""
+        if record.host is not None and not record.unknown:
+            self._changes.append((record.host, weight(record)))
+
+    def room(self, left: int | None) -> None:
+        """Set how many bytes of the reserve are left; None: more than the reserve is free."""
+        self._left = left
+
+    def shut_out(self, host: str) -> str:
+        """Return why a nearly full disk blocks this host; empty if it does not."""
+        left = self._left
+        if left is None or left >= self._kept or self._kept_for(host):
+            return ""
+        return (
+            f"the disk of the audit log has {left} bytes left, which are kept for the robot and for hosts that the"
+            " policy names"
+        )
+
+    def owing(self, host: str) -> str:
+        """Return why calls of this host must wait; empty if they may proceed."""
+        if self._left is None and not self._changes and self._is_usual(host):
+            return ""
+        self._pay()
+        self.owed.bounds = self._plenty if self._left is None else self._scarce
+        return self.owed.refusal(host, 0)
+
+    def pause(self, host: str) -> float:
+        """Return the seconds until calls of this host are checked again; 0 if they may proceed."""
+        if not self.owing(host):
+            return 0.0
+        over = (self.owed.held(host) - self.owed.bounds.host) / self._pace
+        return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over))
+
+    def _is_usual(self, host: str) -> bool:
+        """Whether this host may proceed without `_pay`: it has no debt, or all debts are small and just updated."""
+        if not self.owed.held(host):
+            return True
+        return self.owed.total <= self._plenty.host and self._clock() - self._paid < _PAID_EVERY_SECONDS
+
+    @property
+    def _pace(self) -> int:
+        return RATE if self._left is None else RATE // _SCARCE
+
+    def _pay(self) -> None:
+        while self._changes:
+            host, change = self._changes.popleft()
+            if change > 0:
+                self.owed.charge(host, change)
+            else:
+                self._lower(host, -change)
+        now = self._clock()
+        if now - self._paid >= _PAID_EVERY_SECONDS:
+            paid, self._paid = int((now - self._paid) * self._pace), now
+            for host, _owed in list(self.owed.holders()):
+                self._lower(host, paid)
+
+    def _lower(self, host: str, amount: int) -> None:
+        self.owed.give_back(host, min(amount, self.owed.held(host)))

@@ -1,0 +1,158 @@
+"""Convert records to columns of the database and back.
+
+SQLite and JSON cannot store lone surrogates (undecodable bytes), integers beyond 64 bits, or arbitrary objects. These
+are escaped, limited, or stored as their `repr`. A text longer than `LONGEST_TEXT` characters is cut and marked with its
+length. If the details exceed `LARGEST_DETAIL` bytes, only the smallest are stored, with the names of the others.
+"""
+
+from typing import Any
+
+import msgspec
+
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.record import SCHEMA_VERSION, AuditRecord, RuleReference, Severity
+
+LARGEST_DETAIL = 65_536
+LONGEST_TEXT = 4_096
+_DEEPEST = 16
+_MOST_ITEMS = 256
+_MOST_KEYS = 128
+_LARGEST_INTEGER = (1 << 63) - 1
+_NONE = type(None)
+_KINDS: tuple[tuple[type, ...], ...] = (
+    (int,), (str,), (int,), (int,), (str,), (str,), (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE),
+    (str, _NONE), (str, _NONE), (str, _NONE), (str, _NONE), (int, _NONE), (int, _NONE), (str,), (int, _NONE),
+    (bytes,),
+)  # fmt: skip
+# The hash covers this text; an export and its verification must write it again, from dicts instead of structs.
+_encoder = msgspec.json.Encoder(order="sorted")
+_decode_detail = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+def to_columns(record: AuditRecord, sequence: int) -> StoredColumns:
+    """Return the columns of a record with this sequence. Never fails, whatever the record contains."""
+    try:
+        columns = _columns(record, sequence)
+        if (
+            isinstance(record.detail, dict)
+            and len(columns.detail) <= LARGEST_DETAIL
+            and all(map(_storable, columns, _KINDS))
+        ):
+            return columns
+    except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
+        pass
+    return _columns(plain_record(record), sequence)
+
+
+def _columns(record: AuditRecord, sequence: int) -> StoredColumns:
+    rule = record.rule
+    section, key, file, line = (None,) * 4 if rule is None else (rule.section, rule.key, rule.file, rule.line)
+    return StoredColumns(
+        sequence, record.id, record.time, SCHEMA_VERSION, record.event, record.severity.value,
+        record.decision, record.host, record.caller_id, record.category, record.resource,
+        section, key, file, line, record.revision, record.reason, record.duration_us,
+        _encoder.encode(record.detail),
+    )  # fmt: skip
+
+
+def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
+    kind = type(value)
+    if kind is str:
+        short = len(value) <= LONGEST_TEXT and kind in kinds
+        return short and (value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value))
+    return kind in kinds and (kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER)
+
+
+def from_columns(columns: StoredColumns) -> AuditRecord:
+    """Return the stored record."""
+    rule = None
+    if columns.rule is not None:
+        rule = RuleReference(
+            columns.rule, columns.rule_key or "", columns.rule_file or "", columns.rule_line or 0
+        )
+    return AuditRecord(
+        id=columns.id, time=columns.time, event=columns.event, severity=Severity(columns.severity),
+        decision=columns.decision, host=columns.host, caller_id=columns.caller_id, category=columns.category,
+        resource=columns.resource, rule=rule, revision=columns.revision, reason=columns.reason,
+        duration_us=columns.duration_us, detail=_decode_detail(columns.detail),
+    )  # fmt: skip
+
+
+def plain_record(record: AuditRecord) -> AuditRecord:
+    """Return the record with all values converted to a storable form."""
+    rule = record.rule
+    if rule is not None:
+        rule = RuleReference(_text(rule.section), _text(rule.key), _text(rule.file), _integer(rule.line) or 0)
+    detail = _plain(record.detail)
+    if not isinstance(detail, dict):
+        detail = {"value": detail}
+    if len(_encoder.encode(detail)) > LARGEST_DETAIL:
+        detail = _shortened(detail)
+    return AuditRecord(
+        id=_text(record.id), time=_integer(record.time) or 0, event=_text(record.event),
+        severity=record.severity if isinstance(record.severity, Severity) else Severity.NOTICE,
+        decision=_optional(record.decision), host=_optional(record.host),
+        caller_id=_optional(record.caller_id), category=_optional(record.category),
+        resource=_optional(record.resource), rule=rule, revision=_integer(record.revision),
+        reason=_text(record.reason), duration_us=_integer(record.duration_us), detail=detail,
+        unknown=record.unknown, folds=record.folds,
+    )  # fmt: skip
+
+
+def _shortened(detail: dict[str, Any]) -> dict[str, Any]:
+    """Return the smallest details, and the names of the omitted ones."""
+    sizes = {key: len(_encoder.encode({key: value})) for key, value in detail.items()}
+    kept, room = {}, LARGEST_DETAIL // 4
+    for key in sorted(sizes, key=sizes.__getitem__):
+        room -= sizes[key]
+        if room >= 0:
+            kept[key] = detail[key]
+    left_out = [key[:64] for key in detail if key not in kept]
+    return {**kept, "cut": "the details were too large to keep", "keys": left_out[:_MOST_KEYS]}
+
+
+def _optional(value: object) -> str | None:
+    return None if value is None else _text(value)
+
+
+def _integer(value: object) -> int | None:
+    if not isinstance(value, int):
+        return None
+    return max(-_LARGEST_INTEGER, min(int(value), _LARGEST_INTEGER))
+
+
+def _plain(value: Any, depth: int = 0) -> Any:
+    if value is None or isinstance(value, bool | float):
+        plain: Any = value
+    elif isinstance(value, int):
+        plain = value if abs(value) <= _LARGEST_INTEGER else _text(hex(value))
+    elif isinstance(value, str):
+        plain = _text(value)
+    elif isinstance(value, bytes | bytearray):
+        plain = _text(bytes(value[:LONGEST_TEXT]).decode("ascii", "backslashreplace"))
+    elif depth >= _DEEPEST:
+        plain = "(nested too deeply)"
+    elif isinstance(value, dict):
+        plain = _plain_dict(value, depth)
+    elif isinstance(value, list | tuple | set | frozenset):
+        plain = [_plain(item, depth + 1) for item in list(value)[:_MOST_ITEMS]]
+        if len(value) > len(plain):
+            plain.append(f"... {len(value) - len(plain)} more")
+    else:
+        plain = _text(repr(value))
+    return plain
+
+
+def _plain_dict(value: dict[Any, Any], depth: int) -> dict[str, Any]:
+    pairs = list(value.items())[:_MOST_ITEMS]
+    plain = {_text(key): _plain(item, depth + 1) for key, item in pairs}
+    if len(value) > len(pairs):
+        plain["..."] = f"{len(value) - len(pairs)} more"
+    return plain
+
+
+def _text(value: object) -> str:
+    value = value if type(value) is str else str(value)
+    if len(value) > LONGEST_TEXT:
+        value = f"{value[: LONGEST_TEXT - 64]}... ({len(value)} characters)"
+    return value.encode("utf-8", "backslashreplace").decode()

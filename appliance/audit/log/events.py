@@ -1,0 +1,192 @@
+"""Define the stable names of all events, for the documentation and for search filters.
+
+A name is never renamed and never reused for another event. A new name is added here, with its description, before it
+is recorded.
+"""
+
+from appliance.audit.log.record import Severity
+
+EVENTS: dict[str, str] = {
+    "decision": "A request was decided by the policy (allow, deny, would deny).",
+    "registered": "A node registered a publication, subscription, service or parameter subscription.",
+    "unregistered": "A node withdrew a registration.",
+    "revoked": "A registration, grant or connection was revoked because the policy no longer allows it.",
+    "node lost": "A node no longer answers; its registrations are suspended until it returns or is removed.",
+    "node returned": "A lost node answers again.",
+    "replaced": "A node registered again under its name from the same host; the earlier node got a shutdown call.",
+    "takeover": "A node registered under a name that another host holds.",
+    "policy loaded": "A policy came into force; `detail` has who loaded it, its source, and the hash of its text.",
+    "policy confirmed": "A policy that was loaded with commit-confirm was confirmed and stays in force.",
+    "policy refused": "A new policy has errors and was rejected as a whole; the previous policy stays in force.",
+    "policy file refused": "The appliance started, and the policy's file has errors or fails its tests; the revision"
+    " that was in force before stays in force.",
+    "host enrolled": "A host got a certificate and its virtual address; `detail` has both and who requested it.",
+    "host renewed": "A host got a new certificate; its previous certificate was revoked.",
+    "host authority replaced": "The authority of hosts has another key (`rosrv host authority rotate`, or its files"
+    " were removed): certificates of the earlier one are not accepted.",
+    "host revoked": "A host was excluded: its certificate is revoked, its tunnel closed, its registrations removed.",
+    "certificate ends soon": "The certificate of an enrolled host expires within days and was not renewed.",
+    "certificate ended": "The certificate of an enrolled host has expired; the host can no longer connect.",
+    "host blocked": "An operator blocked a host: all its requests are denied; `detail` has who, `until`, the note, and"
+    " what ended.",
+    "host unblocked": "An operator lifted the block of a host; `detail` has who.",
+    "host block ended": "The time of a host's block was over; the host is decided by the policy again.",
+    "alarm acknowledged": "An operator takes care of an alarm; `resource` is its kind, `detail` has who and the note.",
+    "alarm silenced": "An operator made an alarm a notice for a time; `detail` has who, `until` and the note.",
+    "alarm sounds again": "An operator ended the silence or the acknowledgement of an alarm.",
+    "host awaited": "A one-time token was made; the host that presents it is enrolled under this name.",
+    "host awaited no longer": "A one-time token for enrolment was revoked before it was used.",
+    "hosts reloaded": "The file of declared hosts was read again; `detail` has the tunnels that were opened and"
+    " closed.",
+    "enrolment refused": "An enrolment was rejected; `host` is the real address.",
+    "renewal refused": "A host's request for a new certificate was rejected.",
+    "ports checked": "A check of a machine's ROS ports from outside was reported; `detail` has the result and who"
+    " reported it.",
+    "topics moved": "Topics or services moved to another relay process; `detail` has their names and their monitors.",
+    "tunnel up": "The tunnel of an enrolled host is up; `host` is its virtual address, `detail` has the real one.",
+    "tunnel moved": "An open tunnel now comes from another real address; `detail` has both addresses.",
+    "tunnel down": "The tunnel of an enrolled host is down; no packets of the host are accepted until it is up again.",
+    "tunnel refused": "A tunnel was refused; `host` is the real address, `reason` says why.",
+    "packets refused": "Packets of tunnels were dropped: replayed, or with the address of another host (user-space ESP"
+    " only).",
+    "specifications confirmed": "Specifications that were loaded with commit-confirm were confirmed and stay in force.",
+    "specifications loaded": "Specifications of monitors came into force; `detail` has who loaded them, the changed"
+    " files, and the hashes of all files and of the compiled modules that relays run.",
+    "specifications refused": "Specifications have errors and were rejected as a whole; the previous ones stay in"
+    " force.",
+    "monitor not built": "The file of a monitor has an error at the start, for example after an upgrade. The appliance"
+    " starts without the monitor, which holds its topics unless it is declared `begin`. If the topics of the file are"
+    " not known (`resource` is the file), nothing holds them.",
+    "monitor enabled": "A monitor was enabled; `detail` has who enabled it.",
+    "monitor disabled": "A monitor was disabled: its topics' messages pass unchanged; `detail` has who disabled it,"
+    " and `until` if it is enabled again automatically.",
+    "monitor in shadow mode": "A monitor gets copies of messages and has no effect; `detail` has who ordered it.",
+    "shadow observed": "A monitor in shadow mode would have acted: `detail.would` is drop, change, verdict, fault, log"
+    " or publish, or `missed` for a message that it did not get.",
+    "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
+    "monitors restarted": "A relay process was restarted: its monitors are in their initial state, and some hold their"
+    " topics.",
+    "topics held": "A monitor's state was lost, so it holds its topics until an operator resumes it.",
+    "monitor verdict": "A property of a monitor reached a category that has a handler; `detail` has the logic and the"
+    " category, the `binding` for parametric specifications, the location `at`, the events `why` that alone give the"
+    " verdict, and the `conditions` with the values that they compared.",
+    "message dropped": "A monitor dropped a message; the first in each second is recorded in full, the others as"
+    " `detail.count` with `first_time` and `last_time` (nanoseconds since the epoch). `at` is the location of the"
+    " statement that dropped it, `conditions` the conditions that led there, each with the values that it compared;"
+    " `handler` is the verdict whose handler ran, with its `why`.",
+    "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
+    " that changed it, in order, and `monitor` the monitor of the last event. A record with `count` has `changed_by`"
+    " if several monitors changed the message.",
+    "monitor fault": "An action of a monitor failed; `detail` has file, line, values and `conditions`.",
+    "monitor log": "A monitor logged a line; the first in each second is recorded in full, and further ones that differ"
+    " only in numbers as `detail.count`, with `first_time`, `last_time` (nanoseconds since the epoch), `first_text` and"
+    " `last_text` of those. The reason has the last line.",
+    "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
+    " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
+    "publication refused": "A publisher or service uses another type definition than the specifications; it is not"
+    " relayed.",
+    "recording ordered": "A recording was ordered; `detail` has who ordered it, and the seconds before and after.",
+    "recording closed": "The flight recorder finished a recording; `detail` has its sha256 and its triggers.",
+    "recording fetched": "The messages of a recording were fetched; `detail` has who fetched them.",
+    "recording read": "Messages of a recording were read, decoded; `detail` has who read them, and the topics.",
+    "recording removed": "A recording was removed; `detail.who` has who removed it: `recorder` if it was removed for"
+    " space or age.",
+    "recording missed": "A trigger made no recording: `reason` says why (limit of recordings per hour, or disk space);"
+    " `detail.recording` is the id that the trigger's record had promised.",
+    "topic looked into": "Messages of a topic were shown; `detail` has who requested them, and the `seconds` that the"
+    " record covers.",
+    "rest call": "A REST call was answered; `detail` has the token's name in `who`, the method and the status.",
+    "rest certificate replaced": "REST has another certificate, because the earlier one ended soon or lacked a name;"
+    " `detail` has the SHA-256 of both. Clients that trust exactly the earlier one refuse it.",
+    "evidence exported": "An evidence bundle was made; `detail` has who requested it, the hash of its manifest and its"
+    " time span.",
+    "order refused": "RVMaster rejected an order over REST: no valid token, role or proof; `detail.verb` is the order.",
+    "token added": "An access token for REST was made; `detail` has its name, role, id and expiry.",
+    "token revoked": "An access token for REST was revoked before its expiry.",
+    "token rotated": "An access token for REST replaced the earlier ones of its name; `detail` has its name, role, id"
+    " and expiry, the ids of the `earlier` ones, and their end in `earlier_until`.",
+    "switchover ordered": "An operator ordered the active appliance to hand over to the standby; `detail` has who.",
+    "switchover failed": "An ordered switchover did not happen; `reason` says why, `detail` has who ordered it.",
+    "process started": "A process of the appliance started.",
+    "process died": "A process of the appliance ended unexpectedly.",
+    "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
+    " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
+    "appliance started": "The appliance is in service.",
+    "appliance stopped": "The appliance was shut down in an orderly way.",
+    "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
+    " checkpoint of the other appliance's log that was replicated (null: none), and the takeover before.",
+    "handed over": "This appliance of a pair handed over to the other one in an orderly way; it answers nothing after"
+    " this record until it takes over again.",
+    "malformed": "A peer sent an invalid request, or a publisher an invalid header; it was rejected for the `reason`"
+    " given.",
+    "connection opened": "A subscriber or service client is connected through the relay.",
+    "connection closed": "A connection through the relay ended.",
+    "connection refused": "A connection had no grant or a wrong header, or a publisher refused the appliance's"
+    " connection.",
+    "limit exceeded": "A peer sent more data, larger messages or faster than the limits allow.",
+    "rate limited": "Messages beyond a limit of the policy ([Limits]) were dropped; `rule` has the limit,"
+    " `detail.count` the number of messages.",
+    "probe failed": "The hidden ROS master was reachable from outside; nodes are not served until it is hidden again.",
+    "probe passed": "The ROS master is hidden, or hidden again.",
+    "reconciled": "The reconcile loop found and repaired a difference between the wanted and the observed state.",
+    "denials folded": "Repetitions of a denial that is already recorded; `detail` has their number, the first and the"
+    " last.",
+    "repetitions folded": "Repetitions of an allowed read that is already recorded, and any repeated records of a host"
+    " beyond its quota; `detail` has their number, the first and the last.",
+    "log begun": "The first record of a new log; `detail.earlier_log_missing` is set if an earlier log existed.",
+    "records removed": "Retention removed old records; `detail` has which, why, and the hash of the last one.",
+    "records lost": "The queue was full while the log could not be written; `detail` has the number of lost records.",
+    "checkpoint": "The state of the chain up to the preceding record was sealed for signing.",
+    "signature refused": "The signer rejected a checkpoint, or its signature is invalid or by another key.",
+    "bundle in force": "A bundle of the fleet passed its trial and is in force; `detail.bundle` names it.",
+    "bundle refused": "A bundle of the fleet was refused, or rolled back after its trial; `detail.findings` has the"
+    " reasons. The last good one stays in force.",
+    "bundle metadata rejected": "The collector serves bundles or metadata that are not accepted: badly signed, expired,"
+    " older than known, or for other robots.",
+    "fleet not joined": "After a takeover, this appliance of a pair is not in the other one's fleet: both must join.",
+    "forwarding failed": "The receiver of the forwarded log was unreachable for ten seconds; records wait in the"
+    " appliance.",
+    "forwarding resumed": "The receiver of the forwarded log is reachable again.",
+    "forwarding gap": "Retention removed records before they were forwarded; `detail` has their number.",
+    "disk nearly full": "Only the reserve (`audit.reserve_bytes`) is free on the log's disk; `reason` says what to do.",
+    "disk has room": "More than the reserve is free on the log's disk again.",
+    "clock not synchronised": "No time service synchronises the machine's clock; the times of records may be wrong.",
+    "clock synchronised": "A time service synchronises the machine's clock again.",
+    "clock set forward": "The machine's clock advanced further than the time that passed; `detail` has by how many"
+    " seconds.",
+    "clock set back": "The machine's clock is earlier than the last record; `detail` has by how many seconds.",
+    "protection forgotten": "A monitor is disabled or in shadow mode, or a section of the policy audit-only, for"
+    " longer than `forgotten_after`; `resource` names it, `reason` says how to enable it again.",
+    "log failed": "The log could not be written for some time and is written again; `reason` says why.",
+}
+
+SEVERITIES: dict[str, Severity] = {
+    name: severity
+    for severity, names in {
+        Severity.NOTICE: (
+            "host block ended", "host unblocked",
+            "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
+            "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
+            "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
+            "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
+            "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
+            "tunnel down", "tunnel moved", "tunnel up", "probe passed",
+        ),
+        Severity.WARNING: (
+            "bundle metadata rejected", "bundle refused",
+            "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
+            "forwarding failed", "host authority replaced",
+            "host blocked", "host revoked", "limit exceeded", "malformed", "packets refused",
+            "policy refused", "recording missed", "renewal refused", "rest certificate replaced",
+            "specifications refused", "switchover failed",
+            "tunnel refused",
+        ),
+        Severity.ALARM: (
+            "fleet not joined", "forwarding gap", "monitor not built", "monitors restarted", "policy file refused",
+            "probe failed", "process failing", "protection forgotten", "publication refused", "records lost",
+            "topics held",
+        ),
+    }.items()
+    for name in names
+}  # fmt: skip
+"""The severity of each event for which it is fixed. For other events, the recording code gives it; default: INFO."""

@@ -1,0 +1,429 @@
+"""Write the audit log: `record` puts a record into a queue, and a turn of the log writes it.
+
+1. `record` never blocks and never raises: it only appends to a queue.
+2. Records keep their order.
+3. No record is dropped silently. While the log cannot be written (`failed`), up to `queue_limit` records wait. Further
+   records are only counted, and the count is recorded later.
+4. `wait_durable` returns when all earlier records are on disk (fsync), or returns why they are not. Folded denials are
+   on disk as a count.
+"""
+
+import asyncio
+import contextlib
+import os
+import sqlite3
+import threading
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+import structlog
+
+from appliance.audit.log.budget import Budget
+from appliance.audit.log.disk_space import DiskSpace
+from appliance.audit.log.folding import FoldSettings, RecordFolder
+from appliance.audit.log.housekeeping import WRITE_ERRORS, CheckpointSchedule, Housekeeping
+from appliance.audit.log.ids import IdSource
+from appliance.audit.log.lock_holders import holders
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.log_writer import ChainWriter
+from appliance.audit.log.record import AuditRecord, Severity
+from appliance.audit.log.removal import Remover
+from appliance.audit.log.repetition import summary
+from appliance.audit.log.retention import Retention
+from appliance.audit.log.signatures import RemovalSigner, Signatures, Signer
+from appliance.audit.log.waiters import Waiter, answer
+from appliance.base.clock import now, wall_ns
+from appliance.base.engine_thread import Drive, EngineThread
+from appliance.quotas.pool import QuotaClass
+from appliance.quotas.table import AUDIT_RESERVE
+
+Durability = Literal["strict", "batched"]
+_GATHER_SECONDS = 0.02
+_RETRY_SECONDS = 0.5
+_LARGEST_BATCH = 2048
+_IDLE_SECONDS = 1.0
+_CLOSE_SECONDS = 10.0
+_logger = structlog.get_logger()
+
+
+class Lag(NamedTuple):
+    """The number of waiting records, and the seconds since the queue was last empty."""
+
+    records: int
+    seconds: float
+
+
+class _LossCounter:
+    """A counter of records that did not fit into the queue; thread-safe."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._first = self._last = 0
+        self._lock = threading.Lock()
+
+    def add(self, record: AuditRecord) -> None:
+        with self._lock:
+            self._first = self._first if self.count else record.time
+            self._last = record.time
+            self.count += 1
+
+    def take(self) -> dict[str, Any]:
+        with self._lock:
+            detail = {"count": self.count, "first_time": self._first, "last_time": self._last}
+            self.count = 0
+            return detail
+
+
+class AuditLog:
+    """The log at `path`, open for writing; `drive` makes the driver that calls its turns, in one thread.
+
+    `durability`: `strict` writes at once (group commit), `batched` after 20 ms; both fsync. A checkpoint is made every
+    `checkpoint_every` records or `checkpoint_seconds`. A turn of the log then calls `signer(number, text)`, and the
+    owner answers with `signed` or `refused`. Likewise, `removals(number, checkpoint, newest)` requests the signature of
+    a removal; the answer is `removal_approved` or `removal_refused`. `held_by` is called with the ids of processes that
+    lock the log. `budget` has the debts of hosts; its bounds are smaller while less than `reserve` bytes are free.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        durability: Durability = "batched",
+        checkpoint_every: int = 1000,
+        checkpoint_seconds: float = 60.0,
+        fold: FoldSettings | None = None,
+        signer: Signer | None = None,
+        removals: RemovalSigner | None = None,
+        retention: Retention | None = None,
+        budget: Budget | None = None,
+        reserve: int = AUDIT_RESERVE.bounds.whole,
+        queue_limit: int = 100_000,
+        held_by: Callable[[list[int]], None] = lambda processes: None,  # noqa: ARG005  the default ignores them
+        clock: Callable[[], int] = wall_ns,
+        drive: Drive = EngineThread,
+    ) -> None:
+        self.path = path
+        self.ids = IdSource(clock=clock)
+        self.strict = durability == "strict"
+        self._clock = clock
+        self._now = now()  # the time of the present turn
+        self._queue_limit = queue_limit
+        self._held_by = held_by
+        self.budget = budget or Budget(lambda _host: QuotaClass.NAMED)
+        self._room = DiskSpace(path, reserve, self.budget.room)
+        self._folder = RecordFolder(fold or FoldSettings(), self.ids.next, clock)
+        self._signatures = Signatures(path, signer)
+        self._queue: deque[AuditRecord | Waiter | Callable[[], None]] = deque()
+        self._held: list[AuditRecord] = []
+        self.housekeeping = Housekeeping(
+            path,
+            self._signatures,
+            CheckpointSchedule(checkpoint_every, checkpoint_seconds),
+            Remover(
+                retention or Retention(),
+                self._signatures,
+                removals,
+                clock=clock,
+                now=lambda: self._now,
+                report=lambda reason, detail: self._own("records removed", Severity.NOTICE, reason, detail),
+            ),
+            clock=clock,
+            now=lambda: self._now,
+            make=self._own,
+            hold=self._held.append,
+        )
+        self._waiting: list[Waiter] = []
+        self._writer: ChainWriter | None = None
+        self._failed: str | None = "the log is being opened"
+        self._failed_since = 0
+        self._caught_up = self._written_at = self._retry_at = self._now
+        self._lost = _LossCounter()
+        self._begun = self._closing = self._ended = False
+        self._counts_recovered = False
+        self._continued: tuple[str, int] | None = None
+        self._unwritten: str | None = None
+        self._driver = drive("audit log", self.turn, 0.0 if self.strict else _GATHER_SECONDS)
+
+    # --- for the owner, from any thread ---------------------------------------------------------------------
+
+    def record(self, record: AuditRecord) -> str:
+        """Queue a record; return its id, the id of the record that it repeats, or "" if a collective kind counts it.
+
+        The caller must not change `detail` afterwards.
+        """
+        if self._is_full:
+            self._lost.add(record)
+            return record.id
+        self.budget.charge(record)
+        found_by = self._folder.in_full(record)
+        self._put(record)
+        return found_by
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self._queue) + len(self._held) >= self._queue_limit
+
+    async def wait_durable(self) -> str | None:
+        """Wait until all records so far are on disk; return None, or the reason why they cannot be written."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str | None] = loop.create_future()
+        self._put(Waiter(loop, future))
+        self._driver.hurry()
+        return await future
+
+    async def wait_signed(self) -> str | None:
+        """Wait until a signed checkpoint seals all records so far; return None, or why its signature is refused."""
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[str | None] = loop.create_future()
+        self._put(partial(self.housekeeping.seal_now, Waiter(loop, future)))
+        self._driver.hurry()
+        return await future
+
+    @property
+    def failed(self) -> str | None:
+        """Return why the log cannot be written now, or None."""
+        return self._failed
+
+    @property
+    def degraded(self) -> str | None:
+        """Return why checkpoints, index or retention are behind, or that the disk is nearly full; None otherwise."""
+        return self.housekeeping.degraded or self._room.scarce
+
+    @property
+    def lag(self) -> Lag:
+        """Return how far writing to the disk is behind."""
+        waiting = len(self._queue) + len(self._held)
+        return Lag(waiting, now() - self._caught_up if waiting else 0.0)
+
+    def signed(self, number: int, signature: bytes, public_key: bytes) -> None:
+        """Store the signer's signature if it is valid and made with the pinned key; otherwise record it as refused."""
+        keep = partial(self.housekeeping.keep_signature, number, signature, public_key)
+        self._put(partial(self.housekeeping.attempt, keep))
+
+    def refused(self, number: int, reason: str) -> None:
+        """Record as an alarm that the signer refused a checkpoint."""
+        self._put(partial(self.housekeeping.refused, number, reason))
+
+    def removal_approved(self, number: int, text: bytes, signature: bytes, public_key: bytes) -> None:
+        """Remove the records up to a checkpoint, if the signer's signature of that removal is valid."""
+        remove = partial(self.housekeeping.removal_approved, number, text, signature, public_key)
+        self._put(partial(self.housekeeping.attempt, remove))
+
+    def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
+        """Request the removal again later, because the signer refused it (`early`: the records are too young)."""
+        self._put(partial(self.housekeeping.remover.refused, number, reason, early=early))
+
+    def request_signatures(self) -> None:
+        """Request all missing signatures, because the signer is in service (again)."""
+        self._put(partial(self.housekeeping.attempt, self.housekeeping.ask_signatures))
+        self._put(self.housekeeping.remover.ask_again)
+
+    def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
+        """Write waiting records, make a last checkpoint and close; return the reason for a failure or timeout."""
+        self._closing = True
+        if not self._driver.end(seconds):
+            return f"{self.path}: still being written after {seconds:g} s"
+        return self._unwritten
+
+    def _put(self, item: AuditRecord | Waiter | Callable[[], None]) -> None:
+        self._queue.append(item)
+        self._driver.wake()
+        if self._ended:
+            self._refuse_queued()
+
+    # --- the turns ------------------------------------------------------------------------------------------
+
+    def turn(self, now: float) -> float | None:
+        """Write a batch of the queue and do what is due at `now`; return the time of the next turn, None at the end."""
+        if self._ended:
+            return None
+        self._now = now
+        if now < self._retry_at and not self._closing:
+            return self._retry_at
+        due = None
+        try:
+            due = self._turn(now)
+        except BaseException as error:
+            # A defect: the owner must see that records are no longer written, and deny requests.
+            self._unwritten = self._failed = f"{self.path}: writing ended: {type(error).__name__}: {error}"
+            raise
+        finally:
+            if due is None:
+                self._failed = self._failed or f"{self.path}: the log is closed"
+                self._ended = True
+                self._answer_waiting()
+                self._refuse_queued()
+        return due
+
+    def _refuse_queued(self) -> None:
+        with contextlib.suppress(IndexError):
+            while True:
+                item = self._queue.popleft()
+                if isinstance(item, Waiter):
+                    answer([item], self._failed)
+
+    def _turn(self, now: float) -> float | None:
+        if not self._begun:
+            self._begun = True
+            return now if self._attempt(self._open) else self._pause(now)
+        closing = self._closing  # the queue has everything that was recorded before
+        more = self._drain(now)
+        for due in self._folder.expire(now):
+            self._held.append(due)
+            self.budget.summarised(due)
+        self._look_for_room(now)
+        written = self._attempt(self._write)
+        self._answer_waiting()
+        self.housekeeping.after_batch(written=written)
+        if more and written:
+            return now
+        self.housekeeping.at_rest(quiet_since=self._written_at, busy=lambda: bool(self._queue))
+        if closing:
+            self._finish()
+            return None
+        if self._failed is not None:
+            return self._pause(now)
+        if not self._queue:
+            self._caught_up = now
+        dues = (now + _IDLE_SECONDS, self._folder.next_due(), self.housekeeping.next_due(now))
+        return max(now + 0.001, min(due for due in dues if due is not None))
+
+    def _pause(self, now: float) -> float:
+        self._retry_at = now + _RETRY_SECONDS
+        return self._retry_at
+
+    def _finish(self) -> None:
+        self._held.extend(self._folder.finish())
+        self.housekeeping.unsealed += len(self._held)
+        if self._attempt(self._write) and self.housekeeping.unsealed:
+            self.housekeeping.attempt(self.housekeeping.seal)
+        self._answer_waiting()
+        self._unwritten = self._failed
+        if self._writer is not None:
+            self._writer.close()
+
+    def _drain(self, now: float) -> bool:
+        """Process a batch of queued items; return whether more are left."""
+        queue, offer = self._queue, self._folder.offer
+        for _ in range(_LARGEST_BATCH):
+            if not queue:
+                return False
+            item = queue.popleft()
+            if isinstance(item, AuditRecord):
+                written = list(offer(item, now))
+                self._held.extend(written)
+                if not written or written[-1] is not item:
+                    self.budget.folded(item)
+            elif isinstance(item, Waiter):
+                self._waiting.append(item)
+            else:
+                item()
+        return bool(queue)
+
+    def _look_for_room(self, now: float) -> None:
+        with contextlib.suppress(OSError):  # the writer reports a missing folder
+            scarce = self._room.look(now)
+            if scarce is not None:
+                severity, left = (Severity.ALARM if scarce else Severity.NOTICE), self._room.left
+                event = "disk nearly full" if scarce else "disk has room"
+                _logger.warning(event, left=left, reason=self._room.scarce)
+                self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
+
+    def _attempt(self, action: Callable[[], None]) -> bool:
+        """Run an action on the database; return whether it succeeded. A failure closes the database until a retry."""
+        try:
+            if self._writer is None and action != self._open:
+                self._open()
+            action()
+        except WRITE_ERRORS as error:
+            self._fail(error)
+            return False
+        return True
+
+    def _fail(self, error: Exception) -> None:
+        reason = str(error)
+        if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
+            # This process is in the list because its own connection is still open.
+            others = [pid for pid in holders(self.path) if pid != os.getpid()]
+            if others:
+                reason = f"{reason} by process {', '.join(map(str, others))}"
+                self._held_by(others)
+        self._failed = reason if str(self.path) in reason else f"{self.path}: {reason}"
+        if self._failed_since == 0:
+            self._failed_since = self._clock()
+            _logger.error("the audit log cannot be written", reason=self._failed)
+        if self._writer is not None:
+            writer, self._writer, self.housekeeping.writer = self._writer, None, None
+            with contextlib.suppress(sqlite3.Error):
+                writer.close()
+
+    def _open(self) -> None:
+        earlier = self._signatures.key_was_pinned
+        writer = ChainWriter(self.path, self._clock(), self._continued)
+        self.ids.raise_floor(writer.last_id)
+        self._writer = writer
+        if writer.created:
+            detail = {"log": writer.log_id, "earlier_log_missing": earlier}
+            self._held.insert(
+                0, self._own("log begun", Severity.ALARM if earlier else Severity.NOTICE, "", detail)
+            )
+        # Recover counts only once: afterwards the table has the counts of this process.
+        left = [] if self._counts_recovered else writer.open_folds()
+        if left:
+            writer.close_folds(
+                [summary(fold, self.ids.next(), self._clock(), recovered=True) for fold in left]
+            )
+        self._counts_recovered = True
+        self._continued = (writer.log_id, writer.sequence)
+        if not self._failed_since:
+            self._failed = None
+        self.housekeeping.opened(writer)
+
+    def _write(self) -> None:
+        writer = self._writer
+        if writer is None:
+            raise LogUnreadableError(self._failed or "the log is not open")
+        while self._held or self._folder.touched or self._failed_since:
+            batch = self._held[:_LARGEST_BATCH]
+            touched = tuple(self._folder.touched)
+            report = self._report_of_failure()
+            writer.append(
+                batch + report, [(msgspec.json.encode(key), self._folder.state(key)) for key in touched]
+            )
+            self._continued = (writer.log_id, writer.sequence)
+            del self._held[: len(batch)]
+            self._folder.touched.difference_update(touched)
+            self.housekeeping.unsealed += len(batch) + len(report)
+            self._caught_up = self._written_at = self._now
+            if self._failed_since:
+                _logger.warning("the audit log is written again")
+            self._failed, self._failed_since = None, 0
+            if self._lost.count:
+                self._held.append(
+                    self._own("records lost", Severity.ALARM, "the queue was full", self._lost.take())
+                )
+
+    def _report_of_failure(self) -> list[AuditRecord]:
+        if not self._failed_since:
+            return []
+        detail = {"since": self._failed_since, "until": self._clock()}
+        return [self._own("log failed", Severity.ALARM, self._failed or "", detail)]
+
+    def _answer_waiting(self) -> None:
+        result = self._failed if self._held or self._folder.touched else None
+        waiting, self._waiting = self._waiting, []
+        answer(waiting, result)
+
+    def _own(self, event: str, severity: Severity, reason: str, detail: dict[str, Any]) -> AuditRecord:
+        return AuditRecord(
+            id=self.ids.next(),
+            time=self._clock(),
+            event=event,
+            severity=severity,
+            reason=reason,
+            detail=detail,
+        )

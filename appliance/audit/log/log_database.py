@@ -1,0 +1,166 @@
+"""Create the log's database file, and open it for writing or reading.
+
+A new log is made under a temporary name and linked when complete. An empty, cut or foreign file is therefore never an
+unfinished log: it is reported as an error and left unchanged.
+"""
+
+import os
+import secrets
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from urllib.parse import quote
+
+from appliance.audit.log.chain import StoredColumns
+from appliance.base.atomic_files import name_to_make
+
+APPLICATION_ID = 0x52565541  # "RVUA"
+LAYOUT_VERSION = 2
+_EARLIER = 1  # version 0.1.0: same tables, different hashes
+_BUSY_SECONDS = 5.0
+
+TABLES = (
+    "CREATE TABLE log (id TEXT NOT NULL, begun INTEGER NOT NULL) STRICT",
+    "CREATE TABLE record (sequence INTEGER PRIMARY KEY, id TEXT NOT NULL, time INTEGER NOT NULL,"
+    " version INTEGER NOT NULL, event TEXT NOT NULL, severity TEXT NOT NULL, decision TEXT, host TEXT,"
+    " caller_id TEXT, category TEXT, resource TEXT, rule TEXT, rule_key TEXT, rule_file TEXT,"
+    " rule_line INTEGER, revision INTEGER, reason TEXT NOT NULL, duration_us INTEGER, detail BLOB NOT NULL,"
+    " hash BLOB NOT NULL) STRICT",
+    "CREATE TABLE checkpoint (number INTEGER PRIMARY KEY, sequence INTEGER NOT NULL, text BLOB NOT NULL,"
+    " signature BLOB, public_key BLOB) STRICT",
+    "CREATE TABLE open_fold (key BLOB PRIMARY KEY, state BLOB NOT NULL) STRICT",
+    "CREATE TABLE indexed (through INTEGER NOT NULL) STRICT",
+    "CREATE VIRTUAL TABLE words USING fts5(text, tokenize='trigram', content='', detail=none, columnsize=0)",
+    "CREATE INDEX record_id ON record (id)",
+    "CREATE INDEX record_time ON record (time)",
+    "CREATE INDEX record_event ON record (event)",
+    "CREATE INDEX record_severity ON record (severity)",
+    "CREATE INDEX record_decision ON record (decision) WHERE decision IS NOT NULL",
+    "CREATE INDEX record_host ON record (host) WHERE host IS NOT NULL",
+    "CREATE INDEX record_caller_id ON record (caller_id) WHERE caller_id IS NOT NULL",
+    "CREATE INDEX record_category ON record (category) WHERE category IS NOT NULL",
+    "CREATE INDEX record_resource ON record (resource) WHERE resource IS NOT NULL",
+    "CREATE INDEX record_rule ON record (rule, rule_key) WHERE rule IS NOT NULL",
+    "CREATE INDEX checkpoint_unsigned ON checkpoint (number) WHERE signature IS NULL",
+)
+
+COLUMNS = ", ".join(StoredColumns._fields)
+TEXT_OF_RECORD = (
+    "coalesce(host, '') || ' ' || coalesce(caller_id, '') || ' ' || coalesce(resource, '') || ' ' ||"
+    " coalesce(rule, '') || ' ' || reason || ' ' || CAST(detail AS TEXT)"
+)
+
+
+class LogUnreadableError(Exception):
+    """A log file is missing, damaged or foreign; the message has the remedy."""
+
+
+def create(path: Path, begun: int) -> None:
+    """Create an empty log at `path`, readable by the group of its folder; `begun` is nanoseconds since the epoch."""
+    making = name_to_make(path)
+    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
+    os.fchmod(descriptor, 0o640)
+    os.close(descriptor)
+    try:
+        connection = sqlite3.connect(making, isolation_level=None)
+        try:
+            connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {LAYOUT_VERSION}")
+            connection.execute("BEGIN")
+            for statement in TABLES:
+                connection.execute(statement)
+            connection.execute("INSERT INTO log VALUES (?, ?)", (secrets.token_hex(16), begun))
+            connection.execute("INSERT INTO indexed VALUES (0)")
+            connection.execute("COMMIT")
+        finally:
+            connection.close()
+        # Unlike rename(), link() does not replace a log that another process has created.
+        os.link(making, path)
+    finally:
+        making.unlink()
+
+
+def open_for_writing(path: Path) -> sqlite3.Connection:
+    """Open an existing log for its writer. Raises `LogUnreadableError` and `sqlite3.Error`."""
+    connection = sqlite3.connect(
+        _uri(path, "rw"),
+        uri=True,
+        isolation_level=None,
+        timeout=_BUSY_SECONDS,
+        check_same_thread=False,
+        cached_statements=128,  # an INSERT for each number of rows up to 64, and others
+    )
+    return _checked(connection, path, _prepare_writing)
+
+
+def _prepare_writing(connection: sqlite3.Connection) -> None:
+    mode = connection.execute("PRAGMA journal_mode = WAL").fetchone()[0]
+    if mode != "wal":
+        raise sqlite3.OperationalError(f"the file system has no write-ahead log (journal mode is {mode})")
+    connection.execute("PRAGMA synchronous = FULL")
+    if connection.execute("PRAGMA user_version").fetchone()[0] != LAYOUT_VERSION:
+        connection.execute(f"PRAGMA user_version = {LAYOUT_VERSION}")
+    connection.execute("PRAGMA journal_size_limit = 67108864")
+    connection.execute("PRAGMA temp_store = MEMORY")
+    connection.execute("PRAGMA cache_size = -16384")
+
+
+def open_for_reading(path: Path) -> sqlite3.Connection:
+    """Open a log for reading, even while it is written. Raises `LogUnreadableError` and `sqlite3.Error`."""
+    if not path.parent.is_dir():
+        raise LogUnreadableError(f"{path.parent}: no such directory; is the state directory right (--state)?")
+    try:
+        if not path.exists():
+            raise LogUnreadableError(
+                f"{path}: there is no audit log yet; is the state directory right (--state)?"
+            )
+    except PermissionError as error:
+        raise LogUnreadableError(f"{path}: {error.strerror}; run as root or as the log's owner") from error
+    if not os.access(path, os.R_OK):
+        raise LogUnreadableError(f"{path}: permission denied; run as root or as the log's owner")
+    mode = "ro"
+    if not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-shm").exists():
+        mode = "ro&immutable=1"  # a copy on a read-only medium does not change
+    connection = sqlite3.connect(_uri(path, mode), uri=True, isolation_level=None, timeout=_BUSY_SECONDS,
+                                 check_same_thread=False)  # fmt: skip
+    return _checked(connection, path, lambda _: None)
+
+
+@contextmanager
+def reading(path: Path, advice: str = "; run 'rosrv audit verify'") -> Iterator[sqlite3.Connection]:
+    """Open a log for reading in a `with` block. Raises `LogUnreadableError`, also for SQLite's errors in the block."""
+    try:
+        with closing(open_for_reading(path)) as connection:
+            yield connection
+    except sqlite3.Error as error:
+        raise LogUnreadableError(f"{path}: cannot be read: {error}{advice}") from error
+
+
+def _uri(path: Path, mode: str) -> str:
+    return f"file:{quote(str(path.absolute()))}?mode={mode}"
+
+
+def _checked(
+    connection: sqlite3.Connection, path: Path, prepare: Callable[[sqlite3.Connection], object]
+) -> sqlite3.Connection:
+    try:
+        kind = connection.execute("PRAGMA application_id").fetchone()[0]
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+        if kind != APPLICATION_ID:
+            raise LogUnreadableError(
+                f"{path}: not an audit log, or one that was cut; see 'rosrv audit verify'"
+            )
+        if version not in (_EARLIER, LAYOUT_VERSION):
+            raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
+        prepare(connection)
+    except sqlite3.DatabaseError as error:
+        connection.close()
+        if isinstance(error, sqlite3.OperationalError):
+            raise
+        raise LogUnreadableError(f"{path}: damaged: {error}; keep it as evidence and move it away") from error
+    except BaseException:
+        connection.close()
+        raise
+    return connection

@@ -1,0 +1,339 @@
+"""Append records to the database and extend the chain, on one thread of one process.
+
+1. The head (sequence and hash) changes only after the commit that wrote it.
+2. There is one writer: it holds a lock on `<log>.lock`.
+3. If the file is removed or replaced, writing stops with an error.
+"""
+
+import contextlib
+import fcntl
+import functools
+import os
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from appliance.audit.log import log_database
+from appliance.audit.log.chain import StoredColumns, follows, genesis, record_hash
+from appliance.audit.log.columns import to_columns
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.repetition import FoldState
+from appliance.audit.log.retention import as_kept
+from appliance.signing.signed_statements import NO_CHECKPOINT, Checkpoint, checkpoint_hash, parse_checkpoint
+
+# Rows of one INSERT. Each statement releases the GIL and takes it again. This may take 5 ms (the switch interval) while
+# an event loop is busy. With one row per statement, only 200 rows a second could be written.
+_ROWS_PER_INSERT = 64
+_WIDTH = len(StoredColumns._fields) + 1
+_ROW = "(" + ", ".join("?" * _WIDTH) + ")"
+_CHECKED_AT_OPENING = 256
+_REPLACED = (
+    "the log was removed or replaced while it was written; put it back, or stop the appliance and move what is"
+    " there away to begin a new log"
+)
+_TEXT_ROWS = 256
+
+
+@functools.cache
+def _insert(rows: int) -> str:
+    return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
+
+
+_AHEAD_STEPS = 20  # the most steps of checkpoints that are skipped because the clock was ahead
+
+
+class RemovedRange(NamedTuple):
+    """The records that retention removes, and the hashes after which chain and checkpoints continue."""
+
+    first_sequence: int
+    last_sequence: int
+    last_hash: str
+    first_time: int
+    last_time: int
+    last_checkpoint: int
+    last_checkpoint_hash: str
+
+
+class ChainWriter:
+    """The open database of a log and the head of its chain."""
+
+    def __init__(self, path: Path, begun: int, continued: tuple[str, int] | None = None) -> None:
+        """Open the log at `path`; create a missing one unless a log is `continued` (its id and last sequence).
+
+        Raises `LogUnreadableError`, `sqlite3.Error` or `OSError`.
+        """
+        self.path = path
+        self._lock = _take_lock(path)
+        try:
+            self.created = continued is None and not path.exists()
+            if continued is not None and not path.exists():
+                raise LogUnreadableError(f"{path}: {_REPLACED}")
+            if self.created:
+                log_database.create(path, begun)
+            self._connection = log_database.open_for_writing(path)
+            try:
+                self._file = _identity(path)
+                self._read_head()
+                if continued is not None and (self.log_id != continued[0] or self.sequence < continued[1]):
+                    raise LogUnreadableError(f"{path}: {_REPLACED}")
+            except BaseException:
+                self._connection.close()
+                raise
+        except BaseException:
+            self._let_go()
+            raise
+
+    def _read_head(self) -> None:
+        execute = self._connection.execute
+        (self.log_id,) = execute("SELECT id FROM log").fetchone()
+        rows = execute(
+            f"SELECT {log_database.COLUMNS}, hash FROM record ORDER BY sequence DESC LIMIT ?",  # noqa: S608  fixed names
+            (_CHECKED_AT_OPENING,),
+        ).fetchall()
+        rows.reverse()
+        self.sequence, self.hash, self.last_id = 0, genesis(self.log_id), ""
+        for number, row in enumerate(rows):
+            known = number > 0 or row[0] == 1  # the hash before this record is known
+            if known and (row[0] != self.sequence + 1 or not follows(self.hash, row[:-1], row[-1])):
+                raise LogUnreadableError(
+                    f"{self.path}: record {row[0]} does not fit the chain, so the log was changed; run"
+                    " 'rosrv audit verify', keep the file as evidence and move it away to begin a new log"
+                )
+            self.sequence, self.hash = row[0], row[-1]
+            self.last_id = max(self.last_id, row[1])
+        last = execute(
+            "SELECT number, sequence, text FROM checkpoint ORDER BY number DESC LIMIT 1"
+        ).fetchone()
+        self._text_through = int(execute("SELECT through FROM indexed").fetchone()[0])
+        self.checkpoint_number, self.checkpoint_sequence, self._checkpoint_hash = 0, 0, NO_CHECKPOINT
+        if last is not None:
+            self.checkpoint_number, self.checkpoint_sequence = last[0], last[1]
+            self._checkpoint_hash = checkpoint_hash(last[2])
+
+    def append(
+        self, records: Sequence[AuditRecord], folds: Iterable[tuple[bytes, FoldState | None]] = ()
+    ) -> None:
+        """Write records and the counts of folded records to disk in one transaction."""
+        self._check_file()
+        with self._transaction() as execute:
+            sequence, digest, last_id = self._insert(records)
+            for key, state in folds:
+                if state is None:
+                    execute("DELETE FROM open_fold WHERE key = ?", (key,))
+                else:
+                    execute(
+                        "INSERT OR REPLACE INTO open_fold VALUES (?, ?)", (key, msgspec.json.encode(state))
+                    )
+        self.sequence, self.hash, self.last_id = sequence, digest, last_id
+
+    def _insert(self, records: Sequence[AuditRecord]) -> tuple[int, bytes, str]:
+        sequence, digest, last_id = self.sequence, self.hash, self.last_id
+        for start in range(0, len(records), _ROWS_PER_INSERT):
+            part, values = records[start : start + _ROWS_PER_INSERT], list[object]()
+            for record in part:
+                sequence += 1
+                columns = to_columns(record, sequence)
+                digest = record_hash(digest, columns)
+                values += columns
+                values.append(digest)
+                last_id = max(last_id, columns.id)
+            self._connection.execute(_insert(len(part)), values)
+        return sequence, digest, last_id
+
+    def seal(self, time: int) -> tuple[Checkpoint, bytes]:
+        """Make the next checkpoint, of all records written so far; return it and its text."""
+        checkpoint = Checkpoint(
+            self.log_id,
+            self.checkpoint_number + 1,
+            self.sequence,
+            self.hash.hex(),
+            time,
+            self._checkpoint_hash,
+            self._first_sequence() - 1,
+        )
+        text = checkpoint.text()
+        self._check_file()
+        self._connection.execute(
+            "INSERT INTO checkpoint (number, sequence, text) VALUES (?, ?, ?)",
+            (checkpoint.number, checkpoint.sequence, text),
+        )
+        self.checkpoint_number, self.checkpoint_sequence = checkpoint.number, checkpoint.sequence
+        self._checkpoint_hash = checkpoint_hash(text)
+        return checkpoint, text
+
+    def unsigned(self, limit: int) -> list[tuple[int, bytes]]:
+        """Return number and text of at most `limit` unsigned checkpoints, oldest first."""
+        query = "SELECT number, text FROM checkpoint WHERE signature IS NULL ORDER BY number LIMIT ?"
+        return self._connection.execute(query, (limit,)).fetchall()
+
+    def checkpoint_text(self, number: int) -> bytes | None:
+        """Return the text of a checkpoint, or None."""
+        row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
+        return None if row is None else bytes(row[0])
+
+    def keep_signature(self, number: int, signature: bytes, public_key: bytes) -> None:
+        """Store a checkpoint's signature, unless it already has one."""
+        self._connection.execute(
+            "UPDATE checkpoint SET signature = ?, public_key = ? WHERE number = ? AND signature IS NULL",
+            (signature, public_key, number),
+        )
+
+    def open_folds(self) -> list[FoldState]:
+        """Return the counts that a crash left without a summary."""
+        rows = self._connection.execute("SELECT state FROM open_fold").fetchall()
+        return [msgspec.json.decode(state, type=FoldState) for (state,) in rows]
+
+    def close_folds(self, summaries: Sequence[AuditRecord]) -> None:
+        """Replace the counts of `open_folds` by their summaries."""
+        keys = [key for (key,) in self._connection.execute("SELECT key FROM open_fold")]
+        self.append(summaries, [(key, None) for key in keys])
+
+    @property
+    def text_lag(self) -> int:
+        """Return the number of records that are not in the full-text index yet; every text search reads them all."""
+        return int(self.sequence - self._text_through)
+
+    def index_text(self, rows: int = _TEXT_ROWS) -> bool:
+        """Add some records to the full-text index; return whether more are left."""
+        through = self._text_through
+        if through >= self.sequence:
+            return False
+        self._check_file()
+        end = min(through + rows, self.sequence)
+        with self._transaction() as execute:
+            execute(
+                f"INSERT INTO words (rowid, text) SELECT sequence, {log_database.TEXT_OF_RECORD} FROM record"  # noqa: S608  fixed names
+                " WHERE sequence > ? AND sequence <= ?",
+                (through, end),
+            )
+            execute("UPDATE indexed SET through = ?", (end,))
+        self._text_through = end
+        return bool(end < self.sequence)
+
+    def size(self) -> int:
+        """Return the bytes of the database that are in use."""
+        (pages,) = self._connection.execute("PRAGMA page_count").fetchone()
+        (free,) = self._connection.execute("PRAGMA freelist_count").fetchone()
+        (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
+        return int((pages - free) * page_size)
+
+    def removable(
+        self, step: int, *, signed: bool, between: tuple[int, int] | None = None
+    ) -> RemovedRange | None:
+        """Return the range of about `step` oldest records that ends at a (signed) checkpoint, or None.
+
+        `between` is an age limit and the present time; the range then ends at a checkpoint made before the limit.
+        Checkpoints with a later time than the present, made while the clock was ahead, are removed with the following
+        ones. The last checkpoint always stays.
+        """
+        first = self._first_sequence()
+        condition = "AND signature IS NOT NULL" if signed else ""
+        rows = self._connection.execute(
+            "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"  # noqa: S608  fixed text
+            f" number < (SELECT max(number) FROM checkpoint) {condition} ORDER BY number LIMIT ?",
+            (first, step * _AHEAD_STEPS),
+        )
+        upto: tuple[int, int, bytes] | None = None
+        for row in rows:
+            made = parse_checkpoint(row[2]).time
+            if between is not None and made > between[1]:
+                continue
+            too_young = between is not None and made >= between[0]
+            if too_young or (upto is not None and row[1] >= first + step):
+                break
+            upto = row
+        return None if upto is None else self._range(first, *upto)
+
+    def _range(self, first: int, number: int, last: int, text: bytes) -> RemovedRange:
+        query = "SELECT time, hash FROM record WHERE sequence = ?"
+        first_time, _hash = self._connection.execute(query, (first,)).fetchone()
+        last_time, last_hash = self._connection.execute(query, (last,)).fetchone()
+        return RemovedRange(
+            first, last, last_hash.hex(), first_time, last_time, number, checkpoint_hash(text)
+        )
+
+    def _first_sequence(self) -> int:
+        query = "SELECT coalesce(min(sequence), ?) FROM record"
+        return int(self._connection.execute(query, (self.sequence + 1,)).fetchone()[0])
+
+    def newest_signed(self) -> bytes:
+        """Return the text of the last signed checkpoint; empty if there is none."""
+        query = "SELECT text FROM checkpoint WHERE signature IS NOT NULL ORDER BY number DESC LIMIT 1"
+        row = self._connection.execute(query).fetchone()
+        return b"" if row is None else bytes(row[0])
+
+    def evidence(self, gone: RemovedRange) -> list[AuditRecord]:
+        """Return the denials and alarms among the records to remove, each with its position in `detail.kept`."""
+        rows = self._connection.execute(
+            f"SELECT {log_database.COLUMNS}, hash FROM record WHERE sequence <= ? AND"  # noqa: S608  fixed names
+            " (decision = 'deny' OR severity = 'alarm') ORDER BY sequence",
+            (gone.last_sequence,),
+        )
+        return [as_kept(StoredColumns(*row[:-1]), row[-1]) for row in rows]
+
+    def remove(self, gone: RemovedRange, report: AuditRecord, kept: Sequence[AuditRecord] = ()) -> None:
+        """In one transaction, remove records and their checkpoints, and append the report and the kept records."""
+        self._check_file()
+        with self._transaction() as execute:
+            sequence, digest, last_id = self._insert([report, *kept])
+            (through,) = execute("SELECT through FROM indexed").fetchone()
+            execute(
+                f"INSERT INTO words (words, rowid, text) SELECT 'delete', sequence, {log_database.TEXT_OF_RECORD}"  # noqa: S608  fixed names
+                " FROM record WHERE sequence <= ?",
+                (min(gone.last_sequence, through),),
+            )
+            execute("UPDATE indexed SET through = max(through, ?)", (gone.last_sequence,))
+            execute("DELETE FROM record WHERE sequence <= ?", (gone.last_sequence,))
+            execute("DELETE FROM checkpoint WHERE number <= ?", (gone.last_checkpoint,))
+        self.sequence, self.hash, self.last_id = sequence, digest, last_id
+        self._text_through = max(through, gone.last_sequence)
+        self._connection.execute("PRAGMA incremental_vacuum(256)").fetchall()
+
+    def _check_file(self) -> None:
+        if _identity(self.path) != self._file:
+            raise LogUnreadableError(f"{self.path}: {_REPLACED}")
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[Callable[..., sqlite3.Cursor]]:
+        execute = self._connection.execute
+        execute("BEGIN IMMEDIATE")
+        try:
+            yield execute
+            execute("COMMIT")
+        except BaseException:
+            if self._connection.in_transaction:
+                execute("ROLLBACK")
+            raise
+
+    def close(self) -> None:
+        """Close the database and release the lock."""
+        try:
+            self._connection.close()
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
+        os.close(self._lock)
+        self._lock = -1
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _take_lock(path: Path) -> int:
+    lock = os.open(path.with_name(path.name + ".lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(lock)
+        raise LogUnreadableError(f"{path}: another process writes this log") from error
+    return lock

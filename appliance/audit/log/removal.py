@@ -1,0 +1,137 @@
+"""Remove old records step by step. If the log has a signer, the signer must sign each step first.
+
+Every removal is recorded in the same transaction. Records of a signed log are removed only with the signer's signature
+over exactly these records. A refused removal is tried again later (`unremoved` gives the reason).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from appliance.audit.log.log_writer import ChainWriter, RemovedRange
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.retention import Retention, worth_keeping
+from appliance.audit.log.signatures import RemovalSigner, Signatures
+from appliance.signing.signed_statements import Removal, limit_of_removal
+
+_AT_ONCE = 512
+_LOOK_SECONDS = 5.0
+_AGE_SECONDS = 3600.0
+_ANSWER_SECONDS = 30.0
+_REFUSED_SECONDS = 600.0
+
+
+class _Wanted(NamedTuple):
+    """A step that waits for the signer."""
+
+    gone: RemovedRange
+    reason: str
+    by_size: bool
+
+
+class Remover:
+    """Applies a log's retention, in its turns; `approve` requests a signature, `report` makes the record.
+
+    `now` returns the time of the present turn.
+    """
+
+    def __init__(
+        self,
+        retention: Retention,
+        signatures: Signatures,
+        approve: RemovalSigner | None,
+        *,
+        clock: Callable[[], int],
+        now: Callable[[], float],
+        report: Callable[[str, dict[str, object]], AuditRecord],
+    ) -> None:
+        self._retention = retention
+        self._signatures = signatures
+        self._approve = approve
+        self._clock = clock
+        self._now = now
+        self._report = report
+        self._wanted: _Wanted | None = None
+        self._asked = self._aged = self._refused = 0.0
+        self.due = 0.0
+        self.unremoved: str | None = None
+
+    def step(self, writer: ChainWriter) -> bool:
+        """Remove one step of records, or request the signature for it; return whether records were removed."""
+        now = self._now()
+        self.due = now + _LOOK_SECONDS
+        if now < self._refused or (self._wanted is not None and now - self._asked < _ANSWER_SECONDS):
+            return False
+        wanted = self._find(writer, now)
+        if wanted is None:
+            return False
+        if not self._signatures.has_signer:
+            self._remove(writer, wanted, {})
+            return True
+        if self._approve is None:
+            self.unremoved = "old records are not removed: nobody signs their removal"
+            return False
+        checkpoint = writer.checkpoint_text(wanted.gone.last_checkpoint)
+        if checkpoint is not None:
+            self._wanted, self._asked = wanted, now
+            self._approve(wanted.gone.last_checkpoint, checkpoint, writer.newest_signed())
+        return False
+
+    def ask_again(self) -> None:
+        """Forget earlier requests, which may be lost, because the signer is in service (again)."""
+        self._wanted, self._aged, self._refused, self.due = None, 0.0, 0.0, 0.0
+
+    def sealed(self) -> None:
+        """Search for old records again: after a new checkpoint, the previous one may be removed."""
+        self._aged = self.due = 0.0
+
+    def approved(self, writer: ChainWriter, number: int, text: bytes, signature: bytes, key: bytes) -> bool:
+        """Remove the records if the signer signed exactly the requested removal; return whether they were removed."""
+        wanted, self._wanted = self._wanted, None
+        if wanted is None or wanted.gone.last_checkpoint != number:
+            return False
+        what = f"the removal up to checkpoint {number}"
+        wrong = self._signatures.wrong(what, text, signature, key)
+        gone = wanted.gone
+        limit = "" if wrong is not None else limit_of_removal(text)
+        expected = Removal(
+            writer.log_id, number, gone.last_sequence, gone.last_hash, gone.last_checkpoint_hash, limit
+        )
+        if wrong is not None or expected.text() != text:
+            self.unremoved = f"old records are not removed: {wrong or f'{what} is not what was signed'}"
+            return False
+        self._remove(writer, wanted, {"limit": limit, "signature": signature.hex(), "key": key.hex()})
+        return True
+
+    def refused(self, number: int, reason: str, *, early: bool = False) -> None:
+        """Try again later. `early`: by the signer's clock, the records are not old enough yet, which is normal."""
+        wanted = self._wanted
+        if wanted is not None and wanted.gone.last_checkpoint == number:
+            self._wanted = None
+            self._refused = self._now() + _REFUSED_SECONDS
+            waits = early and not wanted.by_size
+            self.unremoved = None if waits else f"old records are not removed: the signer refuses: {reason}"
+
+    def _find(self, writer: ChainWriter, now: float) -> _Wanted | None:
+        signed = self._signatures.has_signer
+        reason = self._retention.excess(writer.size())
+        if reason is not None:
+            gone = writer.removable(_AT_ONCE, signed=signed)
+            return None if gone is None else _Wanted(gone, reason, by_size=True)
+        if self._retention.days is None or now < self._aged:
+            return None
+        present = self._clock()
+        gone = writer.removable(
+            _AT_ONCE, signed=signed, between=(self._retention.oldest_kept(present), present)
+        )
+        if gone is None or gone.last_sequence > self._retention.collected():
+            self._aged = now + _AGE_SECONDS
+            return None
+        return _Wanted(gone, f"older than {self._retention.days} days", by_size=False)
+
+    def _remove(self, writer: ChainWriter, wanted: _Wanted, proof: dict[str, object]) -> None:
+        gone = wanted.gone
+        count = gone.last_sequence - gone.first_sequence + 1
+        kept = worth_keeping(writer.evidence(gone), count) if wanted.by_size else []
+        detail = gone._asdict() | {"count": count, "kept": len(kept)} | proof
+        writer.remove(gone, self._report(wanted.reason, detail), kept)
+        self.due, self.unremoved = 0.0, None

@@ -1,0 +1,167 @@
+"""Define the kinds of folded records: the key that repetitions share, and the summary of a kind.
+
+Texts from peers cannot create an unlimited number of kinds:
+
+1. The key of a named host's kind has event, decision, rule, request, and reason. The reason of a decision is our own
+   text. From a peer's error only the plain words are used, because the peer chooses numbers, names and quotations.
+2. The key of an unknown host's kind has address, event, decision, call, and the plain words of the reason.
+3. Above the quota there is one kind per host, and one for all unknown hosts. These count the first few reasons, callers
+   and resources by name, and the rest together.
+"""
+
+from typing import Any
+
+import msgspec
+
+from appliance.audit.log.columns import plain_record
+from appliance.audit.log.record import AuditRecord, RuleReference, Severity
+
+Key = tuple[str | int | None, ...]
+KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
+"""The scopes of kinds; `ALL_UNKNOWN` and `ALL` cover many hosts."""
+
+_SCOPES_OF_0_1 = {"stranger": UNKNOWN, "strangers": ALL_UNKNOWN}
+
+OTHERS = "(others)"  # no ROS name or address has a bracket
+_NAMES = 8
+_LONGEST_NAME = 256
+_LONGEST_KEY = 1024
+ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics")
+"""The fields of `detail` that identify a request."""
+
+
+class FoldState(msgspec.Struct, kw_only=True):
+    """The counted repetitions of one kind; stored on disk to survive a crash."""
+
+    scope: str
+    event: str
+    severity: Severity
+    decision: str | None
+    host: str | None
+    caller_id: str | None
+    category: str | None
+    resource: str | None
+    rule: RuleReference | None
+    revision: int | None
+    reason: str
+    recorded_id: str
+    count: int = 0
+    first_id: str = ""
+    last_id: str = ""
+    first_time: int = 0
+    last_time: int = 0
+    about: dict[str, str] = {}
+    tallies: dict[str, dict[str, int]] = {}
+    folds: bool = False
+
+    def __post_init__(self) -> None:
+        self.scope = _SCOPES_OF_0_1.get(self.scope, self.scope)
+
+    def count_in(self, record: AuditRecord) -> None:
+        """Count a repetition."""
+        if not self.count:
+            self.first_id, self.first_time = record.id, record.time
+        number = repetitions(record.detail)
+        self.count += number
+        self.last_id, self.last_time = record.id, record.time
+        if self.scope != KIND:
+            named = {"hosts": record.host, "callers": record.caller_id, "resources": record.resource}
+            for what, name in (named | {"calls": record.detail.get("call")}).items():
+                self._tally(what, name, number)
+        if self.scope != KIND or record.reason != self.reason:
+            self._tally("reasons", record.reason, number)
+
+    def _tally(self, what: str, name: object, number: int) -> None:
+        if name:
+            counts = self.tallies.setdefault(what, {})
+            key = str(name)[:_LONGEST_NAME]
+            key = key if key in counts or len(counts) < _NAMES else OTHERS
+            counts[key] = counts.get(key, 0) + number
+
+    def reset(self) -> None:
+        """Start again at zero, after a summary."""
+        self.count = 0
+        self.tallies = {}
+
+
+def new_state(record: AuditRecord, scope: str) -> FoldState:
+    """Return the state of a kind that begins with this record."""
+    known = {name: record.detail.get(name) for name in ABOUT}
+    about = {name: str(value)[:_LONGEST_KEY] for name, value in known.items() if value is not None}
+    return FoldState(
+        scope=scope, event=record.event, severity=record.severity, decision=record.decision, host=record.host,
+        caller_id=record.caller_id, category=record.category, resource=record.resource, rule=record.rule,
+        revision=record.revision, reason=record.reason, recorded_id=record.id, about=about, folds=record.folds,
+    )  # fmt: skip
+
+
+def subject(record: AuditRecord) -> Key:
+    """Return the key of a request; a contrary decision with the same key ends a kind."""
+    about = tuple(str(record.detail.get(name)) for name in ABOUT)
+    return (record.host, record.caller_id, record.category, record.resource, *about)
+
+
+def kind_of(record: AuditRecord) -> Key:
+    """Return the key of the narrowest kind of a record."""
+    if record.unknown:
+        asked = (str(record.detail.get(name)) for name in ("call", "method", "status"))
+        return (UNKNOWN, record.host, record.event, record.decision, *asked, _plain_words(record.reason))
+    rule = record.rule
+    where: Key = () if rule is None else (rule.section, rule.key, rule.file, rule.line)
+    return (
+        *subject(record),
+        record.event,
+        record.decision,
+        record.revision,
+        record.reason if record.event == "decision" else _plain_words(record.reason),
+        *where,
+    )
+
+
+def _plain_words(reason: str) -> str:
+    return " ".join(word for word in reason[:_LONGEST_KEY].split() if word.isascii() and word.isalpha())
+
+
+def storable(record: AuditRecord) -> AuditRecord:
+    """Return the record, converted if its key and state would not be storable."""
+    rule = record.rule
+    texts = [record.host, record.caller_id, record.category, record.resource, record.reason, record.event]
+    texts += [str(record.detail[name]) for name in ABOUT if name in record.detail]
+    texts += [] if rule is None else [rule.section, rule.key, rule.file]
+    try:
+        for text in texts:
+            if text is not None and not text.isascii():
+                text.encode()
+    except UnicodeEncodeError:
+        return plain_record(record)
+    return record
+
+
+def summary(state: FoldState, record_id: str, time: int, *, recovered: bool = False) -> AuditRecord:
+    """Return the summary of the repetitions counted in `state`."""
+    detail: dict[str, Any] = {
+        "count": state.count, "of": state.event, "scope": state.scope, "recorded_id": state.recorded_id,
+        "first_id": state.first_id, "last_id": state.last_id,
+        "first_time": state.first_time, "last_time": state.last_time,
+    }  # fmt: skip
+    exact = state.scope == KIND
+    detail |= state.about if exact else {}
+    detail |= state.tallies
+    if recovered:
+        detail["recovered"] = True
+    passed = state.folds
+    what = "further record{} of a host beyond its share" if passed else "further denial{} of many kinds"
+    return AuditRecord(
+        id=record_id, time=time, event="repetitions folded" if passed else "denials folded", severity=state.severity,
+        decision=state.decision, host=None if state.scope in (ALL_UNKNOWN, ALL) else state.host,
+        caller_id=state.caller_id if exact else None, category=state.category if exact else None,
+        resource=state.resource if exact else None, rule=state.rule if exact else None, revision=state.revision,
+        reason=state.reason if exact else f"{state.count} {what.format('' if state.count == 1 else 's')}",
+        duration_us=None, detail=detail, unknown=state.scope in (UNKNOWN, ALL_UNKNOWN),
+    )  # fmt: skip
+
+
+def repetitions(detail: dict[str, Any]) -> int:
+    """Return `count` of a record's detail if it is a number of repetitions, else 1."""
+    count = detail.get("count")
+    return count if type(count) is int and count > 0 else 1

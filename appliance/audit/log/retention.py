@@ -1,0 +1,82 @@
+"""Choose which old records to remove, and which of these to write again. No I/O.
+
+The oldest records are removed first, in short steps, each up to a (signed) checkpoint. Every step is recorded as
+`records removed`, with the hash after which the chain continues.
+
+An age limit removes all older records. A size limit keeps denials and alarms longer: they are written again at the end
+of the log, with their id and time. At most half of a step is kept, so the log shrinks. Hosts take turns, so a flood
+from one host cannot displace the records of another.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import from_columns
+from appliance.audit.log.record import AuditRecord, Severity
+
+_UNKNOWN_HOSTS = "(unknown hosts)"
+_DAY = 86_400_000_000_000
+
+
+@dataclass(frozen=True)
+class Retention:
+    """The limits of a log: `days` for which records are kept (None: always), and `size` in bytes (None: any).
+
+    By age, only records up to the sequence `collected()` are removed.
+    """
+
+    days: float | None = None
+    size: int | None = None
+    collected: Callable[[], int] = lambda: 1 << 63
+
+    def __post_init__(self) -> None:
+        if (self.days is not None and self.days <= 0) or (self.size is not None and self.size < 1 << 20):
+            raise ValueError("retention needs more than 0 days and at least 1 MiB")
+
+    def excess(self, size: int) -> str | None:
+        """Return why a log of `size` bytes is too large, or None."""
+        too_large = self.size is not None and size > self.size
+        return f"the log was larger than {self.size} bytes" if too_large else None
+
+    def oldest_kept(self, now: int) -> int:
+        """Return the age limit in nanoseconds since the epoch; 0 without one."""
+        return 0 if self.days is None else now - int(self.days * _DAY)
+
+
+def as_kept(columns: StoredColumns, digest: bytes) -> AuditRecord:
+    """Return a record to write again, with its original sequence and hash in `detail.kept`."""
+    record = from_columns(columns)
+    if "kept" in record.detail:
+        return record
+    place = {"sequence": columns.sequence, "hash": digest.hex()}
+    return msgspec.structs.replace(record, detail=record.detail | {"kept": place})
+
+
+def worth_keeping(evidence: Sequence[AuditRecord], removed: int) -> list[AuditRecord]:
+    """Return the records of `evidence` to write again, in order, when `removed` records are removed.
+
+    Hosts take turns; all unknown hosts together count as one. For each host, alarms are chosen first, then denials,
+    then summaries, each oldest first.
+    """
+    waiting: OrderedDict[str, list[AuditRecord]] = OrderedDict()
+    for record in sorted(evidence, key=_rank):
+        # Version 0.1.0 wrote `stranger`.
+        who = _UNKNOWN_HOSTS if {"unknown_host", "stranger"} & record.detail.keys() else str(record.host)
+        waiting.setdefault(who, []).append(record)
+    chosen: set[str] = set()
+    while waiting and len(chosen) < removed // 2:
+        who, records = waiting.popitem(last=False)
+        chosen.add(records.pop(0).id)
+        if records:
+            waiting[who] = records
+    return [record for record in evidence if record.id in chosen]
+
+
+def _rank(record: AuditRecord) -> int:
+    if record.severity is Severity.ALARM:
+        return 0
+    return 2 if record.event == "denials folded" else 1

@@ -1,0 +1,133 @@
+"""Request signatures of checkpoints, and store the valid ones.
+
+1. A signature is stored only if it is valid for the checkpoint's text and made with the pinned key.
+2. The key of the first valid signature is pinned in `<log>.pub` (PEM); the program never replaces it.
+3. While the signer is not in service, checkpoints stay unsigned. Their signatures are requested later (`ask`), oldest
+   first, a limited number at a time.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
+
+from appliance.audit.log.log_writer import ChainWriter
+from appliance.base.atomic_files import write_whole
+from appliance.base.input_files import read_given
+
+Signer = Callable[[int, bytes], None]
+RemovalSigner = Callable[[int, bytes, bytes], None]
+ASKED_AT_ONCE = 64
+
+
+class KeyUnreadableError(Exception):
+    """A public key file is missing or is not an Ed25519 key in PEM."""
+
+
+def pinned_key_path(log: Path) -> Path:
+    """Return the path of a log's pinned public key."""
+    return log.with_name(log.stem + ".pub")
+
+
+def read_public_key(path: Path) -> bytes:
+    """Return the raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
+    try:
+        key = load_pem_public_key(read_given(path))
+    except OSError as error:
+        raise KeyUnreadableError(f"{path}: {error.strerror}") from error
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise KeyUnreadableError(f"{path}: not a public key in PEM: {error}") from error
+    if not isinstance(key, Ed25519PublicKey):
+        raise KeyUnreadableError(f"{path}: not an Ed25519 public key")
+    return key.public_bytes_raw()
+
+
+def signature_is_valid(public_key: bytes, signature: bytes, text: bytes) -> bool:
+    """Whether the private key of `public_key` signed `text`."""
+    try:
+        Ed25519PublicKey.from_public_bytes(public_key).verify(signature, text)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+class Signatures:
+    """The signatures of a log: requests to the signer, and its valid answers."""
+
+    def __init__(self, log: Path, signer: Signer | None) -> None:
+        self._pin = pinned_key_path(log)
+        self._signer = signer
+        self._asked: set[int] = set()
+        self._waiting = False
+
+    @property
+    def has_signer(self) -> bool:
+        """Whether checkpoints of this log are signed."""
+        return self._signer is not None
+
+    @property
+    def key_was_pinned(self) -> bool:
+        """Whether a log at this path was ever signed."""
+        return self._pin.exists()
+
+    def sealed(self, number: int, text: bytes) -> None:
+        """Request the signature of a new checkpoint, unless others must be requested first."""
+        # The signer signs in order: once a checkpoint waits, all later ones wait until `ask`.
+        self._waiting = self._waiting or len(self._asked) >= ASKED_AT_ONCE
+        if not self._waiting:
+            self._ask(number, text)
+
+    def ask(self, writer: ChainWriter) -> None:
+        """Request the oldest missing signatures again: the signer is in service, or an answer may be lost."""
+        self._asked.clear()
+        self._waiting = False
+        if self._signer is not None:
+            unsigned = writer.unsigned(ASKED_AT_ONCE)
+            self._waiting = len(unsigned) == ASKED_AT_ONCE
+            for number, text in unsigned:
+                self._ask(number, text)
+
+    def _ask(self, number: int, text: bytes) -> None:
+        if self._signer is None:
+            return
+        self._asked.add(number)
+        self._signer(number, text)
+
+    def keep(self, writer: ChainWriter, number: int, signature: bytes, public_key: bytes) -> str | None:
+        """Store a valid signature and pin the first key; return the reason if the signature is invalid."""
+        self._asked.discard(number)
+        text = writer.checkpoint_text(number)
+        if text is None:
+            return f"there is no checkpoint {number}"
+        wrong = self.wrong(f"checkpoint {number}", text, signature, public_key)
+        if wrong is not None:
+            return wrong
+        if not self._pin.exists():
+            write_public_key(self._pin, public_key)
+        writer.keep_signature(number, signature, public_key)
+        if not self._asked and self._waiting:
+            self.ask(writer)
+        return None
+
+    def wrong(self, what: str, text: bytes, signature: bytes, public_key: bytes) -> str | None:
+        """Return why a signature is invalid or not made with the pinned key, or None."""
+        if not signature_is_valid(public_key, signature, text):
+            return f"the signature of {what} is wrong"
+        if not self._pin.exists():
+            return None
+        try:
+            pinned = read_public_key(self._pin)
+        except KeyUnreadableError as error:
+            return str(error)
+        if pinned != public_key:
+            return f"{what} is signed with {public_key.hex()}, {self._pin} has {pinned.hex()}"
+        return None
+
+
+def write_public_key(path: Path, public_key: bytes) -> None:
+    """Write a raw Ed25519 public key to a PEM file, replacing an existing one. Raises `OSError`."""
+    key = Ed25519PublicKey.from_public_bytes(public_key)
+    text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+    write_whole(path, text, 0o644)

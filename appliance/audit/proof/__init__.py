@@ -1,0 +1,1 @@
+"""Prove and verify the audit log: checkpoints, copies, excerpts with proofs, segments."""

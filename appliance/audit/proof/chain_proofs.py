@@ -1,0 +1,145 @@
+"""Export records with their proofs: their position in the chain, up to a signed checkpoint.
+
+Each exported record contains the previous hash and its own hash. `then` lists the content hashes of the following
+records that the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record
+(`checkpoint`). `appliance/evidence` verifies this with the public key alone.
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from appliance.audit.log.chain import content_hash, genesis, link
+from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.record_format import LogEntry, as_json
+from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
+from appliance.signing.signed_statements import NO_CHECKPOINT
+
+_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class ChainProof(msgspec.Struct, frozen=True, kw_only=True):
+    """The position of a record in the chain; hashes are in hexadecimal.
+
+    `then` is None if version 0.1.0 wrote the following records, whose hashes cannot be computed without their content.
+    """
+
+    previous: _Hash
+    hash: _Hash
+    then: list[_Hash] | None
+    checkpoint: SignedCheckpoint | None = None
+
+
+def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[LogEntry, ChainProof]]:
+    """Yield the records that match `wanted` with their proofs, oldest first; one page is in memory at a time.
+
+    Raises `LogUnreadableError` and `FilterError`.
+    """
+    cursor: str | None = "0"
+    waiting: LogEntry | None = None
+    while cursor is not None:
+        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
+        if waiting is not None:
+            entries = [waiting, *entries]
+        last = cursor is None
+        yield from _placed(path, entries, whole=last)
+        waiting = entries[-1] if entries and not last else None
+
+
+def evidence_line(entry: LogEntry, chain: ChainProof) -> str:
+    """Return one line of NDJSON without the newline: the record, and `chain`."""
+    return f'{as_json(entry)[:-1]},"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
+
+
+def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:
+    """Yield records with their proofs. Omit the last record, unless these are the `whole` rest of the export."""
+    following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
+    with reading(path) as connection:
+        connection.execute("BEGIN")
+        places = ChainReader(connection)
+        placed = [
+            (entry, places.place(entry.sequence, after))
+            for entry, after in zip(entries, following, strict=False)
+        ]
+    for entry, chain in placed:
+        if chain is None:
+            raise LogUnreadableError(
+                f"{path}: retention removed record {entry.sequence} while it was exported: export again"
+            )
+        yield entry, chain
+
+
+class ChainReader:
+    """A reader of the proofs of records, in ascending order, from one snapshot of a log."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        (self._log,) = connection.execute("SELECT id FROM log").fetchone()
+        self._sealing: SignedCheckpoint | None = None
+        self._unsealed = False
+        self._before: tuple[int, str] = (-1, "")
+
+    def place(self, sequence: int, following: int) -> ChainProof | None:
+        """Return a record's proof up to the next exported record (`following`; 0: none); None for a removed record."""
+        query = "SELECT hash FROM record WHERE sequence = ?"
+        row = self._connection.execute(query, (sequence,)).fetchone()
+        if row is None:
+            return None
+        digest: bytes = row[0]
+        checkpoint = self._checkpoint(sequence)
+        ends = checkpoint if checkpoint and (not following or checkpoint.sequence < following) else None
+        upto = ends.sequence if ends else following - 1
+        previous = self._previous(sequence)
+        self._before = sequence, digest.hex()
+        return ChainProof(
+            previous=previous,
+            hash=digest.hex(),
+            then=self._contents(digest, sequence, upto) if upto > sequence else [],
+            checkpoint=ends,
+        )
+
+    def _previous(self, sequence: int) -> str:
+        if self._before[0] == sequence - 1:
+            return self._before[1]
+        query = "SELECT hash FROM record WHERE sequence = ?"
+        row = self._connection.execute(query, (sequence - 1,)).fetchone()
+        if row is not None:
+            return str(row[0].hex())
+        if sequence == 1:
+            return genesis(str(self._log)).hex()
+        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+        row = self._connection.execute(query).fetchone()
+        return str(msgspec.json.decode(row[0])["last_hash"]) if row is not None else NO_CHECKPOINT
+
+    def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
+        known = self._sealing
+        if self._unsealed or (known is not None and known.sequence >= sequence):
+            return None if self._unsealed else known
+        query = (
+            "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND sequence >= ?"
+            " AND signature IS NOT NULL AND public_key IS NOT NULL ORDER BY number LIMIT 1"
+        )
+        row = self._connection.execute(query, (known.number if known else 0, sequence)).fetchone()
+        self._unsealed = row is None
+        self._sealing = None if row is None else SignedCheckpoint.of(*row)
+        return self._sealing
+
+    def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:
+        """Return the content hashes of the records from `after` + 1 to `upto`; None if they do not form the chain."""
+        rows = self._connection.execute(
+            f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
+            (after, upto),
+        )
+        contents = []
+        for row in rows:
+            content = content_hash(row[:-1])
+            digest = link(digest, content)
+            if digest != row[-1]:
+                return None
+            contents.append(content.hex())
+        return contents

@@ -1,0 +1,306 @@
+"""Write and verify segments: the records between two consecutive signed checkpoints, as they leave the appliance.
+
+A segment is NDJSON in ASCII; each line ends with a newline. The first line is the header: the checkpoint before the
+records (`begin`) and the checkpoint that seals them (`end`), both with their signatures. At the beginning of a log,
+`begin` is null. If retention removed the checkpoint before, `begin` is null and `after` has the last removed record.
+Each further line is a record, exactly as `rosrv audit export` writes it without a filter. A segment never changes: its
+name is the SHA-256 of its bytes.
+
+Invariants:
+1. The records have consecutive sequences from the one after `begin` to that of `end`, and their chain leads from the
+   hash of `begin` to the hash of `end`. `end` follows `begin`. One key signed both. The hash in `after` is not signed,
+   but no other one leads to the signed hash of `end`.
+2. Each segment has exactly one valid spelling, so equal records have equal names.
+3. Reading and writing need the memory of one record.
+"""
+
+import hashlib
+import sqlite3
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Annotated, NamedTuple, Protocol
+
+import msgspec
+
+from appliance.audit.log.chain import StoredColumns, follows, genesis
+from appliance.audit.log.columns import from_columns, to_columns
+from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.log.record_format import LogEntry, entry_of
+from appliance.audit.log.signatures import signature_is_valid
+from appliance.audit.proof.chain_proofs import ChainProof, evidence_line
+from appliance.audit.proof.copies import SignedCheckpoint
+from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash
+
+LONGEST_LINE = 2 << 20  # bytes; details have at most 64 KiB, and escapes take twelve times as many
+_NOT_A_RECORD = (ValueError, KeyError, TypeError, RecursionError, OverflowError)
+
+
+class SegmentError(ValueError):
+    """A segment is invalid; the message has the line and the reason."""
+
+
+class RecordPlace(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The sequence of a record, and its hash in hexadecimal."""
+
+    sequence: Annotated[int, msgspec.Meta(ge=1)]
+    hash: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class SegmentHeader(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The first line of a segment: its version, and the checkpoints around its records."""
+
+    segment: int = 1
+    begin: SignedCheckpoint | None
+    after: RecordPlace | None = None
+    end: SignedCheckpoint
+
+    def line(self) -> bytes:
+        """Return the line, with its newline."""
+        return msgspec.json.encode(self) + b"\n"
+
+    def follows(self, other: "SegmentHeader") -> bool:
+        """Whether this segment continues `other`: the same log, and no record between them."""
+        before = (other.end.sequence, bytes.fromhex(other.end.hash))
+        return self.end.previous == checkpoint_hash(other.end.text()) and self.start == before
+
+    @property
+    def start(self) -> tuple[int, bytes]:
+        """Return the sequence and the hash that the first record follows."""
+        place = self.begin or self.after
+        return (0, genesis(self.end.log)) if place is None else (place.sequence, bytes.fromhex(place.hash))
+
+
+class SegmentSummary(NamedTuple):
+    """A segment: its name, its header, and the times of its earliest and latest record (nanoseconds; 0: no record)."""
+
+    name: str
+    header: SegmentHeader
+    first_time: int
+    last_time: int
+
+    @property
+    def first(self) -> int:
+        """Return the sequence of its first record."""
+        return self.header.start[0] + 1
+
+    @property
+    def last(self) -> int:
+        """Return the sequence of its last record."""
+        return self.header.end.sequence
+
+
+class LineReader(Protocol):
+    """A binary file, compressed or not."""
+
+    def readline(self, size: int, /) -> bytes:
+        """Return the next line, at most `size` bytes of it."""
+
+
+class _Bytes:
+    """The bytes of a segment on their way: their hash, their number and the times of the records."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+        self.size = self.first_time = self.last_time = 0
+
+    def add(self, line: bytes) -> bytes:
+        self._hash.update(line)
+        self.size += len(line)
+        return line
+
+    def saw(self, time: int) -> None:
+        self.first_time = min(time, self.first_time) if self.first_time else time
+        self.last_time = max(time, self.last_time)
+
+    def summary(self, header: SegmentHeader) -> SegmentSummary:
+        return SegmentSummary(self._hash.hexdigest(), header, self.first_time, self.last_time)
+
+
+def write_segment(log: Path, number: int, write: Callable[[bytes], object]) -> SegmentSummary | None:
+    """Write the segment that checkpoint `number` seals; None if it is not signed yet, or its records were removed.
+
+    Raises `LogUnreadableError`, also for records that do not lead to the checkpoint, and what `write` raises.
+    """
+    with reading(log) as connection:
+        connection.execute("BEGIN")
+        header = _header(connection, number)
+        if header is None:
+            return None
+        end = header.end
+        sequence, digest = header.start
+        count = "SELECT count(*) FROM record WHERE sequence > ? AND sequence <= ?"
+        (present,) = connection.execute(count, (sequence, end.sequence)).fetchone()
+        if present != end.sequence - sequence:
+            return None
+        done = _Bytes()
+        write(done.add(header.line()))
+        found = connection.execute(
+            f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
+            (sequence, end.sequence),
+        )
+        for row in found:
+            columns = StoredColumns(*row[:-1])
+            write(done.add(_line(columns, digest, row[-1], end)))
+            done.saw(columns.time)
+            digest = row[-1]
+    if digest.hex() != end.hash:
+        raise LogUnreadableError(
+            f"{log}: its records do not lead to checkpoint {number}; run 'rosrv audit verify'"
+        )
+    return done.summary(header)
+
+
+def next_segment(log: Path, after: int) -> int | None:
+    """Return the number of the first checkpoint above `after`, signed or not; None: there is none yet.
+
+    Raises `LogUnreadableError`.
+    """
+    with reading(log) as connection:
+        return _number(
+            connection.execute("SELECT min(number) FROM checkpoint WHERE number > ?", (after,)).fetchone()
+        )
+
+
+def _number(row: tuple[int | None]) -> int | None:
+    return row[0]
+
+
+def _header(connection: sqlite3.Connection, number: int) -> SegmentHeader | None:
+    rows = connection.execute(
+        "SELECT text, signature, public_key FROM checkpoint WHERE number IN (?, ?) ORDER BY number",
+        (number - 1, number),
+    ).fetchall()
+    if not rows or any(None in row for row in rows):
+        return None
+    found = [SignedCheckpoint.of(*row) for row in rows]
+    if found[-1].number != number:
+        return None
+    if len(found) == 2 or number == 1:
+        return SegmentHeader(begin=found[0] if len(found) == 2 else None, end=found[-1])
+    query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+    row = connection.execute(query).fetchone()
+    removed = None if row is None else msgspec.json.decode(row[0])
+    if removed is None or removed["last_checkpoint"] != number - 1:
+        return None
+    after = RecordPlace(sequence=removed["last_sequence"], hash=removed["last_hash"])
+    return SegmentHeader(begin=None, after=after, end=found[-1])
+
+
+def _line(columns: StoredColumns, previous: bytes, digest: bytes, end: SignedCheckpoint) -> bytes:
+    ends = end if columns.sequence == end.sequence else None
+    proof = ChainProof(previous=previous.hex(), hash=digest.hex(), then=[], checkpoint=ends)
+    return evidence_line(LogEntry(columns.sequence, from_columns(columns)), proof).encode("ascii") + b"\n"
+
+
+class SegmentReader:
+    """A reader that verifies a segment with one of the raw public keys `keys`, and yields its records; iterate once.
+
+    `most_bytes` is the largest segment. Iteration raises `SegmentError`, and what reading `file` raises. A record that
+    was yielded is proven only when the iteration has ended; `summary` is available then.
+    """
+
+    def __init__(self, file: LineReader, keys: Collection[bytes], most_bytes: int) -> None:
+        """Read and verify the header. Raises `SegmentError`."""
+        self._file = file
+        self._left = most_bytes
+        self._done = _Bytes()
+        self._ended = False
+        line = self._read()
+        try:
+            self.header = msgspec.json.decode(line, type=SegmentHeader)
+            wrong = (
+                "not in its one valid spelling" if self.header.line() != line else _fault(self.header, keys)
+            )
+        except _NOT_A_RECORD as error:
+            wrong = str(error)
+        if wrong is not None:
+            raise SegmentError(f"line 1, the header: {wrong}")
+
+    def _read(self) -> bytes:
+        line = self._file.readline(min(LONGEST_LINE, self._left) + 1)
+        self._left -= len(line)
+        if self._left < 0:
+            raise SegmentError("it is larger than the limit")
+        if len(line) > LONGEST_LINE:
+            raise SegmentError(f"a line has more than {LONGEST_LINE} bytes")
+        if line and not line.endswith(b"\n"):
+            raise SegmentError("it was cut: its last line has no end")
+        return self._done.add(line)
+
+    def __iter__(self) -> Iterator[StoredColumns]:
+        """Yield the stored columns of each record."""
+        end = self.header.end
+        sequence, digest = self.header.start
+        while line := self._read():
+            sequence += 1
+            if sequence > end.sequence:
+                raise SegmentError(f"it has more records than up to {end.sequence}")
+            columns, digest = self._record(line, sequence, digest)
+            self._done.saw(columns.time)
+            yield columns
+        if sequence != end.sequence:
+            raise SegmentError(f"records {sequence + 1} to {end.sequence} are missing at its end")
+        if digest.hex() != end.hash:
+            raise SegmentError(f"its records do not lead to the hash of checkpoint {end.number}")
+        self._ended = True
+
+    def _record(self, line: bytes, sequence: int, previous: bytes) -> tuple[StoredColumns, bytes]:
+        try:
+            fields = msgspec.json.decode(line)
+            entry, chain = entry_of(fields), msgspec.convert(fields["chain"], ChainProof)
+            columns, digest = to_columns(entry.record, entry.sequence), bytes.fromhex(chain.hash)
+            valid = columns.sequence == sequence and follows(previous, columns, digest)
+            same = valid and _line(columns, previous, digest, self.header.end) == line
+        except _NOT_A_RECORD as error:
+            raise SegmentError(f"record {sequence}: {error}") from error
+        if not valid:
+            raise SegmentError(
+                f"record {sequence} does not follow record {sequence - 1}: changed, missing or moved"
+            )
+        if not same:
+            raise SegmentError(f"record {sequence} is not in its one valid spelling")
+        return columns, digest
+
+    def summary(self) -> SegmentSummary:
+        """Read what is left, and return the summary of the proven segment. Raises `SegmentError`."""
+        if not self._ended:
+            for _columns in self:
+                pass
+        return self._done.summary(self.header)
+
+
+def _fault(header: SegmentHeader, keys: Collection[bytes]) -> str | None:
+    """Return why the checkpoints are not two consecutive ones of a log that one of `keys` signed, or None."""
+    begin, end = header.begin, header.end
+    if header.segment != 1:
+        return f"version {header.segment} is not known; update the collector"
+    known = sorted(key.hex() for key in keys)
+    if end.key not in known:
+        return f"checkpoint {end.number} is signed with {end.key[:64]}, expected is {' or '.join(known)}"
+    key = bytes.fromhex(end.key)
+    for checkpoint in filter(None, (begin, end)):
+        name = f"checkpoint {checkpoint.number}"
+        if checkpoint.key != end.key:
+            return f"{name} is signed with {checkpoint.key[:64]}, expected is {end.key}"
+        signature = bytes.fromhex(checkpoint.signature)
+        if signature.hex() != checkpoint.signature or not signature_is_valid(
+            key, signature, checkpoint.text()
+        ):
+            return f"the signature of {name} is wrong"
+    if begin is None and header.after is not None:
+        follows_begin = end.number > 1 and header.after.sequence <= end.sequence
+    elif begin is None:
+        follows_begin = (end.number, end.previous) == (1, NO_CHECKPOINT)
+    elif header.after is not None:
+        return "it has both begin and after"
+    else:
+        follows_begin = (begin.log, begin.number + 1, checkpoint_hash(begin.text())) == (
+            end.log,
+            end.number,
+            end.previous,
+        ) and begin.sequence <= end.sequence
+    return (
+        None
+        if follows_begin
+        else f"checkpoint {end.number} does not follow the one that the segment begins with"
+    )

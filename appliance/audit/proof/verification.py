@@ -1,0 +1,412 @@
+"""Verify that a log is complete and unchanged, or report which records are missing or changed, and how.
+
+The verifier walks the chain once, from the first record to the last. If a record does not follow from the previous one,
+the verifier tries the next records in other positions. This distinguishes a change, a removal, an insertion and a
+reordering. Then it checks the checkpoints against the chain, the key, and the signer's memory.
+
+The log alone cannot show whether records after the last signed checkpoint were cut off or rewritten; `unsealed` is the
+number of records present there. Root can rewrite both the log and the signer's memory. Only checkpoints on another
+machine reveal this.
+"""
+
+import re
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import msgspec
+
+from appliance.audit.log import log_database
+from appliance.audit.log.chain import StoredColumns, follows, genesis
+from appliance.audit.log.log_database import reading
+from appliance.audit.log.signatures import pinned_key_path, read_public_key, signature_is_valid
+from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, LogFinding, Verification
+from appliance.audit.proof.checkpoints import (
+    CheckpointVerifier,
+    SignerMemory,
+    checkpoint_rows,
+    read_signer_memory,
+)
+from appliance.audit.proof.copies import CopiesVerifier, SignedCheckpoint
+from appliance.signing.signed_statements import NO_CHECKPOINT, Removal
+
+_WINDOW = 64
+_TOLD_EVERY = 5000
+_MOST_FINDINGS = 1000
+_EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
+# The distances by which a record may have been renumbered.
+_DISTANCES = tuple(distance for step in range(1, 1000) for distance in (step, -step))
+_WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
+_LOG_ID = re.compile("[0-9a-f]{32}")
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+_NOT_AS_WRITTEN = (TypeError, ValueError, RecursionError, MemoryError)
+
+
+class _Removal(msgspec.Struct, frozen=True):
+    """The detail of a `records removed` record, which has the hashes after which the chain continues."""
+
+    first_sequence: _Count
+    last_sequence: _Count
+    last_hash: _Hash
+    first_time: int
+    last_time: int
+    last_checkpoint: _Count
+    last_checkpoint_hash: _Hash
+    limit: str = ""
+    signature: str = ""
+
+    def is_signed(self, log: str, key: bytes) -> bool:
+        """Whether the signer with this key signed exactly this removal."""
+        checkpoint, sequence = self.last_checkpoint, self.last_sequence
+        gone = Removal(log, checkpoint, sequence, self.last_hash, self.last_checkpoint_hash, self.limit)
+        try:
+            return signature_is_valid(key, bytes.fromhex(self.signature), gone.text())
+        except ValueError:
+            return False
+
+
+class _Reported(msgspec.Struct, frozen=True):
+    """The required detail of a `checkpoint` record."""
+
+    number: _Count
+    hash: str
+
+
+def verify(
+    path: Path,
+    public_key: bytes | None = None,
+    signer: Path | None = None,
+    copies: Sequence[SignedCheckpoint] | None = None,
+    progress: Callable[[int], None] = lambda _sequence: None,
+) -> Verification:
+    """Verify the log at `path` from end to end. Raises `LogUnreadableError` and `KeyUnreadableError`.
+
+    `public_key` (raw, 32 bytes) must have signed the checkpoints; default: the key pinned beside the log. `signer` is
+    the directory with the signer's memory. `copies` are checkpoints from another machine. `progress` is called with
+    the sequence from time to time.
+    """
+    with reading(path, advice="") as connection:
+        connection.text_factory = lambda text: text.decode("utf-8", "surrogateescape")
+        log = _log_id(connection)
+        # Read the memory before the log, so that a checkpoint signed in between is at most in the log.
+        remembered = None if signer is None else read_signer_memory(signer, log)
+        connection.execute("BEGIN").execute("SELECT count(*) FROM sqlite_schema")  # the log as it is now
+        # A key is pinned before its first signature is stored: read it after that.
+        if public_key is None and pinned_key_path(path).exists():
+            public_key = read_public_key(pinned_key_path(path))
+        verifier = _Verifier(connection, log, public_key, remembered, copies=copies, progress=progress)
+        return verifier.run()
+
+
+class _Row(NamedTuple):
+    columns: tuple[object, ...]
+    hash: bytes
+    sequence: int
+    detail: bytes
+
+    def follows(self, previous: bytes, sequence: int) -> bool:
+        """Whether this record was written as `sequence` after the hash `previous`."""
+        try:
+            return follows(previous, (sequence, *self.columns[1:]), self.hash)
+        except UnicodeEncodeError:  # bytes that no writer stored
+            return False
+
+
+def _row(row: tuple[object, ...]) -> _Row:
+    """Check the types of a row: replaced tables may have any type in any column."""
+    sequence, digest, detail = row[0], row[-1], row[_DETAIL]
+    if not (isinstance(sequence, int) and isinstance(digest, bytes) and isinstance(detail, bytes)):
+        raise sqlite3.DataError("a column has a value of another type than a log's tables hold")
+    return _Row(row[:-1], digest, sequence, detail)
+
+
+def _log_id(connection: sqlite3.Connection) -> str:
+    try:
+        rows = connection.execute("SELECT id FROM log LIMIT 2").fetchall()
+    except sqlite3.DatabaseError:
+        return ""  # no such table: `_check_structure` reports it
+    found = rows[0][0] if len(rows) == 1 else None
+    return found if isinstance(found, str) and _LOG_ID.fullmatch(found) else ""
+
+
+class _Verifier:
+    """The verification of one log in one walk."""
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        log: str,
+        key: bytes | None,
+        remembered: SignerMemory | None,
+        *,
+        copies: Sequence[SignedCheckpoint] | None,
+        progress: Callable[[int], None],
+    ) -> None:
+        self._connection = connection
+        self._progress = progress
+        self._key = key
+        self._log = log
+        self._remembered = remembered
+        self._checkpoints = CheckpointVerifier(self._log, key, remembered)
+        self._copies = None if copies is None else CopiesVerifier(self._log, key, copies)
+        self._findings: list[LogFinding] = []
+        self._further: LogFinding | None = None
+        self._untold = 0
+        self._sealed: dict[int, bytes] = {}
+        self._reported: set[int] = set()
+        self._shift = 0
+        self._explained = 0
+        self.records = self.first = self.last = 0
+
+    def run(self) -> Verification:
+        self._check_structure()
+        if not self._log:
+            self._structure("table log does not have the one id of a log: what it sealed cannot be told")
+        removed = self._last_removal()
+        try:
+            sequences = self._connection.execute("SELECT sequence FROM checkpoint")
+            self._sealed = {sequence: b"" for (sequence,) in sequences}
+        except sqlite3.DatabaseError:
+            self._sealed = {}  # `_check_checkpoints` reports it
+        if self._copies is not None:
+            self._sealed |= dict.fromkeys(self._copies.sequences, b"")
+        self._walk(removed)
+        self._check_checkpoints(removed)
+        elsewhere = self._check_copies(removed)
+        removal = self._check_removal(removed)
+        audit = self._checkpoints
+        self._findings.sort(key=lambda finding: finding.first)
+        if self._further is not None:
+            self._findings.append(self._further)
+        return Verification(
+            ok=not self._findings, log=self._log, records=self.records, first=self.first, last=self.last,
+            removed=removed.last_sequence if removed else 0, checkpoints=audit.count,
+            signed_checkpoints=audit.signed, signed_through=audit.signed_through,
+            unsealed=max(0, self.last - audit.signed_through), key=self._key.hex() if self._key else None,
+            findings=self._findings, elsewhere=elsewhere, removal=removal,
+        )  # fmt: skip
+
+    def _check_copies(self, removed: _Removal | None) -> Elsewhere | None:
+        if self._copies is None:
+            return None
+        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
+        gone, last = (removed.last_sequence if removed else 0), self.last - self._shift
+        if removed is not None:
+            chain[gone] = bytes.fromhex(removed.last_hash)
+        try:
+            stored = {row[0]: row[2].hex() for row in checkpoint_rows(self._connection)}
+        except sqlite3.DatabaseError:
+            stored = {}  # `_check_checkpoints` reports it
+        self._findings += self._copies.check(chain, gone, last, stored)
+        return self._copies.result()
+
+    def _check_removal(self, removed: _Removal | None) -> str:
+        """Return "signed", "unsigned", or "" without a removal.
+
+        A removal without a signature is unfounded, unless it was made by a version that did not sign removals. In that
+        case, no signed statement has a smaller `removed`.
+        """
+        if removed is None:
+            return ""
+        if self._key is None:
+            return "unsigned"  # without a key, no signature can be checked
+        if removed.is_signed(self._log, self._key):
+            return "signed"
+        said = self._checkpoints.removed + (self._copies.removed if self._copies else [])
+        if self._remembered is not None and self._remembered.removed is not None:
+            said = [*said, self._remembered.removed]
+        if min(said, default=removed.last_sequence) < removed.last_sequence or not self._checkpoints.signed:
+            message = (
+                "said to have been removed for their age or the log's size, and the signer did not sign that: nothing"
+                " shows that they had to go"
+            )
+            self._find(FindingKind.REMOVAL_UNFOUNDED, 1, removed.last_sequence, message)
+        return "unsigned"
+
+    def _find(self, kind: FindingKind, first: int, last: int, message: str) -> None:
+        if len(self._findings) < _MOST_FINDINGS:
+            name = f"record {first}" if first == last else f"records {first} to {last}"
+            self._findings.append(LogFinding(kind, first, last, f"{name}: {message}"))
+        else:
+            first = first if self._further is None else self._further.first
+            self._untold += 1
+            message = f"records {first} to {last}: {self._untold} further findings, not told one by one"
+            self._further = LogFinding(kind, first, last, message)
+
+    # --- the database itself --------------------------------------------------------------------------------
+
+    def _check_structure(self) -> None:
+        found = self._connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL")
+        expected = set(log_database.TABLES)
+        for name, sql in found:
+            if sql not in expected and name not in _WORDS_TABLES:
+                self._structure(f"{name} does not belong to a log: {sql}")
+            expected.discard(sql)
+        for sql in sorted(expected):
+            self._structure(f"missing: {sql}")
+        try:
+            for (problem,) in self._connection.execute("PRAGMA integrity_check(20)"):
+                if problem != "ok":
+                    self._structure(problem)
+        except sqlite3.DatabaseError as error:
+            self._structure(str(error))
+
+    def _structure(self, message: str) -> None:
+        message = message.encode("utf-8", "backslashreplace").decode()  # bytes that were not text
+        self._findings.append(LogFinding(FindingKind.STRUCTURE, 0, 0, f"database: {message}"))
+
+    def _last_removal(self) -> _Removal | None:
+        """Return the last removal by retention; the walk verifies its record."""
+        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+        try:
+            row = self._connection.execute(query).fetchone()
+            return None if row is None else msgspec.json.decode(row[0], type=_Removal)
+        except (*_NOT_AS_WRITTEN, sqlite3.DatabaseError):
+            return None  # a damaged record is found when it is walked
+
+    # --- the chain ------------------------------------------------------------------------------------------
+
+    def _walk(self, removed: _Removal | None) -> None:
+        self.last = removed.last_sequence if removed else 0
+        previous = bytes.fromhex(removed.last_hash) if removed else genesis(self._log)
+        try:
+            for row in self._rows():
+                self.records += 1
+                if not self.records % _TOLD_EVERY:
+                    self._progress(row.sequence)
+                self.first = self.first or row.sequence
+                previous = self._step(row, previous)
+        except sqlite3.DatabaseError as error:
+            after = self.last + 1
+            self._find(FindingKind.UNREADABLE, after, after, f"it and what follows cannot be read: {error}")
+
+    def _step(self, row: _Row, previous: bytes) -> bytes:
+        sequence, expected = row.sequence, self.last + 1
+        if sequence < expected:
+            self._find(FindingKind.INSERTED, sequence, sequence, "stands before the first record of the log")
+            return previous
+        self.last = sequence
+        if sequence <= self._explained:
+            return previous
+        if sequence > expected:
+            self._find(FindingKind.MISSING, expected, sequence - 1, "removed from the log")
+        elif not row.follows(previous, sequence - self._shift):
+            return self._explain(row, previous)
+        self._note(row, sequence - self._shift)
+        return row.hash
+
+    def _note(self, row: _Row, place: int) -> None:
+        """Store the hash of a sealed record, and the number in a `checkpoint` record."""
+        if place in self._sealed:
+            self._sealed[place] = row.hash
+        if row.columns[_EVENT] == "checkpoint":
+            try:
+                self._reported.add(msgspec.json.decode(row.detail, type=_Reported).number)
+            except _NOT_AS_WRITTEN:
+                return  # a changed record, which the check of its hash reports
+
+    def _rows(self, after: int = -(1 << 63), limit: int = -1) -> Iterator[_Row]:
+        rows = self._connection.execute(
+            f"SELECT {log_database.COLUMNS}, hash FROM record NOT INDEXED WHERE sequence > ?"  # noqa: S608  fixed names
+            " ORDER BY sequence LIMIT ?",
+            (after, limit),
+        )
+        return map(_row, rows)
+
+    def _explain(self, row: _Row, previous: bytes) -> bytes:
+        """Find out why a record does not follow the previous one; return the hash to continue from.
+
+        Each search takes milliseconds. After `_MOST_FINDINGS`, no search is made, so that a forged log cannot take
+        hours.
+        """
+        if len(self._findings) >= _MOST_FINDINGS:
+            return self._changed(row, row.sequence - self._shift)
+        ahead = list(self._rows(row.sequence, _WINDOW))
+        place = row.sequence - self._shift
+        order = _original_order([row, *ahead], previous, place)
+        if not order:
+            return self._changed_or_renumbered(row, ahead[0] if ahead else None, place)
+        first = order[0].sequence
+        if len(order) > 1 and max(written.sequence for written in order) == row.sequence + len(order) - 1:
+            self._explained = row.sequence + len(order) - 1
+            self._find(
+                FindingKind.REORDERED, row.sequence, self._explained, "not in the order they were written in"
+            )
+            for offset, written in enumerate(order):
+                self._note(written, place + offset)
+            return order[-1].hash
+        self._find(FindingKind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
+        self._explained = first - 1
+        self._shift += first - row.sequence
+        return previous
+
+    def _changed_or_renumbered(self, row: _Row, following: _Row | None, place: int) -> bytes:
+        plain_change = following is None or following.follows(row.hash, place + 1)
+        for distance in () if plain_change else _DISTANCES:
+            if following is not None and following.follows(row.hash, place + 1 + distance):
+                if distance > 0:
+                    self._find(
+                        FindingKind.MISSING,
+                        place,
+                        place + distance - 1,
+                        "removed; what follows was renumbered",
+                    )
+                else:
+                    message = "inserted with a hash of its own; what follows was renumbered"
+                    self._find(FindingKind.INSERTED, row.sequence + distance, row.sequence - 1, message)
+                self._shift -= distance
+                self._note(row, place + distance)
+                return row.hash
+        return self._changed(row, place)
+
+    def _changed(self, row: _Row, place: int) -> bytes:
+        message = (
+            "does not have the content it was written with"
+            f" (or record {row.sequence - 1} was replaced by one with a hash of its own)"
+        )
+        self._find(FindingKind.CHANGED, row.sequence, row.sequence, message)
+        self._note(row, place)
+        return row.hash
+
+    # --- the checkpoints ------------------------------------------------------------------------------------
+
+    def _check_checkpoints(self, removed: _Removal | None) -> None:
+        before = (removed.last_checkpoint, removed.last_checkpoint_hash) if removed else (0, NO_CHECKPOINT)
+        chain = {sequence: digest for sequence, digest in self._sealed.items() if digest}
+        audit = self._checkpoints
+        last = self.last - self._shift
+        try:
+            self._findings += audit.check(checkpoint_rows(self._connection), before, chain, last)
+        except sqlite3.DatabaseError as error:
+            self._structure(f"the checkpoints cannot be read: {error}")
+            return
+        for number in sorted(self._reported):
+            if number > audit.last_number:
+                message = f"checkpoint {number}: the chain has its record, but it was removed"
+                self._findings.append(LogFinding(FindingKind.CHECKPOINT_MISSING, number, number, message))
+
+
+def _original_order(rows: list[_Row], previous: bytes, place: int) -> list[_Row]:
+    """Return the records of `rows` in their original order from sequence `place` on.
+
+    The result ends when the ordered records fill the same positions as before (a reordering), or when no next record is
+    found.
+    """
+    order: list[_Row] = []
+    left = list(rows)
+    while left:
+        found = next(
+            (candidate for candidate in left if candidate.follows(previous, place + len(order))), None
+        )
+        if found is None:
+            break
+        order.append(found)
+        left.remove(found)
+        previous = found.hash
+        if max(row.sequence for row in order) == rows[0].sequence + len(order) - 1:
+            break
+    return order

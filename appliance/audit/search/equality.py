@@ -1,0 +1,148 @@
+"""Equal records, and their rows: a flood of one cause is one row for a person. Pure.
+
+Invariants:
+1. Records are equal if they differ only in time, ids, contents of messages and the numbers in the reason.
+2. A record that stands for several (`12 more in the same second`, a summary of repetitions) equals the record that it
+   continues, and counts that many times. If it does not repeat the reason, it equals each record with its other fields.
+3. Equal records are one row if they are consecutive. Between a monitor's records may be other monitors' records of at
+   most `_BETWEEN` rows, because one message causes several records: a verdict, a log line, a drop. Any other record
+   ends all rows, so the order of decisions and changes is as recorded.
+4. Each record is in exactly one row, so the rows' counts add up.
+"""
+
+import hashlib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.repetition import ABOUT, KIND, repetitions
+from appliance.base.varying_numbers import without_numbers
+
+FOLDED = frozenset({"denials folded", "repetitions folded"})
+_ABOUT_THE_LOG = frozenset({"records removed", "records lost", "forwarding gap"})
+"""Events whose `detail.count` is a number of records, not of repetitions."""
+_MORE = re.compile(r"(in shadow mode(?:, not done)?: )?\d{1,18}+ more in the same second(?:: )?")
+_BETWEEN = 8
+
+
+class EqualKey(NamedTuple):
+    """The fields that equal records share; `reason` is without numbers, and empty if the record does not repeat it."""
+
+    fields: tuple[object, ...]
+    reason: str
+
+    def equals(self, other: "EqualKey") -> bool:
+        """Whether two records are equal."""
+        same_reason = self.reason == other.reason or not (self.reason and other.reason)
+        return self.fields == other.fields and same_reason
+
+
+@dataclass(slots=True)
+class EqualRecords:
+    """A row of equal records: the oldest and the newest, how many records, and how often the event happened.
+
+    `value` is the reason of the newest record that has one, without the words about repetitions.
+    """
+
+    first: LogEntry
+    last: LogEntry
+    records: int
+    count: int
+    value: str
+
+
+def equal_key(record: AuditRecord) -> EqualKey:
+    """Return what equal records share."""
+    detail, rule = record.detail, record.rule
+    event = str(detail.get("of")) if _continues(record) else record.event
+    fields = (
+        event, record.severity, record.decision, record.host, record.caller_id, record.category, record.resource,
+        detail.get("category"), detail.get("would"), *(str(detail.get(name)) for name in ABOUT),
+        None if rule is None else (rule.section, rule.key, rule.file, rule.line),
+    )  # fmt: skip
+    return EqualKey(fields, without_numbers(plain_reason(record)))
+
+
+def plain_reason(record: AuditRecord) -> str:
+    """Return the reason without the words about repetitions; empty if there is nothing else."""
+    if "monitor" not in record.detail:
+        return record.reason
+    found = _MORE.match(record.reason)
+    if found is None:
+        return record.reason
+    text = record.reason[found.end() :]
+    return (found[1] or "") + text if text else ""
+
+
+def times(record: AuditRecord) -> int:
+    """Return how often the event of a record happened."""
+    return times_of(record.event, record.detail)
+
+
+def times_of(event: str, detail: dict[str, Any]) -> int:
+    """Return how often an event happened, from its record's fields."""
+    return 1 if event in _ABOUT_THE_LOG else repetitions(detail)
+
+
+def grouped(entries: Iterable[LogEntry]) -> list[EqualRecords]:
+    """Return the rows of records in either order; each row is at the place of its record that came first."""
+    rows: list[EqualRecords] = []
+    open_rows: list[tuple[EqualKey, EqualRecords]] = []
+    for entry in entries:
+        key, reach = equal_key(entry.record), _reach(entry.record)
+        reachable = open_rows[-reach:]
+        at = next((place for place, (other, _row) in enumerate(reachable) if key.equals(other)), None)
+        if at is None:
+            row = EqualRecords(entry, entry, 1, times(entry.record), plain_reason(entry.record))
+            rows.append(row)
+            open_rows = [*open_rows, (key, row)][-reach:]
+            continue
+        other, row = reachable[at]
+        _add(row, entry)
+        if not other.reason and key.reason:
+            open_rows[open_rows.index(reachable[at])] = (key, row)
+    return rows
+
+
+def equality_of(record: AuditRecord) -> dict[str, Any]:
+    """Return all that a client needs to make the rows of `grouped` itself, from pages and streams.
+
+    Two records are equal if their `key` is equal, and their `reason` too unless one is empty. A record joins one of the
+    last `reach` rows, and `times` and `value` are its part of the row's count and value.
+    """
+    key = equal_key(record)
+    value = plain_reason(record)
+    return {
+        "key": _hash(repr(key.fields)),
+        "reason": key.reason and _hash(key.reason),
+        "reach": _reach(record),
+        "times": times(record),
+        "value": value,
+    }
+
+
+def _hash(text: str) -> str:
+    return hashlib.blake2b(text.encode(errors="surrogatepass"), digest_size=12).hexdigest()
+
+
+def _reach(record: AuditRecord) -> int:
+    """Return how many of the last rows a record can join."""
+    return _BETWEEN + 1 if "monitor" in record.detail else 1
+
+
+def _add(row: EqualRecords, entry: LogEntry) -> None:
+    row.records += 1
+    row.count += times(entry.record)
+    reason = plain_reason(entry.record)
+    if entry.sequence < row.first.sequence:
+        row.first, row.value = entry, row.value or reason
+    else:
+        row.last, row.value = entry, reason or row.value
+
+
+def _continues(record: AuditRecord) -> bool:
+    """Whether a record counts repetitions of one kind, whose first record is in full."""
+    return record.event in FOLDED and record.detail.get("scope") == KIND

@@ -1,0 +1,85 @@
+"""Define the words of a search: the options of `rosrv audit search`, and the parameters of the collector's REST."""
+
+from typing import Annotated
+
+import typer
+
+from appliance.audit.log.record import Severity
+from appliance.audit.search.query import Filter
+from appliance.base import clock
+from appliance.base.timestamps import TimestampError, parse_timestamp
+
+Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
+Until = Annotated[str | None, typer.Option("--until", help="Before this time")]
+
+
+def filter_given(
+    *,
+    deny: Annotated[
+        bool, typer.Option("--deny", help="Only denied requests (and summaries of denials)")
+    ] = False,
+    allow: Annotated[bool, typer.Option("--allow", help="Only allowed requests")] = False,
+    would_deny: Annotated[
+        bool, typer.Option("--would-deny", help="Only requests that an audit-only policy would have denied")
+    ] = False,
+    since: Since = None,
+    until: Until = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(
+            "--topic", "--resource", help="Topic, service, parameter or call; a glob such as '/cmd_*'"
+        ),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            "--host",
+            help="Peer: an address or a glob; of an appliance also a network, or a host's name",
+        ),
+    ] = None,
+    caller: Annotated[str | None, typer.Option("--caller", help="Name that the node gave; a glob")] = None,
+    event: Annotated[str | None, typer.Option("--event", help="Name of the event; a glob")] = None,
+    category: Annotated[
+        str | None, typer.Option("--category", help="Category of the request; a glob")
+    ] = None,
+    severity: Annotated[
+        Severity | None, typer.Option("--severity", help="This severity or a higher one")
+    ] = None,
+    rule: Annotated[
+        str | None, typer.Option("--rule", help="Section or key of the policy rule; a glob")
+    ] = None,
+    text: Annotated[
+        str | None, typer.Option("--text", help="Text anywhere in names, reason and details")
+    ] = None,
+    who: Annotated[
+        str | None,
+        typer.Option("--who", help="Author: the name of a token, operator, or disk; a glob"),
+    ] = None,
+) -> Filter:
+    """Return the filter of these words. Raises `TimestampError`."""
+    wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
+    begin, end = times_given(since, until)
+    return Filter(
+        decision=tuple(name for name, asked in wanted.items() if asked),
+        since=begin,
+        until=end,
+        host=host,
+        caller_id=caller,
+        resource=topic,
+        category=category,
+        event=event,
+        severity=severity,
+        rule=rule,
+        text=text,
+        who=who,
+    )
+
+
+def times_given(since: str | None, until: str | None) -> tuple[int | None, int | None]:
+    """Return the times of --since and --until. Raises `TimestampError`."""
+    now = clock.wall_ns()
+    begin = None if since is None else parse_timestamp(since, now)
+    end = None if until is None else parse_timestamp(until, now)
+    if begin is not None and end is not None and begin > end:
+        raise TimestampError(f"--since {since} is later than --until {until}")
+    return begin, end

@@ -1,0 +1,145 @@
+"""Translate filters to SQL. No I/O.
+
+Each condition names the index that can answer it; `search` uses the most selective index. Values are always bound as
+parameters, never part of the statement.
+"""
+
+from typing import NamedTuple
+
+import msgspec
+
+from appliance.audit.log.log_database import TEXT_OF_RECORD
+from appliance.audit.log.record import Severity
+
+IN_NETWORKS = "in_networks"
+"""A function of SQL that `search` defines: whether a host is in one of the networks, which spaces separate."""
+_LONGEST_PATTERN = 256
+_MOST_STARS = 8
+_TRIGRAM = 3
+
+
+class FilterError(ValueError):
+    """A filter is invalid; the message has the part and the reason."""
+
+
+class Filter(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The properties of the records to find; None or empty: any.
+
+    `since` (inclusive) and `until` (exclusive) are nanoseconds since the epoch; `severity` is the minimum. `host`,
+    `caller_id`, `resource`, `category` and `event` are exact, or globs if they contain `*`, `?` or `[`; `rule` is a
+    glob for the rule's section or key. `text` is searched in names, reason and details, ignoring case. `who` is a glob
+    for the name of the token (or `operator`) that made the request. `without_looks` omits allowed REST calls that only
+    read (GET, HEAD). `hosts` are networks, one of which contains the host: the meaning of a host's name.
+    """
+
+    decision: tuple[str, ...] = ()
+    since: int | None = None
+    until: int | None = None
+    host: str | None = None
+    caller_id: str | None = None
+    resource: str | None = None
+    category: str | None = None
+    event: str | None = None
+    severity: Severity | None = None
+    rule: str | None = None
+    text: str | None = None
+    who: str | None = None
+    without_looks: bool = False
+    hosts: tuple[str, ...] = ()
+
+
+# Records with a damaged detail have no author.
+_WHO = "CASE WHEN json_valid(CAST(detail AS TEXT)) THEN json_extract(CAST(detail AS TEXT), '$.who') END"
+# A record of a read has the method in its details, even if the read was only counted. The details escape quotes.
+_NO_LOOK = """NOT (
+    category IS NOT NULL AND category = 'rest' AND decision IS NOT NULL AND decision = 'allow' AND (
+        CAST(detail AS TEXT) LIKE '%"method":"GET"%' OR CAST(detail AS TEXT) LIKE '%"method":"HEAD"%'))"""
+
+
+class Condition(NamedTuple):
+    """A part of a WHERE clause, its values, and the index that can answer it."""
+
+    sql: str
+    values: tuple[object, ...]
+    answered_by: str | None = None
+
+
+def conditions(wanted: Filter) -> list[Condition]:
+    """Return the conditions of a filter without its text. Raises `FilterError`."""
+    found: list[Condition] = []
+    if wanted.decision:
+        marks = ", ".join("?" * len(wanted.decision))
+        found.append(
+            Condition(f"(decision IN ({marks}) AND decision IS NOT NULL)", wanted.decision, "record_decision")
+        )
+    for column in ("host", "caller_id", "resource", "category", "event"):
+        value = getattr(wanted, column)
+        if value is not None:
+            found.append(_match(column, value))
+    if wanted.hosts:
+        found.append(_within(wanted.hosts))
+    if wanted.severity is not None:
+        order = list(Severity)
+        names = tuple(severity.value for severity in order[order.index(wanted.severity) :])
+        found.append(Condition(f"severity IN ({', '.join('?' * len(names))})", names, "record_severity"))
+    if wanted.rule is not None:
+        pattern = checked_pattern("rule", wanted.rule)
+        found.append(
+            Condition(
+                "(rule IS NOT NULL AND (rule GLOB ? OR rule_key GLOB ? OR rule_key = ?))",
+                (pattern,) * 3,
+                "record_rule",
+            )
+        )
+    if wanted.who is not None:
+        found.append(Condition(f"({_WHO}) GLOB ?", (checked_pattern("who", wanted.who),)))
+    if wanted.without_looks:
+        found.append(Condition(_NO_LOOK, ()))
+    if wanted.since is not None:
+        found.append(Condition("time >= ?", (wanted.since,), "record_time"))
+    if wanted.until is not None:
+        found.append(Condition("time < ?", (wanted.until,), "record_time"))
+    return found
+
+
+def _within(networks: tuple[str, ...]) -> Condition:
+    """Return the condition that the host is in one of the networks; only hosts' addresses have an index."""
+    if all(network.endswith(("/32", "/128")) for network in networks):
+        addresses = tuple(network.rpartition("/")[0] for network in networks)
+        marks = ", ".join("?" * len(addresses))
+        return Condition(f"(host IN ({marks}) AND host IS NOT NULL)", addresses, "record_host")
+    return Condition(f"(host IS NOT NULL AND {IN_NETWORKS}(host, ?))", (" ".join(networks),))
+
+
+def _match(column: str, value: str) -> Condition:
+    value = checked_pattern(column, value)
+    operator = "GLOB" if any(sign in value for sign in "*?[") else "="
+    present = "" if column == "event" else f" AND {column} IS NOT NULL"
+    return Condition(f"({column} {operator} ?{present})", (value,), f"record_{column}")
+
+
+def checked_pattern(name: str, value: str) -> str:
+    """Return a pattern that is short, simple and valid Unicode. Raises `FilterError`."""
+    if len(value) > _LONGEST_PATTERN:
+        raise FilterError(f"{name}: longer than {_LONGEST_PATTERN} characters")
+    if value.count("*") > _MOST_STARS:
+        raise FilterError(f"{name}: more than {_MOST_STARS} times '*'")
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise FilterError(f"{name}: not valid Unicode") from error
+    return value
+
+
+def text_condition(text: str) -> Condition:
+    """Return the condition that searches a text in each row."""
+    escaped = checked_pattern("text", text).replace("\\", "\\\\").replace("%", "\\%").replace("_", "\\_")
+    return Condition(f"({TEXT_OF_RECORD}) LIKE ? ESCAPE '\\'", (f"%{escaped}%",))
+
+
+def text_match(text: str) -> str | None:
+    """Return the full-text expression that finds candidates for a text; None if it is too short for the index."""
+    if len(text) < _TRIGRAM or "\0" in text:
+        return None
+    trigrams = {text[start : start + _TRIGRAM] for start in range(len(text) - _TRIGRAM + 1)}
+    return " AND ".join('"' + trigram.replace('"', '""') + '"' for trigram in sorted(trigrams))

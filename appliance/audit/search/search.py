@@ -1,0 +1,292 @@
+"""Read the log: search with paging, show a record with its neighbours, follow, export.
+
+Reading works whether or not the appliance runs, and never blocks the writer. Texts are searched in the full-text index,
+and in the records that are not indexed yet.
+"""
+
+import functools
+import ipaddress
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from appliance.audit.log.chain import StoredColumns
+from appliance.audit.log.columns import from_columns
+from appliance.audit.log.ids import ID_LENGTH
+from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, open_for_reading
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.search.equality import FOLDED, equal_key
+from appliance.audit.search.query import (
+    IN_NETWORKS,
+    Condition,
+    Filter,
+    FilterError,
+    conditions,
+    text_condition,
+    text_match,
+)
+
+LARGEST_PAGE = 10_000
+_SELECTIVE = 20_000
+_BEFORE_A_COUNT = 200  # records; a monitor's count is at most a second later than its record in full
+_Found = TypeVar("_Found")
+
+
+class SearchPage(NamedTuple):
+    """The found records, and the cursor of the next page; None at the end."""
+
+    entries: list[LogEntry]
+    cursor: str | None
+
+
+class RecordInContext(NamedTuple):
+    """A record, and the records of the same host or caller before and after it, in order."""
+
+    entry: LogEntry
+    before: list[LogEntry]
+    after: list[LogEntry]
+
+
+def search(
+    path: Path, wanted: Filter, cursor: str | None = None, limit: int = 100, *, newest_first: bool = True
+) -> SearchPage:
+    """Return a page of at most `limit` records that match `wanted`.
+
+    `cursor` is from the previous page. Raises `LogUnreadableError` and `FilterError`.
+    """
+    if not 1 <= limit <= LARGEST_PAGE:
+        raise FilterError(f"limit: not within 1 and {LARGEST_PAGE}")
+    walk = _Walk(_sequence(cursor), newest_first)
+    return _reading(path, lambda connection: _page(connection, wanted, walk, limit))
+
+
+def show(path: Path, record_id: str, neighbours: int = 5) -> RecordInContext | None:
+    """Return the record with this id (or sequence) and its neighbours, or None."""
+
+    def find(connection: sqlite3.Connection) -> RecordInContext | None:
+        column = "id" if len(record_id) == ID_LENGTH else "sequence"
+        if column == "sequence" and not (record_id.isascii() and record_id.isdecimal()):
+            return None
+        value = record_id if column == "id" else min(int(record_id[:19]), (1 << 63) - 1)
+        found = _fetch(connection, f"WHERE {column} = ? LIMIT 1", (value,))
+        if not found:
+            return None
+        return RecordInContext(
+            found[0],
+            _neighbours(connection, found[0], neighbours, newest_first=True)[::-1],
+            _neighbours(connection, found[0], neighbours, newest_first=False),
+        )
+
+    return _reading(path, find)
+
+
+def export(path: Path, wanted: Filter, page: int = 1000) -> Iterator[LogEntry]:
+    """Yield all records that match `wanted`, oldest first; one page is in memory at a time."""
+    cursor: str | None = "0"
+    while cursor is not None:
+        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
+        yield from entries
+
+
+def last_sequence(path: Path) -> int:
+    """Return the sequence of the last record; 0 if there is none."""
+    return _reading(path, _last_sequence)
+
+
+def recorded_in_full(path: Path, entry: LogEntry) -> LogEntry | None:
+    """Return the full record that a record of repetitions continues; None if the log does not have it.
+
+    Raises `LogUnreadableError`.
+    """
+    record = entry.record
+    if record.event in FOLDED:
+        shown = show(path, str(record.detail.get("recorded_id", "")), 0)
+        return None if shown is None else shown.entry
+    if not ("count" in record.detail and "monitor" in record.detail):
+        return None
+    wanted = Filter(event=record.event, category=record.category)
+    page = search(path, wanted, str(entry.sequence), _BEFORE_A_COUNT)
+    key = equal_key(record)
+    earlier = (one for one in page.entries if "count" not in one.record.detail)
+    return next((one for one in earlier if key.equals(equal_key(one.record))), None)
+
+
+class Follower:
+    """A follower of the log: each `poll` returns the records since the previous one, oldest first."""
+
+    def __init__(self, path: Path, wanted: Filter, after: int | None = None) -> None:
+        """Begin after the sequence `after`, or at the end of the log. Raises `FilterError`."""
+        conditions(wanted)  # an invalid filter is refused now, not at the first record
+        if wanted.text:
+            text_condition(wanted.text)
+        self._path = path
+        self._wanted = wanted
+        self._after = _reading(path, _last_sequence) if after is None else after
+
+    @property
+    def position(self) -> int:
+        """Return the sequence after which the next poll begins."""
+        return self._after
+
+    def poll(self, limit: int = 1000) -> list[LogEntry]:
+        """Return the next records, at most `limit`."""
+        head = _reading(self._path, _last_sequence)
+        if head <= self._after:
+            self._after = min(self._after, head)
+            return []
+        entries, more = search(self._path, self._wanted, str(self._after), limit, newest_first=False)
+        self._after = (
+            entries[-1].sequence if more is not None else max(head, *(e.sequence for e in entries), 0)
+        )
+        return entries
+
+
+class _Walk(NamedTuple):
+    """The start of a page (exclusive), and its direction."""
+
+    start: int | None
+    newest_first: bool
+
+    @property
+    def order(self) -> str:
+        return "DESC" if self.newest_first else "ASC"
+
+    def condition(self, column: str) -> list[Condition]:
+        if self.start is None:
+            return []
+        return [Condition(f"{column} {'<' if self.newest_first else '>'} ?", (self.start,))]
+
+
+def _sequence(cursor: str | None) -> int | None:
+    if cursor is None:
+        return None
+    if not (cursor.isdecimal() and cursor.isascii() and len(cursor) <= 18):
+        raise FilterError("cursor: not one that a search gave")
+    return int(cursor)
+
+
+def _reading(path: Path, read: Callable[[sqlite3.Connection], _Found]) -> _Found:
+    try:
+        with closing(open_for_reading(path)) as connection:
+            connection.execute("BEGIN")
+            return read(connection)
+    except FilterError:
+        raise
+    except (sqlite3.Error, ValueError, TypeError, RecursionError, MemoryError) as error:
+        raise LogUnreadableError(f"{path}: cannot be read: {error}; run 'rosrv audit verify'") from error
+
+
+def _last_sequence(connection: sqlite3.Connection) -> int:
+    (last,) = connection.execute("SELECT coalesce(max(sequence), 0) FROM record").fetchone()
+    return int(last)
+
+
+def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: int) -> SearchPage:
+    found = conditions(wanted)
+    if wanted.hosts:
+        connection.create_function(IN_NETWORKS, 2, _in_networks, deterministic=True)
+    index = _most_selective(connection, found)
+    if wanted.text:
+        found.append(text_condition(wanted.text))
+    words = text_match(wanted.text) if wanted.text and index is None else None
+    if words is None:
+        entries = _select(connection, found + walk.condition("sequence"), index, walk, limit + 1)
+    else:
+        entries = _select_by_text(connection, found, words, walk, limit + 1)
+    if len(entries) <= limit:
+        return SearchPage(entries, None)
+    return SearchPage(entries[:limit], str(entries[limit - 1].sequence))
+
+
+def _in_networks(host: object, networks: str) -> bool:
+    try:
+        address = ipaddress.ip_address(str(host))
+    except ValueError:
+        return False
+    return any(address in network for network in _networks_of(networks))
+
+
+@functools.lru_cache(8)
+def _networks_of(text: str) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+    return tuple(map(ipaddress.ip_network, text.split()))
+
+
+def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
+    """Return the index with the fewest candidates; None if each has `_SELECTIVE` or more, as a scan is then quick."""
+    best, fewest = None, _SELECTIVE
+    for condition in found:
+        if condition.answered_by is not None:
+            count = connection.execute(
+                f"SELECT count(*) FROM (SELECT 1 FROM record INDEXED BY {condition.answered_by}"  # noqa: S608  fixed names
+                f" WHERE {condition.sql} LIMIT ?)",
+                (*condition.values, fewest),
+            ).fetchone()[0]
+            if count < fewest:
+                best, fewest = condition.answered_by, count
+    return best
+
+
+def _select(
+    connection: sqlite3.Connection, found: list[Condition], index: str | None, walk: _Walk, limit: int
+) -> list[LogEntry]:
+    hint = "NOT INDEXED" if index is None else f"INDEXED BY {index}"
+    tail = f"ORDER BY sequence {walk.order} LIMIT ?"
+    return _fetch(connection, f"{hint} {_where(found)} {tail}", (*_values(found), limit))
+
+
+def _select_by_text(
+    connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
+) -> list[LogEntry]:
+    (through,) = connection.execute("SELECT through FROM indexed").fetchone()
+    entries: list[LogEntry] = []
+    for indexed in (False, True) if walk.newest_first else (True, False):
+        left = limit - len(entries)
+        if left and indexed:
+            entries += _candidates(connection, found, words, walk, left)
+        elif left:
+            rest = [*found, *walk.condition("sequence"), Condition("sequence > ?", (through,))]
+            entries += _select(connection, rest, None, walk, left)
+    return entries
+
+
+def _candidates(
+    connection: sqlite3.Connection, found: list[Condition], words: str, walk: _Walk, limit: int
+) -> list[LogEntry]:
+    matching = [Condition("words MATCH ?", (words,)), *walk.condition("words.rowid"), *found]
+    return _fetch(
+        connection,
+        f"{_where(matching)} ORDER BY words.rowid {walk.order} LIMIT ?",
+        (*_values(matching), limit),
+        "words CROSS JOIN record ON record.sequence = words.rowid",
+    )
+
+
+def _neighbours(
+    connection: sqlite3.Connection, entry: LogEntry, count: int, *, newest_first: bool
+) -> list[LogEntry]:
+    walk = _Walk(entry.sequence, newest_first)
+    near: dict[int, LogEntry] = {}
+    for column in ("host", "caller_id"):
+        value = getattr(entry.record, column)
+        if value is not None:
+            same = [Condition(f"{column} = ?", (value,)), *walk.condition("sequence")]
+            near |= {row.sequence: row for row in _select(connection, same, f"record_{column}", walk, count)}
+    return [near[sequence] for sequence in sorted(near, reverse=newest_first)][:count]
+
+
+def _where(found: list[Condition]) -> str:
+    return "WHERE " + " AND ".join(condition.sql for condition in found) if found else ""
+
+
+def _values(found: list[Condition]) -> tuple[object, ...]:
+    return tuple(value for condition in found for value in condition.values)
+
+
+def _fetch(
+    connection: sqlite3.Connection, tail: str, values: tuple[object, ...], table: str = "record"
+) -> list[LogEntry]:
+    rows = connection.execute(f"SELECT {COLUMNS} FROM {table} {tail}", values)  # noqa: S608  fixed names
+    stored = (StoredColumns(*row) for row in rows)
+    return [LogEntry(columns.sequence, from_columns(columns)) for columns in stored]

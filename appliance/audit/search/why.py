@@ -1,0 +1,108 @@
+"""Explain a record in a few lines: author, events, values, location in the specification, recording."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text
+from appliance.base.actors import actor
+
+_ACTIONS = frozenset({"message dropped", "message changed", "monitor verdict", "monitor fault"})
+"""The events of monitors that trigger recordings, if `recorder.triggers` has them."""
+
+_TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
+"""The counts by name in a summary of repetitions (`repetition.py`)."""
+
+
+def lines_of(record: AuditRecord, in_full: LogEntry | None = None) -> Iterator[str]:
+    """Yield the lines of the explanation; the caller must escape untrusted text in them.
+
+    `in_full`: the record of the first event, if this record counts repetitions.
+    """
+    yield from _own_lines(record)
+    yield from _counted(record.detail)
+    if in_full is not None:
+        yield f"the first, in full: record {in_full.sequence}, {rfc3339(in_full.record.time)}"
+        yield from (f"  {line}" for line in lines_of(in_full.record))
+
+
+def _counted(detail: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the monitor, number, time and reasons of counted repetitions."""
+    if "count" not in detail:
+        return
+    if "monitor" in detail:
+        yield f"monitor: {detail['monitor']}"
+    times = [
+        rfc3339(time) for name in ("first_time", "last_time") if isinstance(time := detail.get(name), int)
+    ]
+    yield f"counted: {detail['count']}{f', {times[0]} to {times[-1]}' if times else ''}"
+    for what in _TALLIES:
+        if found := _mapping(detail.get(what)):
+            yield f"{what}: {', '.join(f'{name} ({number} times)' for name, number in found.items())}"
+    texts = dict.fromkeys(str(detail[name]) for name in ("first_text", "last_text") if name in detail)
+    if texts:
+        yield f"from first to last: {' … '.join(texts)}"
+
+
+def _own_lines(record: AuditRecord) -> Iterator[str]:
+    detail = record.detail
+    yield record.reason or record.event
+    sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]
+    author = detail.get("who")
+    by = author and actor(str(author))
+    who = [str(part) for part in (record.caller_id, by, record.host and f"on {record.host}") if part]
+    if who or sent:
+        message = f"message {', '.join(sent)} of " if sent else ""
+        when = f", {rfc3339(record.time)}" if author else ""
+        yield f"by: {message}{' '.join(who) or 'unknown'}{when}"
+    if record.rule is not None:
+        yield f"rule: {rule_text(record.rule)}"
+    places = _list(detail.get("at"))
+    if places:
+        yield f"at: {', '.join(map(str, places))}"
+    if "timer" in detail:
+        yield f"timer: {detail['timer']}"
+    events = _list(detail.get("events"))
+    if events:
+        yield f"events: {', '.join(map(str, events))}"
+    for place, values in _mapping(detail.get("conditions")).items():
+        yield f"where: {place}{_valued(values)}"
+    if values := _valued(detail.get("values")):
+        yield f"with: {values.removeprefix(', ')}"
+    if "handler" in detail:
+        yield f"in the handler of: {detail['handler']}"
+    yield from _recorded(record)
+    if "withheld" in detail:
+        yield "this role may not read contents of messages"
+        return
+    if "why" in detail:
+        from rosmop.run.outcomes import lines_of_why  # noqa: PLC0415  slow to import, and few records need it
+
+        yield from lines_of_why(_mapping(detail["why"]))
+    is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
+    if is_verdict and "why" not in detail and "count" not in detail:
+        yield "because: the causing events are no longer known, or that second had too many verdicts to record them"
+
+
+def _recorded(record: AuditRecord) -> Iterator[str]:
+    """Yield whether the flight recorder recorded the messages around a record that may trigger a recording."""
+    detail = record.detail
+    if "not_recorded" in detail:
+        yield f"not recorded: {detail['not_recorded']}"
+    elif "recording" in detail and "charged_to" in detail and not record.event.startswith("recording "):
+        recording = detail["recording"]
+        yield f"recorded: in {recording}; rosrv record messages {recording} --at {record.id}"
+    elif record.event in _ACTIONS:
+        yield "not recorded: recorder.triggers did not list this kind of event"
+
+
+def _valued(values: object) -> str:
+    return "".join(f", {name} = {value}" for name, value in _mapping(values).items())
+
+
+def _mapping(value: object) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: object) -> list[Any]:
+    return value if isinstance(value, list) else []

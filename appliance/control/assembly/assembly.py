@@ -1,0 +1,214 @@
+"""Assemble RVMaster from its core, its endpoints, the specifications and the calls."""
+
+from dataclasses import dataclass
+
+from appliance.channel import messages
+from appliance.control.assembly.core import Core, make_core
+from appliance.control.assembly.endpoints import Endpoints, make_endpoints
+from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
+from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.assembly.monitor_states import published_now
+from appliance.control.replication import answered_when_stored
+from appliance.master import rosout
+from appliance.master.calls.call import Table, served
+from appliance.master.calls.call_execution import Execution
+from appliance.master.calls.call_table import master_table
+from appliance.master.calls.lookups import LookupCalls
+from appliance.master.calls.monitor_calls import MonitorCalls
+from appliance.master.calls.multicall import Multicall
+from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
+from appliance.master.calls.parameter_calls import ParameterCalls
+from appliance.master.calls.pipeline import Pipeline
+from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.reconcile.arrivals import Arrivals
+from appliance.master.reconcile.publisher import OwnPublisher
+from appliance.master.reconcile.reconciler import Reconciler
+from appliance.master.reconcile.reminders import RelayMoves, Reminders
+from appliance.master.rosmaster import own_parameters
+from appliance.rpc.bulk import LargeWrites, bulk_turns
+from appliance.specifications.specification_manager import SpecificationManager
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The parts of RVMaster. `table` is the Master API."""
+
+    core: Core
+    endpoints: Endpoints
+    reconciler: Reconciler
+    reminders: Reminders
+    publisher: OwnPublisher
+    monitors: SpecificationManager
+    monitor_calls: MonitorCalls
+    pipeline: Pipeline
+    table: Table
+
+
+def assemble(base: Foundation) -> Parts:
+    """Make the parts of RVMaster. No part serves or runs yet."""
+    core = make_core(base)
+    ends = make_endpoints(base, core)
+    settings = base.settings
+    reminders = Reminders(core.registry, core.graph, ends.enactor)
+    if base.replication is not None:
+        base.replication.admission.on_end_of_gap(reminders.begin)
+    arrivals = Arrivals(
+        core.registry,
+        core.graph,
+        ends.enactor,
+        ends.liveness,
+        places=ends.places,
+        faces=ends.faces,
+        addresses=ends.addresses,
+    )
+    parameters = ParameterCalls(
+        ends.rosmaster,
+        core.parameters,
+        core.graph,
+        ends.enactor,
+        core.rights,
+        int(base.settings.limits.offload_bytes),
+    )
+    registration = RegistrationCalls(
+        core.registry,
+        core.graph,
+        ends.enactor,
+        arrivals,
+        ends.relay,
+        core.mediation,
+        core.gate,
+        parameters,
+    )
+    publisher = OwnPublisher(
+        core.registry,
+        core.graph,
+        ends.enactor,
+        name=settings.publish_as,
+        inner_port=base.port(INNER),
+        wanted=lambda: (
+            (rosout.PUBLICATIONS if settings.monitors_on_rosout else {})
+            | core.monitors().checked.publications
+        ),
+        services=settings.own_services,
+        register=registration.register_publisher,
+        offer=registration.register_service,
+    )
+    monitors = _make_monitors(base, core, ends, publisher, reminders)
+    core.monitors.set(monitors)
+    port = base.port(RVMASTER)
+    monitor_calls = MonitorCalls(monitors, core.registry, ends.relay, ends.rosmaster.port, port)
+    pipeline, table = _make_calls(base, core, ends, registration, monitor_calls)
+    node_calls = NodeCalls(
+        core.registry,
+        core.graph,
+        ends.enactor,
+        ends.relay,
+        core.mediation,
+        ends.addresses,
+        ends.relay.nodes,
+        ends.liveness,
+        core.gate,
+        port,
+    )
+    node_table = served(NODE_CALLS.values(), node_calls)
+    ends.handler.set(
+        lambda incarnation: answered_when_stored(
+            base.replication, pipeline.handler(node_table, target=incarnation)
+        )
+    )
+    return Parts(
+        core=core,
+        endpoints=ends,
+        reconciler=Reconciler(
+            ends.rosmaster,
+            ends.enactor.entries,
+            core.registry,
+            ends.faces,
+            core.graph,
+            ends.enactor,
+            core.parameters,
+            base.trail,
+            own_parameters=own_parameters,
+        ),
+        reminders=reminders,
+        publisher=publisher,
+        monitors=monitors,
+        monitor_calls=monitor_calls,
+        pipeline=pipeline,
+        table=table,
+    )
+
+
+def _make_monitors(
+    base: Foundation, core: Core, ends: Endpoints, publisher: OwnPublisher, reminders: Reminders
+) -> SpecificationManager:
+    settings, compiler = base.settings, base.compiler
+    log = rosout.Rosout(
+        settings.publish_as,
+        ends.relay.publish,
+        lambda name: core.monitors().checked.monitors.get(name, ""),
+    )
+    return SpecificationManager(
+        settings.monitors,
+        settings.enable,
+        base.store,
+        base.trail,
+        on_fault=settings.on_fault,
+        slices=settings.slices,
+        allocation=ends.relay.allocation,
+        relays=RelayMoves(ends.relay, core.graph, ends.enactor, reminders),
+        published=publisher.wake,
+        told=[log.reported] if settings.monitors_on_rosout else [],
+        site_keys=settings.site_keys,
+        check=compiler.check,
+        check_at_start=compiler.check_at_start,
+        try_out=compiler.try_out,
+        parts=compiler.parts,
+        live=lambda: published_now(core.registry, core.carried),
+    )
+
+
+def _make_calls(
+    base: Foundation,
+    core: Core,
+    ends: Endpoints,
+    registration: RegistrationCalls,
+    monitor_calls: MonitorCalls,
+) -> tuple[Pipeline, Table]:
+    settings, trail, offload = base.settings, base.trail, int(base.settings.limits.offload_bytes)
+    lookups = LookupCalls(
+        core.registry,
+        core.graph,
+        ends.enactor,
+        ends.relay,
+        core.mediation,
+        ends.addresses,
+        base.port(RVMASTER),
+        stop=lambda reason: base.lifeline.say(messages.ApplianceStopRequested(reason)),
+        unseen=settings.publish_as if settings.hide_publisher else None,
+    )
+    execution = Execution(
+        gate=core.gate,
+        policy=core.policy,
+        trail=trail,
+        registry=core.registry,
+        enactor=ends.enactor,
+        liveness=ends.liveness,
+        parameters=registration.parameters,
+        redecide_for=ends.enforcement.redecide_for,
+        large=offload,
+        large_writes=LargeWrites(
+            offload, base.quota_class, None if base.replication is None else base.replication.stored
+        ),
+    )
+    pipeline = Pipeline(
+        execution,
+        Multicall(execution, registration.parameters, trail, offload=offload),
+        addresses=ends.addresses,
+        trail=trail,
+        limits=value_limits(settings),
+        offload=offload,
+        bulk=bulk_turns(base.quota_class),
+        processor=base.listener_limits.time,
+    )
+    return pipeline, master_table(registration, lookups, registration.parameters, monitor_calls)

@@ -1,0 +1,95 @@
+"""Make the core of RVMaster. The core decides calls and changes the graph, but sends no messages."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from appliance.control.assembly.foundation import Current, Foundation
+from appliance.master.calls.gate import CallGate, HostLimits
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.endpoints.traffic import RelayTraffic
+from appliance.master.graph.grants import Grants
+from appliance.master.graph.graph import RosGraph
+from appliance.master.graph.mediation import Mediation
+from appliance.master.graph.registry import Registry
+from appliance.master.graph.revocation import Revocation
+from appliance.master.parameter_charges import ParameterCharges
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.master.reconcile.liveness import Watchlist
+from appliance.policy.policy import Policy
+from appliance.quotas.pool import Pool
+from appliance.quotas.table import PARAMETER_BYTES
+from appliance.specifications.specification_manager import SpecificationManager
+from roswire.parameter_tree import Tree
+
+
+@dataclass(frozen=True, slots=True)
+class Core:
+    """The core of RVMaster. `policy()` returns the policy in force; `monitors` is set once specifications load."""
+
+    policy: Callable[[], Policy]
+    registry: Registry
+    watchlist: Watchlist
+    carried: RelayTraffic
+    grants: Grants
+    mediation: Mediation
+    rights: ParameterRights
+    graph: RosGraph
+    gate: CallGate
+    parameters: ParameterMirror
+    revocation: Revocation
+    monitors: Current[SpecificationManager]
+
+
+def make_core(base: Foundation) -> Core:
+    """Make the core from the registry, the policy, and the parameters in the store."""
+    settings, registry, monitors = base.settings, base.registry, Current[SpecificationManager]()
+
+    def policy() -> Policy:
+        return base.policies.current
+
+    watchlist = Watchlist()
+    carried = RelayTraffic(base.trail, registry, settings.relays, watchlist.cut_off)
+    grants = Grants(carried.used)
+    mediation = Mediation(
+        policy,
+        lambda: monitors().checked,
+        relay_all=settings.relaying == "all",
+        stand_ins=settings.mediation == "full",
+    )
+    rights = ParameterRights(policy, base.trail)
+    parameters = _make_mirror(base)
+
+    def tree() -> Tree:
+        return parameters.tree
+
+    graph = RosGraph(registry, grants, mediation, tree, may_read_value=rights.may_read_value)
+    limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
+    return Core(
+        policy=policy,
+        registry=registry,
+        watchlist=watchlist,
+        carried=carried,
+        grants=grants,
+        mediation=mediation,
+        rights=rights,
+        graph=graph,
+        gate=CallGate(policy, registry, limits),
+        parameters=parameters,
+        revocation=Revocation(registry, grants, graph, policy, tree),
+        monitors=monitors,
+    )
+
+
+def _make_mirror(base: Foundation) -> ParameterMirror:
+    whole = int(base.settings.limits.parameter_bytes)
+    bounds = PARAMETER_BYTES.bounds.sized(whole, whole // 2)
+    pool = Pool("bytes of parameters", bounds, base.quota_class)
+    return ParameterMirror(
+        base.store.load_parameters(),
+        base.parameters_dirty.set,
+        ParameterCharges(pool, base.store, base.store.parameter_owners()),
+        depth_limit=base.settings.limits.nesting,
+        note=base.store.note_parameter,
+        together=base.store.database.together,
+        since=base.store.parameter_changes(),
+    )

@@ -1,0 +1,142 @@
+"""Make the endpoints of RVMaster, which carry changes of the graph to nodes, relays and the ROS master."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from ipaddress import ip_address, ip_network
+
+from appliance.channel import messages
+from appliance.control.assembly.core import Core
+from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
+from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.recording_orders import RecordingOrders
+from appliance.master import rosout
+from appliance.master.endpoints.delivery import Delivery
+from appliance.master.endpoints.node_api import NodeApiClient
+from appliance.master.endpoints.node_ports import AdvertisedAddresses, NodePorts
+from appliance.master.endpoints.proxy_endpoints import MasterSideApi, ProxyEndpoints
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.registry import Incarnation
+from appliance.master.reconcile.enactor import Enactor, Enforcement
+from appliance.master.reconcile.entries import MasterRegistrations
+from appliance.master.reconcile.liveness import Liveness
+from appliance.master.rosmaster import RosMaster, limits_of_answers
+from appliance.rpc.server import Handler
+from appliance.specifications.allocation import Allocation
+from appliance.specifications.specification_manager import ALLOCATION
+
+_REFUSALS = 2
+_REFUSALS_OF_A_ROBOT = (
+    4  # a further computer whose cable was unplugged refuses until the witness has answered it
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoints:
+    """The endpoints. `handler()` returns the handler of a node's proxy endpoint; it is set once calls can be served."""
+
+    places: NodePorts
+    addresses: AdvertisedAddresses
+    recordings: RecordingOrders
+    relay: RelayControl
+    rosmaster: RosMaster
+    faces: ProxyEndpoints
+    inner: MasterSideApi
+    enactor: Enactor
+    enforcement: Enforcement
+    liveness: Liveness
+    handler: Current[Callable[[Incarnation], Handler]]
+
+
+def make_endpoints(base: Foundation, core: Core) -> Endpoints:
+    """Make the endpoints. They do not serve yet."""
+    settings, policies, handler = base.settings, base.policies, Current[Callable[[Incarnation], Handler]]()
+    places = NodePorts(
+        settings.listen_address[0],
+        policies.current.ports,
+        keep=base.lifeline.keep,
+        drop=base.lifeline.drop,
+        named_as=lambda host: core.policy().named_as(host),
+        relays=settings.relays,
+    )
+    nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
+    delivery = Delivery(nodes, troubled=core.watchlist.could_not_tell, quota_class=base.quota_class)
+    recordings = RecordingOrders(
+        settings.recorder,
+        base.trail,
+        lambda: messages.RevisionsStated(policies.revision, core.monitors().revision),
+        base.plan,
+    )
+    allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
+    relay = RelayControl(
+        core.registry,
+        core.grants,
+        places,
+        nodes,
+        core.carried,
+        allocation=allocation,
+        policy=core.policy,
+        monitors=core.monitors,
+        broken=core.watchlist.look_at,
+        own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
+        own_call=recordings.called,
+    )
+    rosmaster = RosMaster(
+        settings.rosmaster_port,
+        limits=limits_of_answers(value_limits(settings), int(settings.limits.parameter_bytes)),
+    )
+    faces = ProxyEndpoints(
+        core.registry,
+        places,
+        inner_port=base.port(INNER),
+        serve=lambda incarnation: handler()(incarnation),  # noqa: PLW0108 - it is set later
+        server=base.listener_limits.server,
+    )
+    entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)
+    enactor = Enactor(
+        core.graph,
+        entries,
+        store=base.store,
+        trail=base.trail,
+        delivery=delivery,
+        relay=relay,
+        faces=faces,
+        places=places,
+    )
+    enforcement = Enforcement(core.revocation, enactor)
+    base.enforcement.set(enforcement)
+    return Endpoints(
+        places=places,
+        addresses=AdvertisedAddresses(
+            [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
+            base.lifeline.route_to if settings.isolation == "netns" else None,
+            base.sockets[RVMASTER].getsockname()[0],
+            fixed=base.pair.membership.fixed if base.pair is not None else None,
+            tunnels=settings.ipsec.pool,
+        ),
+        recordings=recordings,
+        relay=relay,
+        rosmaster=rosmaster,
+        faces=faces,
+        inner=MasterSideApi(core.registry),
+        enactor=enactor,
+        enforcement=enforcement,
+        liveness=Liveness(
+            core.registry,
+            core.graph,
+            core.revocation,
+            enactor,
+            core.watchlist,
+            nodes=nodes,
+            settings=settings.liveness,
+            quota_class=base.quota_class,
+            refusals=_REFUSALS if base.replication is None else _REFUSALS_OF_A_ROBOT,
+            shut_out=base.replication.admission.in_doubt if base.replication is not None else lambda: False,
+        ),
+        handler=handler,
+    )
+
+
+def _header_of_rosout() -> messages.OwnHeaderStated:
+    from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
+
+    return rosout.header(standard_definitions())

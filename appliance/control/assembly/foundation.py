@@ -1,0 +1,221 @@
+"""Make the first part of control: the store, the audit log, the policy, the tunnels and the listening sockets."""
+
+import asyncio
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import structlog
+
+from appliance.audit.log.ids import IdSource
+from appliance.audit.log.log import AuditLog
+from appliance.configuration.settings import Settings
+from appliance.control.assembly.host_authority import HostAuthority, make_host_authority
+from appliance.control.assembly.host_blocks import BlockTable, blocks_at_start
+from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.control.assembly.open_audit import open_audit
+from appliance.control.assembly.policies import Policies
+from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
+from appliance.control.assembly.robot import robot_addresses
+from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
+from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.replication import Pair, Replication, make_replication
+from appliance.hosts.host_table import HostTable
+from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.master.graph.registry import Registry
+from appliance.master.reconcile.enactor import Enforcement
+from appliance.quotas.pool import QuotaClass
+from appliance.recorder.recording_plan import RecordingPlan
+from appliance.rpc.server import listen
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+
+T = TypeVar("T")
+RVMASTER, INNER, OWN = "rvmaster", "inner", "own"
+"""The names of the listeners for nodes, for the ROS master, and for the appliance's own nodes."""
+
+_log = structlog.get_logger()
+
+
+class Current(Generic[T]):
+    """A value that is set after its readers are made. Call this object to get the value."""
+
+    def __init__(self) -> None:
+        self._values: list[T] = []
+
+    def set(self, value: T) -> None:
+        """Set the value."""
+        self._values = [value]
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
+
+    def __call__(self) -> T:
+        """Return the value. Raises `RuntimeError` before it is set."""
+        if not self._values:
+            raise RuntimeError("this part of control is used before it is created")
+        return self._values[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Foundation:
+    """The durable state, the policy and the listeners.
+
+    `enforcement` gets its value later. `parameters_dirty` is set whenever the mirror of the parameters changes.
+    `pair` and `replication` exist on one of two appliances.
+    """
+
+    settings: Settings
+    lifeline: ControlLifeline
+    compiler: SpecificationCompiler
+    signing: SignerRequests
+    host_authority: HostAuthority
+    audit: AuditLog
+    receipts: ReceiptFloor
+    trail: AuditTrail
+    plan: RecordingPlan
+    store: StateStore
+    blocks: BlockTable
+    table: HostTable
+    tunnels: Tunnels
+    policies: Policies
+    registry: Registry
+    quota_class: HostQuotaClass
+    listener_limits: ListenerLimits
+    sockets: Mapping[str, socket.socket]
+    enforcement: Current[Enforcement]
+    parameters_dirty: asyncio.Event
+    pair: Pair | None
+    replication: Replication | None
+
+    def port(self, name: str) -> int:
+        """Return the port of a listener."""
+        return int(self.sockets[name].getsockname()[1])
+
+
+async def make_foundation(
+    settings: Settings,
+    lifeline: ControlLifeline,
+    compiler: SpecificationCompiler,
+    tunnels: Current[Tunnels],
+    pair: Pair | None,
+    *,
+    restarted: bool,
+) -> Foundation:
+    """Open the log and the store, read the policy and open the listeners.
+
+    `tunnels` is set here, before the supervisor can report about tunnels.
+
+    Raises `PolicyRefusedError`, `StoreError`, and `OSError` if an address is in use.
+    """
+    audit, quota_class, enforcement = Current[AuditLog](), Current[HostQuotaClass](), Current[Enforcement]()
+    signing = SignerRequests(audit)
+    receipts = ReceiptFloor(settings)
+    held_by = lifeline.log_held()
+    audit.set(
+        open_audit(
+            settings,
+            signing,
+            held_by,
+            class_of=lambda host: _class_of(quota_class, host),
+            kept_for=lambda host: bool(quota_class) and quota_class().has_reserve(host),
+            receipts=receipts,
+        )
+    )
+    plan = RecordingPlan(settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next)
+    trail = AuditTrail(
+        audit(),
+        strict=settings.audit.durability == "strict",
+        deny_when_failed=settings.audit.on_audit_failure == "deny",
+        recordings=plan.detail,
+    )
+    store = StateStore(
+        settings.state / "control", failed=lambda reason: _log.error("state is not written", reason=reason)
+    )
+    replication = make_replication(settings, pair, store)
+    blocks = blocks_at_start(store, pair, settings.state / "control")
+    # The policy names hosts by address. These addresses are reliable only once clear text from them is blocked, so
+    # start the tunnels before the policy.
+    table = make_host_table(settings, store)
+    host_authority = make_host_authority(
+        settings, signing.link, store, trail, table, pair=pair, replication=replication
+    )
+    tunnels.set(Tunnels(table, trail, *host_authority, listen=settings.listen_address, say=lifeline.say))
+    if pair is not None:
+        pair.tunnels.hand_to(tunnels())
+    await tunnels().start()
+    policies = Policies(
+        settings.policy,
+        store,
+        trail,
+        robot=robot_addresses(settings, pair.membership.witness if pair is not None else None),
+        hosts=lambda: tunnels().addresses,
+        blocks=lambda: blocks.reasons,
+        live=lambda: enforcement().revocation.live(),  # noqa: PLW0108  it is assembled later
+        changed=lambda before, policy: enforcement().policy_changed(before, policy),
+        carried_out=lambda: enforcement().carried_out(),
+        site_keys=settings.site_keys,
+    )
+    policies.start(restarted=restarted or pair is not None)
+    registry = Registry()
+    quota_class.set(HostQuotaClass(lambda: policies.current, registry.registrations_of))
+    return Foundation(
+        settings=settings,
+        lifeline=lifeline,
+        compiler=compiler,
+        signing=signing,
+        host_authority=host_authority,
+        audit=audit(),
+        receipts=receipts,
+        trail=trail,
+        plan=plan,
+        store=store,
+        blocks=blocks,
+        table=table,
+        tunnels=tunnels(),
+        policies=policies,
+        registry=registry,
+        quota_class=quota_class(),
+        listener_limits=ListenerLimits(settings, trail, lambda: policies.current, quota_class()),
+        sockets=_open_listeners(settings, lifeline),
+        enforcement=enforcement,
+        parameters_dirty=asyncio.Event(),
+        pair=pair,
+        replication=replication,
+    )
+
+
+def make_host_table(settings: Settings, store: StateStore) -> HostTable:
+    """Return the table of the hosts in the store, with those that hosts.yaml or a bundle declares."""
+    kept = store.settings()
+    declared = DeclaredHosts(settings.hosts, kept.get(BUNDLED_HOSTS, ""), kept.get(DECLARED_HOSTS, ""))
+    return HostTable(store, settings.ipsec.pool, declared)
+
+
+def _open_listeners(settings: Settings, lifeline: ControlLifeline) -> dict[str, socket.socket]:
+    host, port = settings.listen_address
+    sockets = lifeline.sockets
+    for name, address in ((RVMASTER, (host, port)), (INNER, ("127.0.0.1", 0)), (OWN, ("127.0.0.1", 0))):
+        if name not in sockets:
+            sockets[name] = open_listener(*address)
+            lifeline.keep(name, sockets[name])
+    return sockets
+
+
+def open_listener(host: str, port: int) -> socket.socket:
+    """Return a listening socket. Raises `OSError` with what to do."""
+    try:
+        return listen(host, port)
+    except OSError as error:
+        raise OSError(
+            f"{host}:{port} cannot be listened on: {error.strerror}; "
+            "is a ROS master running there? Stop it, or choose another --listen"
+        ) from error
+
+
+def _class_of(quota_class: Current[HostQuotaClass], host: str) -> QuotaClass:
+    # Before the policy is read, all hosts count as named.
+    return quota_class().of_text(host) if quota_class else QuotaClass.NAMED

@@ -1,0 +1,109 @@
+"""Keep the hosts that operators block, with the ends of their blocks. The policy denies all their requests.
+
+Invariants:
+
+1. A block is stored before it takes effect, and survives restarts of control and of the appliance.
+2. A block ends by the age clock (`base/age_clock.py`): changes of the system clock neither end nor extend it.
+   After a takeover by another appliance, `stored_times.py` moves the ends to its age clock.
+3. `reasons` is never changed, only replaced. So a policy keeps the blocks with which it was put into force.
+"""
+
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+from appliance.base import clock
+from appliance.base.age_clock import AgeClock
+from appliance.control.assembly.stored_times import adopt_times
+from appliance.control.replication import Pair
+from appliance.policy.model import Address, address_of
+from appliance.store.host_tables import HostBlockRow
+from appliance.store.state_file import StateStore
+
+_SECOND = 1_000_000_000
+_NOTE_SHOWN = 60  # characters; the reason of a decision is bounded
+
+
+class BlockTable:
+    """All blocks, by canonical address; `age()` is the age clock."""
+
+    def __init__(self, store: StateStore, age: Callable[[], int]) -> None:
+        self._store = store
+        self._age = age
+        self._rows = {address_of(row.address): row for row in store.hosts.blocks()}
+        self._now, self._wall, self._seen = age() if self._rows else 0, clock.wall(), clock.since_boot_ns()
+        self.reasons: Mapping[Address, str] = self._described()
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def rows(self) -> dict[Address, HostBlockRow]:
+        """Return all blocks, the earliest first."""
+        return dict(self._rows)
+
+    def read_clock(self) -> None:
+        """Read the age clock, which may write a file. Only one thread at a time may call this."""
+        self._now, self._wall, self._seen = self._age(), clock.wall(), clock.since_boot_ns()
+
+    def age_now(self) -> int:
+        """Return the age clock's time, from the last reading and the time since."""
+        return self._now + clock.since_boot_ns() - self._seen
+
+    def until(self, row: HostBlockRow) -> float | None:
+        """Return the end of a block by the present system clock, in seconds since the epoch; None: it has no end."""
+        return None if row.ends is None else self._wall + (row.ends - self._now) / _SECOND
+
+    def put(self, address: Address, *, seconds: float | None, who: str, note: str) -> HostBlockRow:
+        """Store a block from now on, in place of an earlier block of the host."""
+        ends = None if seconds is None else self._now + int(seconds * _SECOND)
+        row = HostBlockRow(str(address), clock.wall(), ends, who, note)
+        self._store.hosts.save_block(row)
+        self._rows.pop(address, None)
+        self._rows[address] = row
+        self.reasons = self._described()
+        return row
+
+    def take(self, address: Address) -> HostBlockRow | None:
+        """Remove the block of a host; return None if it is not blocked."""
+        row = self._rows.get(address)
+        if row is not None:
+            self._store.hosts.forget_block(row.address)
+            del self._rows[address]
+            self.reasons = self._described()
+        return row
+
+    def due(self) -> list[Address]:
+        """Return the hosts whose blocks are over."""
+        return [
+            address for address, row in self._rows.items() if row.ends is not None and row.ends <= self._now
+        ]
+
+    def seconds_left(self) -> float | None:
+        """Return the seconds until the first block is over; None if no block has an end."""
+        ends = [row.ends for row in self._rows.values() if row.ends is not None]
+        return max(0.0, (min(ends) - self._now) / _SECOND) if ends else None
+
+    def _described(self) -> dict[Address, str]:
+        return {address: self._description(row) for address, row in self._rows.items()}
+
+    def _description(self, row: HostBlockRow) -> str:
+        until = self.until(row)
+        end = "" if until is None else f" until {in_utc(until)}"
+        note = row.note if len(row.note) <= _NOTE_SHOWN else f"{row.note[: _NOTE_SHOWN - 1]}…"
+        about = f": {note}" if note else ""
+        return f"blocked by {row.who}{end}{about}; lift it with `rosrv host unblock {row.address}`"
+
+
+def blocks_at_start(store: StateStore, pair: Pair | None, directory: Path) -> BlockTable:
+    """Return the stored blocks, with the age clock of this directory.
+
+    On one of two appliances, first move all times in the state to its clocks.
+    """
+    age = AgeClock(directory / "age")
+    adopt_times(store, pair, age)
+    return BlockTable(store, age)
+
+
+def in_utc(seconds: float) -> str:
+    """Return a time (seconds since the epoch) as text, to the second."""
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%SZ")

@@ -1,0 +1,207 @@
+"""Limit the listeners of control: RVMaster, and the peer-side and master-side proxy endpoints.
+
+An unknown host (an address that no rule of the policy names, or that an operator blocks) is refused. If a section of
+the policy is audit-only, only a blocked host is. The beginning of the body is read first, to record the name of the
+call. While the ROS master is not hidden, every host is refused.
+"""
+
+import socket
+from collections.abc import Callable
+from functools import partial
+
+from appliance.audit.log.record import Severity
+from appliance.configuration.settings import Settings
+from appliance.master.calls.call import with_record
+from appliance.master.calls.request_peek import asked_for
+from appliance.policy.model import Address, text_for_caller
+from appliance.policy.policy import Policy
+from appliance.quotas.descriptors import connections_within
+from appliance.quotas.pool import Bounds, QuotaClass
+from appliance.quotas.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
+from appliance.rpc.connection_table import ConnectionTable
+from appliance.rpc.fair_queue import Turns
+from appliance.rpc.front import HttpLimits
+from appliance.rpc.processor_time import ProcessorTime
+from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
+from appliance.rpc.source_queues import NamedFirst
+from appliance.telemetry.audit_trail import AuditTrail
+from roswire.xmlrpc import XmlRpcLimits, build_fault
+
+
+class ListenerLimits:
+    """The limits and connections of all listeners.
+
+    `policy()` returns the policy in force; `quota_class(host)` returns the quota class of a host.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        trail: AuditTrail,
+        policy: Callable[[], Policy],
+        quota_class: Callable[[Address], QuotaClass],
+    ) -> None:
+        limits = settings.limits
+        self.http = HttpLimits(
+            head_bytes=int(limits.header_bytes),
+            head_seconds=limits.header_seconds,
+            body_bytes=int(limits.body_bytes),
+            idle_seconds=limits.idle_seconds,
+        )
+        self.connection_table = ConnectionTable(
+            quota_class,
+            connections=RVMASTER_CONNECTIONS.bounds.sized(
+                connections_within(limits.connections), limits.connections_per_host
+            ),
+            connection_class=partial(connection_class_of, policy, quota_class),
+        )
+        alike = partial(class_of, policy, quota_class)
+        self.turns = Turns(RVMASTER_REQUESTS.bounds, quota_class, alike, trail.pause, own_slots=True)
+        self.time = ProcessorTime(alike)
+        self.first = NamedFirst(policy)
+        self.own_connection_table = ConnectionTable(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
+        self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
+        self._trail = trail
+        self._policy = policy
+        self._unhidden = ""
+        self._servers: list[HttpServer] = []
+
+    async def open(
+        self,
+        sock: socket.socket,
+        handler: Handler,
+        *,
+        guarded: bool,
+        at_once: AtOnce = not_at_once,
+        keep: bool = True,
+    ) -> None:
+        """Serve a listener. `guarded` is false for a listener that only the appliance's own processes can reach."""
+        server = self.server(sock.dup(), handler, guarded=guarded, at_once=at_once, keep=keep)
+        self._servers.append(server)
+        await server.start()
+
+    def server(
+        self,
+        sock: socket.socket,
+        handler: Handler,
+        *,
+        guarded: bool = True,
+        at_once: AtOnce = not_at_once,
+        keep: bool = True,
+    ) -> HttpServer:
+        """Return a server that shares the limits of all listeners. The caller must start and close the server."""
+        return HttpServer(
+            sock,
+            handler,
+            at_once=at_once,
+            limits=self.http,
+            connection_table=self.connection_table if guarded else self.own_connection_table,
+            turns=self.turns if guarded else self._own_turns,
+            time=self.time,
+            first=self.first if guarded else None,
+            keep=keep,
+            refuse=self.refuse if guarded else lambda _peer: None,
+            troubled=self.troubled,
+            malformed=self.malformed,
+        )
+
+    def close(self) -> None:
+        """Stop serving."""
+        for server in self._servers:
+            server.close()
+
+    def refuse(self, peer: Peer) -> Refusal | None:
+        """Return the refusal for a peer, or None if the peer is served."""
+        if self._unhidden:
+            fault = build_fault(1, f"the appliance does not serve nodes: {self._unhidden}")
+            return lambda _beginning: fault
+        policy = self._policy()
+        # The rosout aggregator calls from this machine. The policy need not name this machine.
+        if peer.here or policy.serves(peer.host):
+            return None
+        denial = policy.blocked(peer.host)
+        reason = f"no rule of the policy names {peer.text}" if denial is None else denial.reason
+        told = reason if denial is None else text_for_caller(denial, policy.tell)
+        return partial(self._refuse_unknown, peer, reason, told)
+
+    def _refuse_unknown(self, peer: Peer, reason: str, told: str, beginning: bytes) -> bytes:
+        asked = asked_for(peer, beginning)
+        record = self._trail.happened(
+            "decision",
+            reason,
+            severity=Severity.WARNING,
+            decision="deny",
+            host=peer.text,
+            caller_id=asked.caller_id,
+            category=asked.category.value,
+            resource=asked.resource,
+            more=asked.about,
+        )
+        return build_fault(1, with_record(told, record))
+
+    def troubled(self, peer: Peer, reason: str) -> None:
+        """Record that a peer exceeded a limit."""
+        self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        """Record that a peer sent something that is not a request."""
+        self._trail.happened("malformed", reason, decision="deny", host=peer.text)
+
+    def probed(self, reason: str) -> None:
+        """Handle the result of the supervisor's probe. `reason` is empty if the ROS master is hidden."""
+        if bool(reason) != bool(self._unhidden):
+            event = "probe failed" if reason else "probe passed"
+            self._trail.happened(event, reason or "the ROS master is hidden")
+        self._unhidden = reason
+
+
+def value_limits(settings: Settings) -> XmlRpcLimits:
+    """Return the configured bounds of XML-RPC values."""
+    limits = settings.limits
+    return XmlRpcLimits(
+        body=int(limits.body_bytes),
+        elements=limits.elements,
+        depth=limits.nesting,
+        string=int(limits.string_bytes),
+        parts=limits.multicall_parts,
+    )
+
+
+ClassOf = Callable[[Address], QuotaClass]
+_UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
+
+
+def class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> str:
+    """Return the class that is charged for a host's processor time, and that shares turns.
+
+    The class is the address or network that the policy names. A host can have many addresses, so all hosts that only
+    `*` names share one class, or a second one if they have a registration.
+    """
+    if host.is_loopback or policy().names(host):
+        return policy().alike(host)
+    return _ANYBODY if quota_class(host) is QuotaClass.REGISTERED else _UNKNOWN
+
+
+def connection_class_of(policy: Callable[[], Policy], quota_class: ClassOf, host: Address) -> QuotaClass:
+    """Return a host's quota class for connections.
+
+    Hosts that only `*` names share processor time as one host. So their connections must not use up the quotas of hosts
+    that the policy names. Without a registration, they count as unknown; with a registration, as named. Any of these
+    hosts can register a node, so they do not get the part for registered hosts.
+    """
+    found = class_of(policy, quota_class, host)
+    if found == _UNKNOWN:
+        return QuotaClass.UNKNOWN
+    return QuotaClass.NAMED if found == _ANYBODY else quota_class(host)
+
+
+# The bounds for the appliance's own nodes and the ROS master: they share one address, and no other host can reach their
+# listeners.
+_FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (
+    Bounds(whole=bounds.whole, host=bounds.whole, unknown=0, kept=0)
+    for bounds in (RVMASTER_CONNECTIONS.bounds, RVMASTER_BYTES.bounds, RVMASTER_REQUESTS.bounds)
+)
+
+
+def _own_node(_host: Address) -> QuotaClass:
+    return QuotaClass.REGISTERED

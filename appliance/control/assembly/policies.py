@@ -1,0 +1,392 @@
+"""Manage the policy in force: load it, store revisions, roll back, and limit the time of an unconfirmed change.
+
+A new policy passes the gate (`policy_gate.py`) before it takes effect, also at a start. An invalid policy changes
+nothing, and all findings are reported. The store keeps every policy that came into force as a revision.
+
+Operators' changes are made one at a time. A change that expects a revision other than the one in force is rejected. A
+change is answered once it is on disk and the relays have carried it out: revoked traffic no longer passes.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import structlog
+
+from appliance.base import clock
+from appliance.base.actors import DISK, UNCONFIRMED
+from appliance.base.withdrawal import take_effect
+from appliance.channel import admin
+from appliance.channel.answers import policy_answers as answers
+from appliance.channel.answers.policy_answers import Loaded
+from appliance.control.assembly.policy_gate import (
+    KeptPolicy,
+    PolicyRefusedError,
+    judged,
+    policy_at_start,
+    read_policy,
+    with_cases,
+)
+from appliance.control.errors import UnknownThingError
+from appliance.policy.host_sets import Network
+from appliance.policy.judgement import PolicyContext
+from appliance.policy.live_rights import LiveRight, deprived
+from appliance.policy.model import Address
+from appliance.policy.policy import Policy
+from appliance.signing.fingerprints import fingerprint
+from appliance.signing.site_keys import signer
+from appliance.store.revisions import LIMITS, Revisions, reloaded_by
+from appliance.store.state_file import RevisionRow, StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+
+_REFUSED = "policy file refused"
+_log = structlog.get_logger()
+_SHOWN_NODES = 3
+
+
+class PolicyCases(NamedTuple):
+    """Test cases that come with a policy: the name of their file, and their text (None: no cases)."""
+
+    file: str
+    text: str | None
+
+
+def kept_policy(row: RevisionRow) -> KeptPolicy:
+    """Return a stored revision for the gate."""
+    return KeptPolicy(row.revision, row.text, row.file, row.who, row.signature)
+
+
+class RevisionChangedError(Exception):
+    """The revision in force is not the revision that the change expects; the message has both numbers."""
+
+    def __init__(self, expected: int, found: int) -> None:
+        super().__init__(f"revision {found} is in force, not {expected}: read it before you change it")
+
+
+class Policies(Revisions[RevisionRow]):
+    """The policy in force and its revisions. The marked methods answer requests about them."""
+
+    refusal = PolicyRefusedError
+    outdated = RevisionChangedError
+
+    def __init__(
+        self,
+        file: Path,
+        store: StateStore,
+        trail: AuditTrail,
+        *,
+        robot: Collection[Address | Network],
+        hosts: Callable[[], Mapping[str, Address]],
+        blocks: Callable[[], Mapping[Address, str]],
+        live: Callable[[], Iterable[LiveRight]],
+        changed: Callable[[Policy, Policy], int],
+        carried_out: Callable[[], Awaitable[None]],
+        site_keys: Sequence[str],
+    ) -> None:
+        """Prepare; `start` brings a policy into force.
+
+        `hosts()` returns the addresses for `host:NAME`; the owner calls `hosts_changed` when they change. `blocks()`
+        returns the blocked hosts (`Policy.blocks`); the owner calls `blocks_changed` when they change. `live()` returns
+        the live rights of all hosts.
+        `changed(before, policy)` decides all live rights again, and returns the number of revocations. `carried_out()`
+        waits until the relays have carried out all orders. With `site_keys`, one of these keys must sign every policy.
+        """
+        nothing = RevisionRow(0, "", "", 0.0, "", "")
+        super().__init__(store, store.revisions, store.save_revision, nothing, LIMITS[0])
+        self.file = file
+        self._trail = trail
+        self._robot = robot
+        self._hosts = hosts
+        self._blocks = blocks
+        self._live = live
+        self._changed = changed
+        self._carried_out = carried_out
+        self._site_keys = site_keys
+        self._current: Policy | None = None
+        self.file_refused = store.settings().get(_REFUSED, "")
+        """Why the file was refused at the last start or reload, in a line; empty: it was not."""
+
+    @property
+    def current(self) -> Policy:
+        """Return the policy in force."""
+        if self._current is None:
+            raise RuntimeError("no policy is loaded yet")
+        return self._current
+
+    @property
+    def differs_from_file(self) -> bool:
+        """Whether the policy in force differs from the file."""
+        try:
+            return read_policy(self.file) != (self.current.text, self.in_force.signature)
+        except PolicyRefusedError:
+            return True
+
+    def start(self, *, restarted: bool) -> None:
+        """Bring a policy into force at the start of control. Raises `PolicyRefusedError`.
+
+        After a crash of control (`restarted`), this is the policy that was in force. At the start of the appliance, it
+        is the file, if a reload would take it: otherwise the last revision stays in force, with an alarm. Exception: if
+        an operator's own revision (from a rollback or REST) was in force when the appliance stopped, this revision is
+        used.
+        """
+        kept_first = self._find_last(restarted=restarted)
+        kept = kept_policy(self.in_force) if self.revision else None
+        policy, signature, refused = policy_at_start(kept, self.file, self.known, kept_first=kept_first)
+        if kept is None or (kept.text, kept.signature) != (policy.text, signature):
+            self._end_limit()
+            self._keep(policy, signature, who=DISK, note="read at start")
+            return
+        self._enforce(policy)
+        self._resume()
+        if refused is not None:
+            self._file_refused(refused)
+        elif not kept_first:
+            self._note_refused("")
+
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
+        """Run an operator's change exclusively, then wait until it is on disk and carried out."""
+        async with super()._changing(expected):
+            yield
+            await self.store.settled()
+            await self._carried_out()
+
+    async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
+        """Read the file again: check, test and load it, and decide all live rights again.
+
+        The author of the revision is always `disk`; `who` is recorded and in the note. Raises `PolicyRefusedError`.
+        Raises `RevisionChangedError` if another revision came into force in the meantime.
+        """
+        within, note = request.confirm_within, reloaded_by(who)
+        async with self._changing(request.expected):
+            try:
+                policy, signature = await self._prepared(lambda: read_policy(self.file), str(self.file), who)
+            except PolicyRefusedError as error:
+                self._note_refused(error.findings[0])
+                raise
+            return self._keep(policy, signature, who=DISK, note=note, by=who, within=within)
+
+    async def attempt(self, text: str, signature: str, cases: PolicyCases) -> None:
+        """Compile and test a text without loading it. Raises `PolicyRefusedError`."""
+        await asyncio.to_thread(self._tested, lambda: (text, signature), "policy.ini", self.known, cases)
+
+    async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
+        """Bring a given text into force, as `reload` does with the file.
+
+        Loading the same text again makes no new revision. Messages cite its rules as `revision N:line`, because the
+        lines of the file may differ. Raises `PolicyRefusedError` and `RevisionChangedError`.
+        """
+        return await self.load_with(request, who, None)
+
+    async def load_with(self, request: admin.PolicyLoad, who: str, cases: PolicyCases | None) -> Loaded:
+        """Load as `load` does, with test cases that replace those beside the file (None: those of the file)."""
+        given, within = (request.text, request.signature), request.confirm_within
+        async with self._changing(request.expected):
+            now = self.in_force
+            if now.who != DISK and (now.text, now.signature) == given:
+                return self._loaded(self.revision, 0)
+            name = f"revision {self.revision + 1}"
+            policy, signature = await self._prepared(lambda: given, name, who, cases)
+            return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
+
+    def hosts_changed(self) -> int:
+        """Compile the policy in force again, because hosts changed. Return the number of revocations."""
+        try:
+            policy = judged(self.current.text, self.in_force.signature, self.current.file, self.known)
+        except PolicyRefusedError as error:  # a defect: the same text was valid before
+            _log.error("the policy does not know the new hosts", findings=error.findings)
+            return 0
+        return self._enforce(policy)
+
+    def blocks_changed(self) -> int:
+        """Decide by the present blocks of hosts. Return the number of revocations."""
+        return self._enforce(self.current)
+
+    async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
+        """Bring a kept revision into force. Raises `PolicyRefusedError` and `RevisionChangedError`."""
+        async with self._changing(request.expected):
+            return await self.rollback(request.revision, who=who)
+
+    async def rollback(self, revision: int | None, *, who: str) -> Loaded:
+        """Bring a kept revision into force (None: the previous revision).
+
+        Raises `PolicyRefusedError`. Raises `RevisionChangedError` if another revision came into force in the meantime.
+        """
+        row = await self._wanted(revision)
+        policy = judged(row.text, row.signature, row.file, self.known)
+        return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
+
+    async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
+        """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
+        async with self._changing(request.expected):
+            waited = self.confirm_by is not None
+            if waited:
+                self._end_limit()
+                self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
+            return answers.PolicyConfirmed(waited, self.revision)
+
+    async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
+        """Return the kept revisions."""
+        rows = [self._described(row) for row in await self._kept()]
+        return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
+
+    async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
+        """Return a revision and the context for checks of its text. Raises `UnknownThingError`."""
+        row = await self._kept_revision(self.revision if request.revision is None else request.revision)
+        return await asyncio.to_thread(self._text, row, self.known)
+
+    async def one_revision(self, request: admin.PolicyRevisionWanted) -> answers.RevisionText:
+        """Return a revision with its text. Raises `UnknownThingError`."""
+        row = await self._kept_revision(request.revision)
+        return msgspec.convert(self._described(row), answers.RevisionText)
+
+    async def compiled(self, number: int) -> Policy | None:
+        """Return a kept revision as a policy; None if it is not kept, or not valid any more."""
+        try:
+            row = await self._kept_revision(number)
+            return judged(row.text, row.signature, row.file, self.known)
+        except (UnknownThingError, PolicyRefusedError):
+            return None
+
+    async def _kept_revision(self, number: int) -> RevisionRow:
+        row = self.in_force if number == self.revision else await self._find(number)
+        if row is None:
+            raise UnknownThingError(f"there is no revision {number}")
+        return row
+
+    def _text(self, row: RevisionRow, known: PolicyContext) -> answers.PolicyKnown:
+        return answers.PolicyKnown(
+            **self._described(row),
+            policy_file=str(self.file),
+            differs_from_file=self.differs_from_file,
+            warnings=[str(warning) for warning in self.current.warnings],
+            confirm_by=self.confirm_by,
+            **with_cases(known, self.file).fields(),
+        )
+
+    @property
+    def known(self) -> PolicyContext:
+        """Return the present context of policies: hosts, robot and site keys."""
+        return PolicyContext(
+            dict(self._hosts()), self._robot, site_keys=self._site_keys, blocks=self._blocks()
+        )
+
+    # --- inside ---
+
+    async def _prepared(
+        self, read: Callable[[], tuple[str, str]], file: str, who: str, cases: PolicyCases | None = None
+    ) -> tuple[Policy, str]:
+        """Read, compile and test a policy in a thread, without delay for nodes. Return it with its signature."""
+        before = self.revision
+        try:
+            while True:
+                known = self.known
+                policy, signature = await asyncio.to_thread(self._tested, read, file, known, cases)
+                if self._hosts() == known.hosts:
+                    break
+        except PolicyRefusedError as error:
+            self._refused(error, who)
+            raise
+        if self.revision != before:  # changed by a signal, or a late confirmation
+            raise RevisionChangedError(before, self.revision)
+        return policy, signature
+
+    def _refused(self, error: PolicyRefusedError, who: str) -> None:
+        self._trail.happened(
+            "policy refused",
+            f"revision {self.revision} stays in force: {error.findings[0]}",
+            findings=error.findings[:100],
+            who=who,
+        )
+
+    def _note_refused(self, reason: str) -> None:
+        """Keep why the file was refused, also for a control that follows after a crash."""
+        if reason != self.file_refused:
+            self.file_refused = reason
+            self.store.save_setting(_REFUSED, reason)
+
+    def _file_refused(self, error: PolicyRefusedError) -> None:
+        """Report in the log, the records and the status that the start refused the file."""
+        self._note_refused(error.findings[0])
+        text = f"revision {self.revision} stays in force, because the start refused {self.file}"
+        _log.error(text, findings=error.findings[:100])
+        self._trail.happened(
+            "policy file refused",
+            f"{text}: {self.file_refused}",
+            findings=error.findings[:100],
+            revision=self.revision,
+        )
+
+    def _tested(
+        self,
+        read: Callable[[], tuple[str, str]],
+        file: str,
+        known: PolicyContext,
+        cases: PolicyCases | None = None,
+    ) -> tuple[Policy, str]:
+        text, signature = read()
+        tested = (
+            with_cases(known, self.file)
+            if cases is None
+            else replace(known, cases_file=cases.file, cases=cases.text)
+        )
+        return judged(text, signature, file, tested), signature
+
+    def _keep(
+        self,
+        policy: Policy,
+        signature: str,
+        *,
+        who: str,
+        note: str,
+        by: str | None = None,
+        within: float | None = None,
+    ) -> Loaded:
+        take_effect()
+        self._note_refused("")
+        before = self.revision
+        row = RevisionRow(before + 1, policy.text, policy.file, clock.wall(), who, note, signature)
+        lost = [] if self._current is None else _losses(policy, self._live())
+        self._put_in_force(row, within)
+        revoked = self._enforce(policy)
+        self._trail.happened(
+            "policy loaded",
+            f"revision {row.revision} is in force: {note}",
+            who=by or who,
+            file=policy.file,
+            sha256=fingerprint(policy.text),
+            signed_by=signer(self._site_keys, policy.text, signature),
+            revoked=revoked,
+            warnings=[*lost, *map(str, policy.warnings)][:100],
+        )
+        return self._loaded(before, revoked, lost)
+
+    def _enforce(self, policy: Policy) -> int:
+        before, self._current = self._current, replace(policy, blocks=dict(self._blocks()))
+        self._trail.revision = self.revision
+        return 0 if before is None else self._changed(before, self._current)
+
+    def _loaded(self, before: int, revoked: int, lost: Sequence[str] = ()) -> Loaded:
+        warnings = [*lost, *map(str, self.current.warnings)]
+        return Loaded(self.revision, before, warnings, revoked, self.confirm_by)
+
+    async def _go_back(self, revision: int) -> None:
+        await self.rollback(revision, who=UNCONFIRMED)
+
+
+def _losses(policy: Policy, live: Iterable[LiveRight]) -> list[str]:
+    """Return a warning for each host with nodes that keeps none of its rights under this policy."""
+    return [
+        f"warning: {host} has nodes ({_some(nodes)}) and loses all its rights: if that is a mistake, "
+        "`rosrv policy rollback` and name the host in the policy"
+        for host, nodes in deprived(policy, live).items()
+    ]
+
+
+def _some(names: Collection[str]) -> str:
+    more = f" and {len(names) - _SHOWN_NODES} more" if len(names) > _SHOWN_NODES else ""
+    return ", ".join(sorted(names)[:_SHOWN_NODES]) + more

@@ -1,0 +1,1 @@
+"""Connect control to the supervisor and the signer."""

@@ -1,0 +1,84 @@
+"""Send requests to the signer: sign checkpoints of the audit log, approve removals from the log, make certificates.
+
+Missing signatures are requested again whenever a signer process starts.
+"""
+
+import asyncio
+import os
+from collections.abc import Callable
+
+from appliance.audit.log.log import AuditLog
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
+from appliance.configuration.settings import Settings
+
+_ANY = 1 << 63
+
+
+class ReceiptFloor:
+    """The last record that retention by age may remove: any, or with `fleet.retention_waits` what the collector has.
+
+    While only the reserve of the log's disk is free, it is any record. One thread writes, another reads.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._folder = settings.state / "control"
+        self._reserve = int(settings.audit.reserve_bytes)
+        self._received = 0 if settings.fleet.retention_waits else _ANY
+
+    def received(self, sequence: int) -> None:
+        """Note that the collector has all records up to this sequence."""
+        if self._received != _ANY:
+            self._received = sequence
+
+    def through(self) -> int:
+        """Return the sequence of that record."""
+        disk = os.statvfs(self._folder)
+        return self._received if disk.f_bavail * disk.f_frsize >= self._reserve else _ANY
+
+
+class SignerRequests:
+    """The link to the signer; `want` and `want_removal` are thread-safe."""
+
+    def __init__(self, audit: Callable[[], AuditLog]) -> None:
+        self.link = Link(self._heard)
+        self.signed = asyncio.Event()
+        """Set with each signature of a checkpoint, after the log got it."""
+        self._audit = audit
+        self._loop = asyncio.get_running_loop()
+
+    def want(self, number: int, text: bytes) -> None:
+        """Request the signature of a checkpoint. The log calls this method on its own thread."""
+        self._ask(messages.SignatureWanted(number, text))
+
+    def want_removal(self, number: int, checkpoint: bytes, newest: bytes) -> None:
+        """Request approval to remove the records up to a checkpoint. The log calls this method on its own thread."""
+        self._ask(messages.RemovalWanted(number, checkpoint, newest))
+
+    def _ask(self, message: messages.Message) -> None:
+        self._loop.call_soon_threadsafe(self.link.send, message)
+
+    def attach(self, channel: Channel) -> None:
+        """Attach the link of a started signer, and request missing signatures."""
+        self.link.attach(channel)
+        self._audit().request_signatures()
+
+    def _heard(self, message: object) -> None:
+        match message:
+            case messages.SignatureMade(number, signature, public_key):
+                self._audit().signed(number, signature, public_key)
+                self.signed.set()
+            case messages.SignatureRefused(number, reason):
+                self._audit().refused(number, reason)
+            case messages.RemovalApproved(number, text, signature, public_key):
+                self._audit().removal_approved(number, text, signature, public_key)
+            case messages.RemovalRefused(number, reason, early):
+                self._audit().removal_refused(number, reason, early=early)
+            case (
+                messages.AuthorityStated(number)
+                | messages.CertificateMade(number)
+                | messages.CertificateRefused(number)
+                | messages.RevocationsMade(number)
+            ):
+                self.link.answered(number, message)

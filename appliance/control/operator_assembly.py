@@ -1,0 +1,190 @@
+"""Make the parts that serve operators on the admin socket and over REST: tunnels, tokens, queries and orders."""
+
+from dataclasses import dataclass
+from functools import partial
+
+from appliance.channel.answers.status import AuditState
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.foundation import Current, Foundation
+from appliance.control.bundle_gate import BundleGate
+from appliance.control.bundle_health import RobotHealth
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.forwarder_link import ForwarderLink
+from appliance.control.operators.administration import Administration
+from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
+from appliance.control.operators.block_orders import BlockOrders
+from appliance.control.operators.clock_check import ClockCheck
+from appliance.control.operators.limit_use import LimitQueries
+from appliance.control.operators.overview import hosts_connected
+from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_methods import request_methods
+from appliance.control.operators.switched_off import SwitchedOffWatch
+from appliance.control.operators.token_orders import TokenOrders
+from appliance.control.rest.rest import RestLink
+from appliance.control.rest.rest_certificate import RestCertificate
+from appliance.control.standby_orders import StandbyOrders, StandbySource
+from appliance.hosts.certification import Certification
+from appliance.hosts.enrolment import HostEnrolment, find_endpoint
+from appliance.hosts.rest_address import rest_address
+from appliance.store.stored_deadlines import StoredDeadlines
+
+
+@dataclass(frozen=True, slots=True)
+class Operators:
+    """The parts that serve operators."""
+
+    certification: Certification
+    hosts: HostEnrolment
+    tokens: TokenOrders
+    ends_of_tokens: StoredDeadlines
+    clock: ClockCheck
+    forwarded: ForwarderLink
+    collected: ForwarderLink
+    switched_off: SwitchedOffWatch
+    blocks: BlockOrders
+    standby: StandbyOrders
+    bundles: BundleGate
+    administration: Administration
+    rest: RestLink
+
+
+def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Operators:
+    """Make the parts that serve operators. The specifications must already be loaded."""
+    settings, trail, ends = base.settings, base.trail, parts.endpoints
+    ends_of_tokens = StoredDeadlines(base.store)
+    certification = Certification(
+        base.store,
+        trail,
+        base.host_authority.authority,
+        base.table,
+        base.tunnels,
+        appliances=base.host_authority.appliances,
+        master_port=settings.listen_address[1],
+        rest=rest_address(settings),
+        ends=ends_of_tokens,
+        changed=base.policies.hosts_changed,
+    )
+    hosts = HostEnrolment(
+        certification,
+        partial(find_endpoint, settings, base.lifeline.endpoint),
+        expel=ends.enforcement.expel,
+        carried_out=ends.relay.carried_out,
+        machines=parts.core.registry.machines,
+    )
+    rest = Current[RestLink]()
+    tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
+    clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
+    syslog = settings.audit.syslog
+    forwarded = ForwarderLink(syslog.to, syslog.send, trail)
+    pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
+    collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
+    switched_off = SwitchedOffWatch(
+        parts.monitors, base.policies, base.store, trail, settings.forgotten_after
+    )
+    core = parts.core
+    blocks = BlockOrders(
+        base.blocks,
+        base.policies,
+        base.store,
+        trail,
+        live=core.revocation.live,
+        connected=partial(hosts_connected, parts),
+        enrolled=lambda: {row.name: row.address for row in base.table.enrolled()},
+        remotes=lambda: {name: seen.remote for name, seen in base.tunnels.seen.items()},
+        carried_out=ends.relay.carried_out,
+    )
+    bundles = BundleGate(
+        settings.fleet,
+        policies=base.policies,
+        monitors=parts.monitors,
+        hosts=hosts,
+        store=base.store,
+        trail=trail,
+        health=lambda deprived: RobotHealth.of(
+            trail.meter, base.policies.current, parts.monitors, base.lifeline.surroundings.processes, deprived
+        ),
+    )
+    handled = HandledAlarms(base.store)
+    looks = Queries(
+        parts,
+        trail,
+        base.policies,
+        hosts,
+        base.lifeline.surroundings,
+        audit=partial(_audit_state, base, forwarded, collected),
+        clock=clock.state,
+        recorder=ends.recordings.state,
+        queued_deliveries=lambda: ends.enactor.delivery.waiting,
+        live=core.revocation.live,
+        switched_off=switched_off.rows,
+        blocks=blocks.status,
+        standby=standby.state,
+        bundles=bundles.status,
+        handled=handled.marked,
+        name=base.settings.name,
+    )
+    orders = StandbyOrders(standby, trail)
+    administration = Administration(
+        looks,
+        request_methods(
+            queries=looks,
+            policies=base.policies,
+            monitors=parts.monitors,
+            hosts=hosts,
+            certification=certification,
+            tokens=tokens,
+            recordings=ends.recordings,
+            blocks=blocks,
+            evidence=EvidenceOrders(base.audit, trail),
+            standby=orders,
+            alarms=AlarmOrders(handled, trail, looks.present),
+            limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),
+        ),
+        durable=partial(_durable, base),
+        require_room=base.store.database.require_room,
+    )
+    rest.set(
+        RestLink(
+            administration,
+            tokens,
+            trail,
+            served=certification.served_by,
+            certified=RestCertificate(
+                base.store, trail, "" if base.pair is None else base.pair.membership.name
+            ).stated,
+            require_proof=settings.api_require_proof,
+        )
+    )
+    return Operators(
+        certification=certification,
+        hosts=hosts,
+        tokens=tokens,
+        ends_of_tokens=ends_of_tokens,
+        clock=clock,
+        forwarded=forwarded,
+        collected=collected,
+        switched_off=switched_off,
+        blocks=blocks,
+        standby=orders,
+        bundles=bundles,
+        administration=administration,
+        rest=rest(),
+    )
+
+
+async def _durable(base: Foundation) -> None:
+    """Wait until the records of an order are in the log, and on one of two appliances until its changes are stored."""
+    await base.trail.durable()
+    if base.replication is not None:
+        await base.replication.stored()
+
+
+def _audit_state(base: Foundation, forwarded: ForwarderLink, collected: ForwarderLink) -> AuditState:
+    return AuditState(
+        *base.audit.lag,
+        failed=base.audit.failed,
+        on_failure=base.settings.audit.on_audit_failure,
+        degraded=base.audit.degraded,
+        forwarding=forwarded.status(),
+        collector=collected.status(),
+    )

@@ -1,0 +1,1 @@
+"""Answer the queries and orders of operators."""

@@ -1,0 +1,123 @@
+"""Carry out operators' orders and queries, from the admin socket and from REST.
+
+Each request is a class in `appliance.channel.admin`. To add a request, define its class with a row in the table of
+operations, write the method that answers it, and add the method to the table in `control/operators/request_methods.py`.
+"""
+
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any
+
+from appliance.base.withdrawal import WithdrawnError, require_awaited
+from appliance.channel import admin
+from appliance.channel.admin import A
+from appliance.control.assembly.policies import RevisionChangedError
+from appliance.control.assembly.policy_gate import PolicyRefusedError
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.evidence_orders import NotSealedError
+from appliance.control.lease_client import HandOverError
+from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_methods import RequestMethod
+from appliance.control.operators.token_orders import TokenRefusedError
+from appliance.control.recording_orders import RecorderAwayError
+from appliance.hosts.host_table import (
+    HostForbiddenError,
+    HostRefusedError,
+    HostsChangedError,
+    UnknownHostError,
+)
+from appliance.master.endpoints.topic_taps_control import TooManyTapsError
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specification_manager import (
+    DryRunUnderWayError,
+    MonitorsChangedError,
+    UnknownMonitorError,
+)
+from appliance.store.writer_thread import StoreError
+
+# The first matching exception class is used.
+_TROUBLES: dict[type[Exception], admin.Trouble] = {
+    RevisionChangedError: "conflict",
+    HostsChangedError: "conflict",
+    UnknownThingError: "unknown",
+    SenselessError: "request",
+    TooManyTapsError: "busy",
+    DryRunUnderWayError: "busy",
+    WithdrawnError: "busy",
+    UnknownMonitorError: "unknown",
+    UnknownHostError: "unknown",
+    HostForbiddenError: "forbidden",
+    HostRefusedError: "refused",
+    TokenRefusedError: "refused",
+    RecorderAwayError: "failed",
+    NotSealedError: "failed",
+    HandOverError: "failed",
+    StoreError: "failed",
+}
+# Requests that are rejected if the store cannot be written. A block or revocation is not in the list: it takes effect
+# at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a reason
+# to switch over.
+KEPT = (
+    admin.CHANGES
+    | {admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}
+) - {
+    admin.HostBlock, admin.HostRevoke, admin.TokenRevoke,
+    admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove, admin.StandbyPromote,
+}  # fmt: skip
+
+
+class Administration:
+    """Carry out requests. `durable()` waits until all audit records are on disk, or cannot be written.
+
+    `require_room()` raises `StoreError` if the store cannot be written. Requests in `KEPT` are then rejected.
+    """
+
+    def __init__(
+        self,
+        queries: Queries,
+        methods: Iterable[RequestMethod[Any]],
+        *,
+        durable: Callable[[], Awaitable[object]],
+        require_room: Callable[[], None],
+    ) -> None:
+        self._queries = queries
+        self._durable = durable
+        self._require_room = require_room
+        self._methods = {method.request: method for method in methods}
+
+    async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
+        """Carry out a request of `who`: the name of a token, or `operator` for the admin socket.
+
+        The records of an order are in the audit log before the order is answered, so that a later search finds them. If
+        the client gives up before the order takes effect, the order is withdrawn (`appliance/base/withdrawal.py`).
+        """
+        answer = await self._answer(request, who)
+        if self._methods[type(request)].order:
+            await self._durable()
+        return answer
+
+    async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
+        method = self._methods[type(request)]
+        try:
+            require_awaited()
+            if type(request) in KEPT:
+                self._require_room()
+            return admin.AdminAnswer(True, await method.answer(request, *([who] if method.who else [])))
+        except (PolicyRefusedError, SpecificationsRefusedError) as error:
+            text = self._in_force(error)
+            return admin.AdminAnswer(False, error=text, findings=error.findings, trouble="refused")
+        except MonitorsChangedError as error:
+            return admin.AdminAnswer(False, error=str(error), trouble="conflict", tag=error.tag)
+        except tuple(_TROUBLES) as error:
+            return admin.AdminAnswer(False, error=str(error), trouble=_trouble(error))
+
+    def _in_force(self, error: PolicyRefusedError | SpecificationsRefusedError) -> str:
+        if isinstance(error, PolicyRefusedError):
+            return f"the policy was rejected; revision {self._queries.policies.revision} stays in force"
+        revision = self._queries.parts.monitors.revision
+        return f"rejected; revision {revision} of the specifications stays in force"
+
+
+def _trouble(error: Exception) -> admin.Trouble:
+    if isinstance(error, HostRefusedError) and error.ours:
+        return "failed"
+    return next(trouble for kind, trouble in _TROUBLES.items() if isinstance(error, kind))

@@ -1,0 +1,297 @@
+"""Block hosts and lift their blocks, by operators' orders and at the end of a block's time.
+
+A block takes the same path as a change of the policy: all registrations and grants are decided again, and those of the
+host are denied. When it ends, withdrawn registrations return, as after a change of the policy that grants them again.
+"""
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+from collections import Counter
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+
+from msgspec.structs import asdict, replace
+
+from appliance.base.withdrawal import take_effect
+from appliance.channel import admin
+from appliance.channel.answers import host_answers as answers
+from appliance.channel.answers.status import BlocksState
+from appliance.channel.rest_bodies import LONGEST_BLOCK_SECONDS
+from appliance.control.assembly.host_blocks import BlockTable
+from appliance.control.assembly.policies import Policies
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.hosts.host_table import HostRefusedError
+from appliance.policy.host_names import HostNames, UnknownHostNameError
+from appliance.policy.live_rights import LiveRight
+from appliance.policy.model import Address, address_of
+from appliance.rpc.front import plain_address
+from appliance.store.host_tables import HostBlockRow
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
+
+MOST = 1000
+_LONGEST_NOTE = 200
+_LONGEST_NAME = 300
+_MOST_NAMED = 5
+_FEW = 10  # registrations: two nodes; a robot has more
+_LOOK_SECONDS = 10.0  # the timer does not count while the machine is suspended; the age clock does
+_REGISTERED = {
+    "registerPublisher": "publications",
+    "registerSubscriber": "subscriptions",
+    "registerService": "services",
+    "subscribeParam": "parameters",
+}
+
+
+class BlockOrders:
+    """The operators' requests about blocked hosts.
+
+    `live()` returns the rights that a change of the policy may end, `connected()` the two hosts of each connection
+    through the relay. `enrolled()` returns the addresses of enrolled hosts by name, `remotes()` the real addresses of
+    hosts in tunnels by name. `carried_out()` waits until the relays have carried out all orders.
+    """
+
+    def __init__(
+        self,
+        blocks: BlockTable,
+        policies: Policies,
+        store: StateStore,
+        trail: AuditTrail,
+        *,
+        live: Callable[[], list[LiveRight]],
+        connected: Callable[[], Iterable[Collection[str]]],
+        enrolled: Callable[[], Mapping[str, str]],
+        remotes: Callable[[], Mapping[str, str]],
+        carried_out: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._blocks = blocks
+        self._policies = policies
+        self._store = store
+        self._trail = trail
+        self._live = live
+        self._connected = connected
+        self._enrolled = enrolled
+        self._remotes = remotes
+        self._carried_out = carried_out
+        self._clock_reads = asyncio.Lock()
+        self._changed = asyncio.Event()
+
+    async def listed(self, _request: admin.HostBlocks) -> answers.BlockedHosts:
+        """Return all blocked hosts."""
+        await self._read_clock()
+        return answers.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
+
+    def status(self) -> BlocksState:
+        """Return the number of blocks and the earliest end."""
+        ends = [self._blocks.until(row) for row in self._blocks.rows().values()]
+        return BlocksState(len(ends), min((end for end in ends if end is not None), default=None))
+
+    async def block(self, request: admin.HostBlock, who: str) -> answers.HostBlocked:
+        """Block a host. Raises `SenselessError`, `HostRefusedError` and `StoreError`."""
+        address = self._address(request.address)
+        _require_sensible(request)
+        _require_possible(address)
+        await self._read_clock()
+        before = self._held_by(address)
+        if not request.force:
+            self._require_not_the_robot(address, before)
+        earlier = self._blocks.rows().get(address)
+        if earlier is None and len(self._blocks) >= MOST:
+            raise HostRefusedError(f"{MOST} hosts are blocked, the limit: lift a block (rosrv host blocks)")
+        take_effect()
+        replaced = None if earlier is None else self._row(earlier)
+        row = self._blocks.put(address, seconds=request.for_seconds, who=who, note=request.note)
+        self._apply()
+        # The relays report later that they closed the connections.
+        ended = replace(_difference(before, self._held_by(address)), connections=before.connections)
+        shown = self._row(row)
+        self._trail.happened(
+            "host blocked",
+            f"{address} is {self._blocks.reasons[address]}",
+            host=row.address,
+            whole=True,
+            address=row.address,
+            who=who,
+            until=shown.until,
+            note=row.note,
+            replaced=replaced is not None,
+            forced=request.force,
+            ended=ended,
+        )
+        try:
+            await self._store.settled()
+        except StoreError as error:
+            raise StoreError(
+                f"{address} is blocked now, but a stop of the appliance ends it: {error}"
+            ) from error
+        await self._carried_out()
+        knows = self._policies.current.knows
+        others = sorted(other for other in self._same_machine(row.address) if knows(address_of(other)))
+        return answers.HostBlocked(**asdict(shown), ended=ended, replaced=replaced, other_addresses=others)
+
+    async def unblock(self, request: admin.HostUnblock, who: str) -> answers.HostUnblocked:
+        """Lift the block of a host. Raises `SenselessError`, `UnknownThingError` and `StoreError`."""
+        address = self._address(request.address)
+        await self._read_clock()
+        earlier = self._blocks.rows().get(address)
+        if earlier is None:
+            raise UnknownThingError(f"{address} is not blocked: `rosrv host blocks` lists the blocked hosts")
+        take_effect()
+        shown, restored = self._row(earlier), self._lift([address])
+        self._trail.happened(
+            "host unblocked",
+            f"the block of {address} by {earlier.who} was lifted",
+            host=earlier.address,
+            whole=True,
+            address=earlier.address,
+            who=who,
+            restored=restored,
+        )
+        await self._store.settled()
+        await self._carried_out()
+        return answers.HostUnblocked(**asdict(shown), restored=restored)
+
+    async def watch(self) -> None:
+        """End blocks when their time is over; runs until cancelled."""
+        while True:
+            self._changed.clear()
+            await self._read_clock()
+            self._end_due()
+            left = self._blocks.seconds_left()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(
+                    self._changed.wait(), None if left is None else min(left, _LOOK_SECONDS)
+                )
+
+    def _end_due(self) -> None:
+        rows, due = self._blocks.rows(), self._blocks.due()
+        if not due:
+            return
+        self._lift(due)
+        for address in due:
+            self._trail.happened(
+                "host block ended",
+                f"the block of {address} by {rows[address].who} is over",
+                host=rows[address].address,
+                whole=True,
+                address=rows[address].address,
+                note=rows[address].note,
+            )
+
+    def _lift(self, addresses: Iterable[Address]) -> int:
+        before = self._registrations()
+        for address in addresses:
+            self._blocks.take(address)
+        self._apply()
+        return self._registrations() - before
+
+    def _apply(self) -> None:
+        self._policies.blocks_changed()
+        self._changed.set()
+
+    async def _read_clock(self) -> None:
+        async with self._clock_reads:
+            await asyncio.to_thread(self._blocks.read_clock)
+
+    # --- what may be blocked ---
+
+    def _address(self, text: str) -> Address:
+        """Return the canonical address of a host, given as an address, or as the name of one host."""
+        with contextlib.suppress(ValueError):
+            return plain_address(str(ipaddress.ip_address(text)))
+        policy = self._policies.current
+        enrolled = {name: address_of(address) for name, address in self._enrolled().items()}
+        try:
+            networks = HostNames.of(policy.text, enrolled, policy.robot).networks(text[:_LONGEST_NAME])
+        except UnknownHostNameError as error:
+            raise SenselessError(str(error)) from None
+        if len(networks) > 1 or networks[0].num_addresses > 1:
+            some = ", ".join(
+                str(one).removesuffix("/32").removesuffix("/128") for one in networks[:_MOST_NAMED]
+            )
+            raise SenselessError(f"{text[:80]!r} is not one host: block one address at a time ({some})")
+        return plain_address(str(networks[0].network_address))
+
+    def _require_not_the_robot(self, address: Address, held: answers.BlockEnded) -> None:
+        own, whole = _registrations_of(held), self._registrations()
+        if any(address in network for network in self._policies.current.robot):
+            why = "is the robot's own host"
+        elif own > max(whole / 2, _FEW):
+            why = f"has {own} of {whole} registrations, so it may be the robot itself"
+        else:
+            return
+        raise HostRefusedError(
+            f"{address} {why}: to block it would end {in_words(held)}; to do it all the same, use --force"
+            " (REST: `force`)"
+        )
+
+    def _same_machine(self, address: str) -> set[str]:
+        enrolled = self._enrolled()
+        pairs = ({enrolled[name], remote} for name, remote in self._remotes().items() if name in enrolled)
+        return {other for pair in pairs if address in pair for other in pair - {address}}
+
+    # --- what a host has ---
+
+    def _held_by(self, address: Address) -> answers.BlockEnded:
+        count = Counter(_REGISTERED.get(one.call, "") for one in self._live() if one.host == address)
+        connections = sum(str(address) in hosts for hosts in self._connected())
+        return answers.BlockEnded(
+            **{name: count[name] for name in _REGISTERED.values()}, connections=connections
+        )
+
+    def _registrations(self) -> int:
+        return sum(one.call in _REGISTERED for one in self._live())
+
+    def _row(self, row: HostBlockRow) -> answers.BlockedHost:
+        names = (name for name, address in self._enrolled().items() if address == row.address)
+        return answers.BlockedHost(
+            row.address, next(names, ""), row.since, self._blocks.until(row), row.who, row.note
+        )
+
+
+def _require_possible(address: Address) -> None:
+    """Raise `HostRefusedError` for addresses that cannot be another host's."""
+    if address.is_unspecified or address.is_multicast or str(address) == "255.255.255.255":
+        raise HostRefusedError(f"{address} cannot be the address of a host")
+    if address.is_loopback or _is_own(address):
+        raise HostRefusedError(
+            f"{address} is the appliance's own address: its own calls come from there, so it cannot be blocked"
+        )
+
+
+def _require_sensible(request: admin.HostBlock) -> None:
+    seconds = request.for_seconds
+    if seconds is not None and not 1 <= seconds <= LONGEST_BLOCK_SECONDS:
+        raise SenselessError(
+            f"a block with a time lasts 1 second to {LONGEST_BLOCK_SECONDS // 86_400} days; without one it lasts until"
+            " it is lifted"
+        )
+    if len(request.note) > _LONGEST_NOTE or not request.note.isprintable():
+        raise SenselessError(f"a note has at most {_LONGEST_NOTE} characters, all of them printable")
+
+
+def _is_own(address: Address) -> bool:
+    """Whether this machine has the address: only then can a socket be bound to it."""
+    family = socket.AF_INET if address.version == 4 else socket.AF_INET6
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        try:
+            sock.bind((str(address), 0))
+        except OSError:
+            return False
+    return True
+
+
+def _difference(before: answers.BlockEnded, after: answers.BlockEnded) -> answers.BlockEnded:
+    left = asdict(after)
+    return answers.BlockEnded(**{name: count - left[name] for name, count in asdict(before).items()})
+
+
+def in_words(held: answers.BlockEnded) -> str:
+    """Return numbers of registrations and connections as text."""
+    return f"{_registrations_of(held)} registrations and {held.connections} connections"
+
+
+def _registrations_of(held: answers.BlockEnded) -> int:
+    return held.publications + held.subscriptions + held.services + held.parameters

@@ -1,0 +1,96 @@
+"""Collect how much of each finite resource is used, for `rosrv limits`. docs/reference/quotas.md has all quotas."""
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from appliance.channel import admin
+from appliance.channel.answers.limit_answers import LimitList, LimitUse
+from appliance.channel.answers.status import RecorderState
+from appliance.configuration.settings import Settings
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.listener_limits import ListenerLimits
+from appliance.quotas.pool import Pool
+from appliance.quotas.table import NAMES, RELAY_FRAMES, RELAY_LATCHED, RELAY_QUEUES, QuotaRow
+
+
+@dataclass(frozen=True)
+class LimitQueries:
+    """The answer to `rosrv limits`; `recorder()` returns the state of the flight recorder."""
+
+    parts: Parts
+    settings: Settings
+    listeners: ListenerLimits
+    recorder: Callable[[], RecorderState | None]
+
+    async def use(self, _request: admin.LimitsWanted) -> LimitList:
+        """Return the resources that hosts can exhaust, with their present use."""
+        return LimitList([*self._registry(), *self._pools(), *self._relays(), *self._stored()])
+
+    def _registry(self) -> Iterator[LimitUse]:
+        registry, limits = self.parts.core.registry, self.settings.limits
+        nodes = Counter(one.host for one in registry.all() if not one.own)
+        yield _by_host("nodes", None, "limits.nodes_per_host", nodes, limits.nodes_per_host)
+        yield _by_host(
+            "registrations",
+            NAMES.bounds.whole,
+            "limits.topics_per_host",
+            dict(registry.registrations_by_host()),
+            limits.topics_per_host,
+        )
+
+    def _pools(self) -> Iterator[LimitUse]:
+        core = self.parts.core
+        yield _of_pool("ports of nodes", "[Ports] range", self.parts.endpoints.places.taken)
+        yield _of_pool(
+            "connections to RVMaster and nodes",
+            "limits.connections",
+            self.listeners.connection_table.connected,
+        )
+        yield _of_pool("bytes of parameters", "limits.parameter_bytes", core.parameters.charges.pool)
+
+    def _relays(self) -> Iterator[LimitUse]:
+        carried, limits = self.parts.core.carried, self.settings.relay
+        allowed = limits.connections * self.settings.relays
+        yield LimitUse("connections to the relays", len(carried.connections), allowed, "relay.connections")
+        for kind, (resource, row) in _MEMORY.items():
+            fullest = max((held.get(kind, 0) for held in carried.memory.values()), default=0)
+            allowed = row.bounds.whole * int(limits.memory_bytes) // _WHOLE_MEMORY
+            yield LimitUse(f"{resource}, one relay", fullest, allowed, "relay.memory_bytes")
+
+    def _stored(self) -> Iterator[LimitUse]:
+        audit, folder = self.settings.audit, self.settings.state / "control"
+        size = sum(file.stat().st_size for file in folder.glob("audit.db*"))
+        kept = None if audit.retention_bytes is None else int(audit.retention_bytes)
+        allowed = size + shutil.disk_usage(folder).free if kept is None else kept
+        yield LimitUse("bytes of audit records", size, allowed, "audit.retention_bytes, or the disk")
+        recorder = self.recorder()
+        if recorder is not None:
+            disk = int(self.settings.recorder.disk)
+            yield LimitUse("bytes of recordings", recorder.bytes, disk, "recorder.disk")
+
+
+_MEMORY: dict[str, tuple[str, QuotaRow]] = {
+    "frames": ("bytes of unfinished messages", RELAY_FRAMES),
+    "queues": ("bytes waiting for subscribers", RELAY_QUEUES),
+    "latched": ("bytes of latched messages", RELAY_LATCHED),
+}
+"""The resource of each kind of a relay's memory; a row has the relay that holds most of it."""
+
+_WHOLE_MEMORY = sum(row.bounds.whole for _resource, row in _MEMORY.values())  # as `RelayMemory.of` divides it
+
+
+def _by_host(
+    resource: str, whole: int | None, setting: str, held: Mapping[Any, int], allowed: int
+) -> LimitUse:
+    host = max(held, key=lambda one: held[one], default=None)
+    used = sum(held.values())
+    if host is None:
+        return LimitUse(resource, used, whole, setting)
+    return LimitUse(resource, used, whole, setting, str(host), held[host], allowed)
+
+
+def _of_pool(resource: str, setting: str, pool: Pool[Any]) -> LimitUse:
+    return _by_host(resource, pool.bounds.whole, setting, dict(pool.holders()), pool.bounds.host)

@@ -1,0 +1,102 @@
+"""Describe the graph for operators: nodes, topics, services, connections, traffic.
+
+All values are a snapshot of the registry and the relay's reports. The appliance's own nodes are left out.
+"""
+
+from collections.abc import Iterator
+
+from msgspec.structs import asdict
+
+from appliance.channel.answers.graph_answers import Connection, Graph, Node, Publisher, Service, Topic
+from appliance.control.assembly.assembly import Parts
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.graph.registry import Incarnation, Kind, Life
+from appliance.specifications.allocation import SERVICE, TOPIC
+
+
+def graph_of(parts: Parts) -> Graph:
+    """Return the present graph."""
+    registry = parts.core.registry
+    shown = [
+        incarnation
+        for incarnation in registry.all()
+        if incarnation.life is not Life.REPLACED and not incarnation.own
+    ]
+    live = [incarnation for incarnation in shown if incarnation.life is Life.LIVE]
+    names = {incarnation.key: incarnation.name for incarnation in shown}
+    return Graph(
+        [_node(incarnation) for incarnation in sorted(shown, key=lambda incarnation: incarnation.name)],
+        _topics(parts, live, names),
+        _services(parts, live, names),
+    )
+
+
+def hosts_connected(parts: Parts) -> Iterator[set[str]]:
+    """Yield the two hosts of each connection through the relay: of the publisher or service, and of the client."""
+    registry = parts.core.registry
+    for connection in parts.core.carried.connections.values():
+        holder = registry.by_key(connection.key)
+        yield {connection.host} if holder is None else {connection.host, str(holder.host)}
+
+
+def _node(incarnation: Incarnation) -> Node:
+    return Node(
+        incarnation.name,
+        str(incarnation.host),
+        "live" if incarnation.life is Life.LIVE else "lost",
+        publishes=sorted(incarnation.resources(Kind.PUBLICATION)),
+        subscribes=sorted(incarnation.resources(Kind.SUBSCRIPTION)),
+        offers=sorted(incarnation.resources(Kind.SERVICE)),
+    )
+
+
+def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Topic]:
+    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, TOPIC, names)
+    publishers: dict[str, list[Publisher]] = {}
+    subscribers: dict[str, list[str]] = {}
+    for incarnation in live:
+        for registration in incarnation.registrations.values():
+            topic = registration.resource
+            if registration.kind is Kind.PUBLICATION:
+                publisher = Publisher(
+                    **asdict(relay.carried.flow(incarnation.key, topic)), node=incarnation.name
+                )
+                publishers.setdefault(topic, []).append(publisher)
+            elif registration.kind is Kind.SUBSCRIPTION:
+                subscribers.setdefault(topic, []).append(incarnation.name)
+    return [
+        Topic(
+            name,
+            parts.core.registry.type_of(name),
+            mediated=parts.core.mediation.carries_topic(name),
+            publishers=publishers.get(name, []),
+            subscribers=subscribers.get(name, []),
+            connections=connections.get(name, []),
+        )
+        for name in sorted(publishers.keys() | subscribers.keys())
+    ]
+
+
+def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
+    relay, connections = parts.endpoints.relay, _connections(parts.endpoints.relay, SERVICE, names)
+    return [
+        Service(
+            **asdict(relay.carried.flow(incarnation.key, registration.resource)),
+            name=registration.resource,
+            node=incarnation.name,
+            mediated=parts.core.mediation.carries_service(registration.resource),
+            connections=connections.get(registration.resource, []),
+        )
+        for incarnation in live
+        for registration in incarnation.registrations.values()
+        if registration.kind is Kind.SERVICE
+    ]
+
+
+def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
+    found: dict[str, list[Connection]] = {}
+    for connection in relay.carried.connections.values():
+        if connection.kind == kind and connection.key in names:
+            row = Connection(names[connection.key], connection.caller_id, connection.host)
+            found.setdefault(connection.resource, []).append(row)
+    return found

@@ -1,0 +1,232 @@
+"""Answer queries about the appliance: status, graph, live registrations, measurements. Queries change nothing."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+
+import appliance
+from appliance.base.clock import now, wall
+from appliance.channel import admin
+from appliance.channel.answers.graph_answers import (
+    Graph,
+    Registration,
+    Registrations,
+    TopicMessage,
+    TopicMessages,
+)
+from appliance.channel.answers.inventory_answers import InUse, Inventory
+from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.monitor_answers import Monitors
+from appliance.channel.answers.standby_answers import StandbyState
+from appliance.channel.answers.status import (
+    AuditState,
+    BlocksState,
+    BundlesState,
+    ClockState,
+    MinuteState,
+    PolicyState,
+    RecorderState,
+    Status,
+    SwitchedOff,
+)
+from appliance.control.assembly.assembly import Parts
+from appliance.control.assembly.monitor_states import monitors_of, monitors_status
+from appliance.control.assembly.policies import Policies
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.links.supervisor_link import Surroundings
+from appliance.control.operators.measurements import measures_of
+from appliance.control.operators.overview import graph_of
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.master.graph.registry import Kind, Life
+from appliance.policy.live_rights import LiveRight
+from appliance.policy.sections import DECIDERS
+from appliance.telemetry.audit_trail import AuditTrail
+
+MOST_MESSAGES = 20
+LONGEST_LOOK = 10.0
+"""The longest time in seconds that a query waits for messages."""
+
+ONE_LOOK = 60.0
+"""The seconds in which all queries of one token for one topic make only one audit record."""
+
+_TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
+
+
+@dataclass(frozen=True)
+class Queries:
+    """The answers to queries.
+
+    `audit()`, `clock()` and `recorder()` return the states of the audit log, the machine's clock and the flight
+    recorder. `live()` returns the rights that a change of the policy may end. `switched_off()` returns the protection
+    that is switched off. `blocks()` and `bundles()` return the states of the blocks and the bundles. `standby()`
+    returns the state of the two appliances, or None if this one is not one of two. `handled(status)` adds the alarms
+    that operators have acknowledged or silenced.
+    """
+
+    parts: Parts
+    trail: AuditTrail
+    policies: Policies
+    hosts: HostEnrolment
+    surroundings: Surroundings
+    audit: Callable[[], AuditState]
+    clock: Callable[[], ClockState]
+    recorder: Callable[[], RecorderState | None]
+    queued_deliveries: Callable[[], int]
+    live: Callable[[], list[LiveRight]]
+    switched_off: Callable[[], list[SwitchedOff]]
+    blocks: Callable[[], BlocksState]
+    standby: Callable[[], StandbyState | None]
+    bundles: Callable[[], BundlesState | None]
+    handled: Callable[[Status], Status]
+    name: str = ""
+    started: float = field(default_factory=wall)
+    _shown: dict[tuple[str, str], float] = field(default_factory=dict)
+
+    async def status(self, _request: admin.StatusWanted) -> Status:
+        """Return the status of all parts of the appliance."""
+        return self.present()
+
+    async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
+        """Return the parts of the appliance, and the kernel features in use."""
+        from appliance.configuration.inventory import inventory  # noqa: PLC0415  only for this query
+
+        found = await asyncio.to_thread(inventory)
+        around = self.surroundings
+        sandbox = {process.role: process.sandbox for process in around.processes if process.sandbox}
+        used = InUse(
+            firewall=around.firewall.report.backend,
+            esp=self.hosts.status().esp,
+            sandbox=sandbox,
+            lacks=sorted({lack for process in around.processes for lack in process.lacks}),
+        )
+        return msgspec.structs.replace(found, in_use=used)
+
+    async def graph(self, _request: admin.GraphWanted) -> Graph:
+        """Return nodes, topics and services with their traffic."""
+        return graph_of(self.parts)
+
+    async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
+        """Return all monitors with state and counters."""
+        return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
+
+    async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
+        """Return the next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyTapsError`."""
+        if not 1 <= request.messages <= MOST_MESSAGES or not 0 < request.seconds <= LONGEST_LOOK:
+            raise SenselessError(f"ask for 1 to {MOST_MESSAGES} messages, within {LONGEST_LOOK:g} seconds")
+        topic = next((topic for topic in graph_of(self.parts).topics if topic.name == request.topic), None)
+        if topic is None:
+            raise UnknownThingError(f"no node publishes or subscribes to {request.topic[:200]}")
+        if not topic.mediated:
+            raise SenselessError(
+                f"the messages of {topic.name} do not pass the appliance (relaying: monitored), so it cannot show them"
+            )
+        self._record_look(topic.name, who)
+        seen = await self.parts.endpoints.relay.look(
+            topic.name, request.messages, request.seconds, latched=request.latched
+        )
+        registry = self.parts.core.registry
+        rows = []
+        for message in seen:
+            node = registry.by_key(message.key)
+            name = node.name if node is not None else ""
+            rows.append(TopicMessage(message.time, name, message.size, message.fields, message.why))
+        return TopicMessages(
+            topic.name,
+            seen[0].type if seen else topic.type,
+            [publisher.node for publisher in topic.publishers],
+            topic.subscribers,
+            rows,
+        )
+
+    def _record_look(self, topic: str, who: str) -> None:
+        """Record only the first of equal queries within `ONE_LOOK`, because a plot in the console polls."""
+        moment = now()
+        for key in [key for key, since in self._shown.items() if moment - since >= ONE_LOOK]:
+            del self._shown[key]
+        if (who, topic) in self._shown:
+            return
+        self._shown[who, topic] = moment
+        self.trail.happened(
+            "topic looked into",
+            f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
+            category="topic",
+            resource=topic,
+            who=who,
+            seconds=ONE_LOOK,
+        )
+
+    async def metrics(self, _request: admin.MetricsWanted) -> Measures:
+        """Return the status and all counters."""
+        return measures_of(
+            self.parts, self.trail.meter, self.present(), self.hosts.rows(), self.queued_deliveries()
+        )
+
+    async def registrations(self, _request: admin.RegistrationsWanted) -> Registrations:
+        """Return all live rights that a change of the policy may end."""
+        return Registrations([Registration(**live.fields()) for live in self.live()])
+
+    def present(self) -> Status:
+        """Return the status of all parts of the appliance."""
+        return self.handled(self._status())
+
+    def _status(self) -> Status:
+        parts, registry, relay = self.parts, self.parts.core.registry, self.parts.endpoints.relay
+        meter = self.trail.meter
+        # The appliance's own nodes are not counted; the graph leaves them out also.
+        lives = [incarnation.life for incarnation in registry.all() if not incarnation.own]
+        named = {
+            (registration.kind, registration.resource)
+            for node, registration in registry.in_order()
+            if not node.own
+        }
+        return Status(
+            name=self.name,
+            version=appliance.__version__,
+            since=self.started,
+            master=self.surroundings.master,
+            processes=self.surroundings.processes,
+            isolation=self.surroundings.firewall.isolation,
+            relaying="all" if parts.core.mediation.relay_all else "monitored",
+            mediation="full" if parts.core.mediation.stand_ins else "monitored",
+            firewall=self.surroundings.firewall.report,
+            probe=self.surroundings.probe,
+            policy=self._policy(),
+            ipsec=self.hosts.status(),
+            monitors=monitors_status(parts.monitors),
+            rosmaster="reachable" if parts.endpoints.rosmaster.whole else "being rebuilt",
+            relay=relay.presence,
+            nodes=lives.count(Life.LIVE),
+            shadows=lives.count(Life.SHADOW),
+            topics=len({name for kind, name in named if kind in _TOPIC}),
+            services=sum(kind is Kind.SERVICE for kind, _name in named),
+            connections=len(relay.carried.connections),
+            messages=relay.carried.total.messages,
+            dropped=relay.carried.total.dropped,
+            audit=self.audit(),
+            clock=self.clock(),
+            recorder=self.recorder(),
+            switched_off=self.switched_off(),
+            blocks=self.blocks(),
+            last_minute=MinuteState(sum(meter.denied.counts().values()), meter.dropped.counts()),
+            standby=self.standby(),
+            bundles=self.bundles(),
+        )
+
+    def _policy(self) -> PolicyState:
+        policies = self.policies
+        return PolicyState(
+            revision=policies.revision,
+            file=str(policies.file),
+            source=policies.current.file,
+            who=policies.in_force.who,
+            differs_from_file=policies.differs_from_file,
+            warnings=len(policies.current.warnings),
+            audit_only=[
+                decider.name for decider in DECIDERS if policies.current.audit_only(decider.categories[0])
+            ],
+            confirm_by=policies.confirm_by,
+            loaded=policies.in_force.loaded,
+            file_refused=policies.file_refused,
+        )

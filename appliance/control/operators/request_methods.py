@@ -1,0 +1,115 @@
+"""The table of methods: the method of control that answers each request of operators' tools."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, Generic
+
+from appliance.channel import admin
+from appliance.channel.admin import A, AdminRequest
+from appliance.control.assembly.policies import Policies
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.operators.alarm_orders import AlarmOrders
+from appliance.control.operators.block_orders import BlockOrders
+from appliance.control.operators.limit_use import LimitQueries
+from appliance.control.operators.queries import Queries
+from appliance.control.operators.token_orders import TokenOrders
+from appliance.control.recording_orders import RecordingOrders
+from appliance.control.standby_orders import StandbyOrders
+from appliance.hosts.certification import Certification
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.specifications.specification_manager import SpecificationManager
+
+
+@dataclass(frozen=True, slots=True)
+class RequestMethod(Generic[A]):
+    """The method that answers a request. `who`: it also takes the client's name.
+
+    `order`: the answer waits until the records of the request are in the audit log.
+    """
+
+    request: type[AdminRequest[A]]
+    answer: Callable[..., Awaitable[A]]
+    who: bool = False
+    order: bool = True
+
+
+def request_methods(
+    *,
+    queries: Queries,
+    policies: Policies,
+    monitors: SpecificationManager,
+    hosts: HostEnrolment,
+    certification: Certification,
+    tokens: TokenOrders,
+    recordings: RecordingOrders,
+    blocks: BlockOrders,
+    evidence: EvidenceOrders,
+    standby: StandbyOrders,
+    limits: LimitQueries,
+    alarms: AlarmOrders,
+) -> tuple[RequestMethod[Any], ...]:
+    """Return the methods of these parts: one for each request."""
+    return (
+        RequestMethod(admin.StatusWanted, queries.status, order=False),
+        RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
+        RequestMethod(admin.AlarmsWanted, alarms.listed, order=False),
+        RequestMethod(admin.AlarmAcknowledge, alarms.acknowledge, who=True),
+        RequestMethod(admin.AlarmSilence, alarms.silence, who=True),
+        RequestMethod(admin.LimitsWanted, limits.use, order=False),
+        RequestMethod(admin.GraphWanted, queries.graph, order=False),
+        RequestMethod(admin.MonitorsWanted, queries.monitors, order=False),
+        RequestMethod(admin.TopicLook, queries.topic_look, who=True, order=False),
+        RequestMethod(admin.MetricsWanted, queries.metrics, order=False),
+        RequestMethod(admin.RegistrationsWanted, queries.registrations, order=False),
+        RequestMethod(admin.StandbyWanted, standby.state, order=False),
+        RequestMethod(admin.StandbyPromote, standby.promote, who=True, order=False),
+        RequestMethod(admin.PolicyReload, policies.reload, who=True),
+        RequestMethod(admin.PolicyLoad, policies.load, who=True),
+        RequestMethod(admin.PolicyRollback, policies.roll_back, who=True),
+        RequestMethod(admin.PolicyConfirm, policies.confirm, who=True),
+        RequestMethod(admin.PolicyRevisions, policies.revisions),
+        RequestMethod(admin.PolicyWanted, policies.text),
+        RequestMethod(admin.PolicyRevisionWanted, policies.one_revision),
+        RequestMethod(admin.MonitorRevisions, monitors.revisions),
+        RequestMethod(admin.MonitorRevisionWanted, monitors.texts),
+        RequestMethod(admin.MonitorLoad, monitors.load, who=True),
+        RequestMethod(admin.MonitorTry, monitors.attempt, who=True),
+        RequestMethod(admin.MonitorReplace, monitors.replace, who=True),
+        RequestMethod(admin.MonitorReload, monitors.reload, who=True),
+        RequestMethod(admin.MonitorRemove, monitors.remove, who=True),
+        RequestMethod(admin.MonitorRollback, monitors.roll_back, who=True),
+        RequestMethod(admin.MonitorConfirm, monitors.confirm, who=True),
+        RequestMethod(admin.MonitorSwitch, monitors.switch, who=True),
+        RequestMethod(admin.MonitorShadow, monitors.shadow, who=True),
+        RequestMethod(admin.MonitorResume, monitors.resume, who=True),
+        RequestMethod(admin.HostList, hosts.listed),
+        RequestMethod(admin.HostEndpoint, hosts.endpoint),
+        RequestMethod(admin.HostKit, hosts.kit),
+        RequestMethod(admin.HostAdd, hosts.add, who=True),
+        RequestMethod(admin.HostRenew, hosts.renew, who=True),
+        RequestMethod(admin.HostToken, hosts.token, who=True),
+        RequestMethod(admin.HostRevoke, hosts.revoke, who=True),
+        RequestMethod(admin.HostsReload, hosts.reload, who=True),
+        RequestMethod(admin.HostBlock, blocks.block, who=True),
+        RequestMethod(admin.HostUnblock, blocks.unblock, who=True),
+        RequestMethod(admin.HostBlocks, blocks.listed, order=False),
+        RequestMethod(admin.HostEnrol, hosts.itself.enrol),
+        RequestMethod(admin.HostRenewItself, hosts.itself.renew),
+        RequestMethod(admin.HostRenewed, hosts.itself.renewed),
+        RequestMethod(admin.HostPorts, hosts.ports.tell, who=True),
+        RequestMethod(admin.RevocationsWanted, certification.revocations),
+        RequestMethod(admin.AuthorityWanted, certification.authority),
+        RequestMethod(admin.TokenList, tokens.listed),
+        RequestMethod(admin.TokenAdd, tokens.add, who=True),
+        RequestMethod(admin.TokenRotate, tokens.rotate, who=True),
+        RequestMethod(admin.TokenRevoke, tokens.revoke, who=True),
+        RequestMethod(admin.RecordingsWanted, recordings.recordings),
+        RequestMethod(admin.RecordingWanted, recordings.recording),
+        RequestMethod(admin.RecordNow, recordings.now, who=True),
+        RequestMethod(admin.RecordingFetch, recordings.fetch, who=True),
+        RequestMethod(admin.RecordingRead, recordings.read, who=True),
+        RequestMethod(admin.RecordingOfMemory, recordings.of_memory, who=True),
+        RequestMethod(admin.RecordingRemove, recordings.remove, who=True),
+        RequestMethod(admin.LogSealed, evidence.seal),
+        RequestMethod(admin.EvidenceExported, evidence.exported, who=True),
+    )

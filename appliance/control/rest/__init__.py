@@ -1,0 +1,1 @@
+"""Answer the requests of REST, and check the proofs of signed orders."""

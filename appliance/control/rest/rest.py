@@ -1,0 +1,220 @@
+"""Carry out the REST requests that the api passes on, one by one, and record REST calls.
+
+These invariants ensure that a flooded or compromised api cannot block RVMaster:
+
+1. At most `_MOST_WAITING` requests wait; further requests are answered `busy` at once. Between two requests, the event
+   loop serves nodes.
+2. Requests that wait for another process (`WaitingRequest`, at most `_MOST_SLOW`) do not delay other requests.
+3. The link to the api ends if the api sends an invalid message or does not read its answers.
+4. REST requests cannot make access tokens, and RVMaster's decisions do not depend on the api.
+5. A request is withdrawn if its client is gone before the request takes effect (`appliance/base/withdrawal.py`).
+6. Every request needs a token whose role allows it. Every change also needs the client's own HTTP request, with a proof
+   if the settings require it (`rest_proof.py`). Control denies and records all other requests.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import structlog
+
+from appliance.audit.log.record import Severity
+from appliance.base import clock
+from appliance.base.withdrawal import awaited
+from appliance.channel import messages
+from appliance.channel.admin import (
+    ORDERS,
+    AdminAnswer,
+    ChallengeWanted,
+    WaitingRequest,
+    encode,
+    verb_of,
+)
+from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.link import Link
+from appliance.channel.messages.api import (
+    RequestAnswered,
+    RequestMade,
+    RequestWithdrawn,
+    RestCalled,
+    RestServed,
+    TokensStated,
+    TokenUsed,
+)
+from appliance.control.operators.administration import Administration
+from appliance.control.operators.token_orders import TokenOrders
+from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError
+from appliance.telemetry.audit_trail import AuditTrail
+
+_log = structlog.get_logger()
+_MOST_WAITING = 64
+_TEXT = 300
+_DENIED = (401, 403, 421, 429)
+_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # a rejected request with one of these methods changed nothing
+_MOST_SLOW = 16
+
+
+class RestLink:
+    """The link to the api.
+
+    `served(pin)` is called with the pin by which hosts recognise the api, and `certified(sha256)`
+    with the fingerprint of its certificate. `require_proof`: every change needs a signed
+    request, because a bare token is not enough.
+    """
+
+    def __init__(
+        self,
+        administration: Administration,
+        tokens: TokenOrders,
+        trail: AuditTrail,
+        *,
+        served: Callable[[str], None],
+        certified: Callable[[str], None],
+        require_proof: bool,
+    ) -> None:
+        self._administration = administration
+        self._tokens = tokens
+        self._askers = RequestAuthenticator(tokens, require_proof=require_proof)
+        self._trail = trail
+        self._link = Link(self._received, self._lost)
+        self._waiting: deque[RequestMade] = deque()
+        self._withdrawn: dict[int, bool] = {}  # unanswered requests of the present link, by number
+        self._worker: asyncio.Task[None] | None = None  # the worker of the present link
+        self._slow: set[asyncio.Task[None]] = set()
+        self._workers: set[asyncio.Task[None]] = set()  # the workers of present and ended links
+        self._served, self._certified = served, certified
+
+    def attach(self, channel: Channel) -> None:
+        """Serve a new api process, and send the usable tokens to it."""
+        self._link.attach(channel)
+        self._worker = None
+        self._waiting.clear()
+        self._withdrawn = {}
+        self.state_tokens()
+
+    def _received(self, message: object) -> None:
+        match message:
+            case RequestMade(number):
+                if len(self._waiting) >= _MOST_WAITING:
+                    text = "too many requests wait for the appliance: try again"
+                    self._send_answer(number, AdminAnswer(False, error=text, trouble="busy"))
+                    return
+                self._waiting.append(message)
+                self._withdrawn[number] = False
+                if self._worker is None or self._worker.done():
+                    self._worker = asyncio.get_running_loop().create_task(self._work(self._link.channel))
+                    self._workers.add(self._worker)
+                    self._worker.add_done_callback(self._workers.discard)
+            case RequestWithdrawn(number):
+                if number in self._withdrawn:
+                    self._withdrawn[number] = True
+            case RestCalled():
+                self._record(message)
+            case TokenUsed(token):
+                self._tokens.used(token)
+            case RestServed(pin, certificate):
+                self._served(pin)
+                self._certified(certificate)
+            case _:
+                self._link.close()
+                self._lost(f"it sent {type(message).__name__}")
+
+    async def _work(self, channel: Channel | None) -> None:
+        while self._waiting and channel is self._link.channel:
+            made = self._waiting.popleft()
+            if isinstance(made.request, WaitingRequest):
+                self._begin(channel, made)
+            else:
+                await self._serve(channel, made)
+            await asyncio.sleep(0)
+
+    def _begin(self, channel: Channel | None, made: RequestMade) -> None:
+        """Serve a request that waits for charon, the signer, the recorder or a topic's messages in its own task."""
+        if len(self._slow) >= _MOST_SLOW:
+            text = "too many long requests are running: try again"
+            self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(channel, made))
+        self._slow.add(task)
+        task.add_done_callback(self._slow.discard)
+
+    async def _serve(self, channel: Channel | None, made: RequestMade) -> None:
+        withdrawn = self._withdrawn
+
+        def given_up() -> bool:
+            gone = withdrawn.get(made.number, False) or channel is not self._link.channel
+            return gone or clock.now() > made.until
+
+        with awaited(given_up):
+            answer = await self._answer(made)
+        if channel is self._link.channel:
+            self._send_answer(made.number, answer)
+
+    async def _answer(self, made: RequestMade) -> AdminAnswer[Any]:
+        if type(made.request) in ORDERS and self._trail.obstacle is not None:
+            return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
+        try:
+            who = await self._askers.asker(made)
+            if isinstance(made.request, ChallengeWanted):
+                return AdminAnswer(True, self._askers.challenge())
+            return await self._administration.carry_out(made.request, who=who)
+        except UnprovenError as error:
+            self._refused(made, error)
+            return AdminAnswer(False, error=str(error), trouble="forbidden")
+        except Exception as error:  # noqa: BLE001  a defect affects only this request
+            _log.exception("a request of the api failed", request=type(made.request).__name__)
+            return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
+
+    def _refused(self, made: RequestMade, error: UnprovenError) -> None:
+        asked = made.asked
+        self._trail.happened(
+            "order refused",
+            str(error)[:_TEXT],
+            severity=error.severity,
+            decision="deny",
+            host=asked.host[:_TEXT] if asked is not None else None,
+            category="rest",
+            resource=asked.target.partition("?")[0][:_TEXT] if asked is not None else "",
+            who=error.who or None,
+            verb=verb_of(made.request),
+        )
+
+    def _record(self, call: RestCalled) -> None:
+        denied = call.status in _DENIED or (call.method in _METHODS and call.status >= 400 and not call.dry)
+        self._trail.happened(
+            "rest call",
+            call.reason[:_TEXT],
+            severity=Severity.WARNING if denied else Severity.INFO,
+            decision="deny" if denied else "allow",
+            host=call.host,
+            category="rest",
+            resource=call.path[:_TEXT],
+            who=call.who or None,
+            method=call.method[:_TEXT],
+            more={"dry_run": True} if call.dry else None,
+            status=call.status,
+            took_us=call.duration_us,
+            count=call.count,
+        )
+
+    def state_tokens(self) -> None:
+        """Send the api the usable tokens."""
+        self._send(TokensStated(self._tokens.usable()))
+
+    def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+        self._withdrawn.pop(number, None)
+        self._send(RequestAnswered(number, encode(answer)))
+
+    def _send(self, message: messages.Message) -> None:
+        try:
+            self._link.send(message)
+        except ChannelFullError:
+            self._link.close()
+            _log.error("the api does not read its answers: its link is closed")
+
+    def _lost(self, wrong: str) -> None:
+        """Forget the requests of the api. `wrong` is the api's protocol error, or empty if its process ended."""
+        self._waiting.clear()
+        if wrong:
+            _log.error("the api's link is closed; another one is started", reason=wrong)

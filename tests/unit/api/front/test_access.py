@@ -1,0 +1,153 @@
+"""Tests of `appliance.api.front.access`."""
+
+from typing import Any
+
+import pytest
+
+from appliance.api.front.access import Bearer, TokenAuthenticator
+from appliance.api.front.problems import ProblemError
+from appliance.base import clock
+from appliance.base.clock import using
+from appliance.channel.messages.api import TokenKept
+from appliance.store import access_tokens
+from appliance.store.access_tokens import TokenRow, make_token
+from tests.support.inline_loop import run
+from tests.support.virtual_clock import VirtualClock
+
+
+def kept(row: TokenRow) -> TokenKept:
+    return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+
+
+def recognise(door: TokenAuthenticator, header: str | None, host: str = "10.0.0.1") -> Any:
+    try:
+        return run(door.recognise(header, host))
+    except ProblemError as problem:
+        return problem.status
+
+
+def test_a_token_has_the_name_role_and_expiry_it_was_made_with() -> None:
+    row, text = make_token("alice", "operator", now=clock.wall(), seconds=60)
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row)])
+    for scheme in ("Bearer", "bearer"):
+        bearer = recognise(door, f"{scheme} {text}")
+        assert (bearer.name, bearer.role, bearer.expires) == ("alice", "operator", row.expires)
+    assert door.still_good(bearer)
+    door.state([])
+    assert not door.still_good(bearer)
+    assert recognise(door, f"Bearer {text}") == 401
+
+
+def test_no_token_is_called_revoked_before_control_has_stated_the_tokens() -> None:
+    row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
+    door = TokenAuthenticator(10, lambda _token: None)
+    assert recognise(door, f"Bearer {text}") == 503
+    assert recognise(door, None) == 401
+    door.state([])
+    assert recognise(door, f"Bearer {text}") == 401
+    door.state([kept(row)])
+    assert recognise(door, f"Bearer {text}").name == "alice"
+
+
+def test_a_step_back_of_the_clock_revives_no_token() -> None:
+    with using(machine := VirtualClock()):
+        row, text = make_token("alice", "viewer", now=clock.wall(), seconds=60)
+        door = TokenAuthenticator(10, lambda _token: None)
+        door.state([kept(row)])
+        bearer = Bearer(row.id, row.name, "viewer", row.expires, text)
+        machine.set_wall(clock.wall() - 86_400)
+        machine.advance(59)
+        assert door.still_good(bearer)
+        machine.advance(2)
+        door.state([kept(row)])
+        assert not door.still_good(bearer)
+
+
+def test_an_expired_token_is_refused() -> None:
+    """A token is refused after its expiry, even if it was recognised before."""
+    row, text = make_token("a", "viewer", now=clock.wall() - 100, seconds=50)
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row)])
+    assert recognise(door, f"Bearer {text}") == 401
+
+
+def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
+    checks: list[str] = []
+
+    def counted(secret: str, salt: bytes) -> bytes:
+        checks.append(secret)
+        return real(secret, salt)
+
+    real = access_tokens.hash_secret
+    monkeypatch.setattr(access_tokens, "hash_secret", counted)
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row)])
+    for _ in range(3):
+        assert recognise(door, f"Bearer {text}").name == "a"
+    assert len(checks) == 1
+
+
+def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
+    checks: list[str] = []
+
+    def counted(secret: str, salt: bytes) -> bytes:
+        checks.append(secret)
+        return b"never"
+
+    monkeypatch.setattr(access_tokens, "hash_secret", counted)
+    door = TokenAuthenticator(5, lambda _token: None)
+    door.state([kept(row)])
+    wrong = f"Bearer rosrv_{row.id}_" + "A" * 43
+    assert [recognise(door, wrong) for _ in range(8)] == [401] * 5 + [429] * 3
+    assert len(checks) == 5
+    assert recognise(door, wrong, "10.0.0.2") == 401
+    monkeypatch.undo()
+    assert recognise(door, f"Bearer {text}", "10.0.0.3").name == "a"
+
+
+def test_unknown_tokens_do_not_lock_out_a_neighbour() -> None:
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
+    door = TokenAuthenticator(5, lambda _token: None)
+    door.state([kept(row)])
+    statuses = [recognise(door, f"Bearer nonsense{number}") for number in range(8)]
+    assert statuses == [401] * 5 + [429] * 3
+    assert recognise(door, f"Bearer {text}").name == "a"
+
+
+def test_a_use_is_reported_at_once_and_then_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=600)
+    ended, late = make_token("b", "viewer", now=clock.wall() - 100, seconds=50)
+    used: list[str] = []
+    door = TokenAuthenticator(10, used.append)
+    door.state([kept(row), kept(ended)])
+    for header in (
+        None,
+        f"Bearer {late}",
+        f"Bearer {text[:-1]}!",
+        f"Bearer {make_token('c', 'viewer', now=0, seconds=1)[1]}",
+    ):
+        recognise(door, header)
+    assert used == []
+    machine = VirtualClock()
+    with using(machine):
+        for passed, reports in ((0.0, 1), (59.0, 1), (2.0, 2), (1.0, 2)):
+            machine.advance(passed)
+            assert recognise(door, f"Bearer {text}").name == "a"
+            assert used == [row.id] * reports
+        door.state([kept(row)])
+        recognise(door, f"Bearer {text}")
+    assert used == [row.id] * 3
+
+
+def test_a_stream_ends_with_the_grace_time_of_its_token() -> None:
+    row, text = make_token("a", "viewer", now=clock.wall(), seconds=60)
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row)])
+    bearer = recognise(door, f"Bearer {text}")
+    door.state([kept(row._replace(expires=clock.wall() + 30))])
+    assert door.still_good(bearer)
+    door.state([kept(row._replace(expires=clock.wall() - 1))])
+    assert not door.still_good(bearer)

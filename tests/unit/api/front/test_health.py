@@ -1,0 +1,90 @@
+"""Tests of `appliance.api.front.health`."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import pytest
+
+from appliance.api.front.control import ControlAwayError
+from appliance.api.front.health import Health, routes
+from appliance.api.front.history import SampleHistory
+from appliance.api.front.problems import ProblemError
+from appliance.api.front.services import Services
+from appliance.channel.answers.measures import Measures
+from tests.support.answers import example
+
+pytestmark = pytest.mark.anyio
+SERVING: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
+
+
+class Probed:
+    """REST before a control in a given state; `looks` counts the queries to control."""
+
+    def __init__(self, *statuses: dict[str, Any] | None) -> None:
+        self._statuses = list(statuses)
+        self.looks = 0
+        self.history = SampleHistory(self._measures)
+        services = SimpleNamespace(control=SimpleNamespace(connected=True), history=self.history)
+        (self._ready,) = [
+            one.endpoint  # type: ignore[attr-defined]  # it is a route with one
+            for one in routes(cast(Services, services)).routes
+            if one.path == "/readyz"  # type: ignore[attr-defined]  # and a path
+        ]
+
+    async def _measures(self) -> Measures:
+        self.looks += 1
+        status = self._statuses.pop(0) if len(self._statuses) > 1 else self._statuses[0]
+        if status is None:
+            raise ControlAwayError("being restarted")
+        return example(Measures, status=status, nodes={"live": 0})
+
+    async def ready(self) -> str:
+        try:
+            answer = await self._ready()
+        except ProblemError as problem:
+            assert problem.status == 503
+            return problem.kind
+        return str(msgspec.json.decode(answer.body, type=Health).status)
+
+
+@contextlib.asynccontextmanager
+async def sampled(probed: Probed) -> AsyncIterator[None]:
+    """Take samples of health during the block; the first sample exists when it begins."""
+    async with asyncio.timeout(30):
+        task = asyncio.create_task(probed.history.run())
+        await probed.history.after(0)
+        yield
+        task.cancel()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"probe": "the ROS Master answers"}, {"relay": "1 of 2 are away"}, {"relay": "away"},
+        {"rosmaster": "being rebuilt"}, {"audit": {"failed": "disk full", "on_failure": "deny"}}, None,
+    ],
+)  # fmt: skip
+async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] | None) -> None:
+    unready = None if wrong is None else SERVING | wrong
+    probed = Probed(unready, unready, SERVING)
+    async with sampled(probed):
+        assert await probed.ready() == "not-served"
+        assert await probed.ready() == "ready"
+
+
+async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
+    probed = Probed(SERVING | {"audit": {"failed": "disk full", "on_failure": "allow"}})
+    async with sampled(probed):
+        assert await probed.ready() == "ready"
+        assert probed.looks == 1
+
+
+async def test_many_probes_ask_control_once() -> None:
+    probed = Probed(SERVING | {"relay": "away"})
+    async with sampled(probed):
+        assert set(await asyncio.gather(*(probed.ready() for _ in range(200)))) == {"not-served"}
+        assert probed.looks <= 3

@@ -1,0 +1,60 @@
+"""Tests of `appliance.api.routes.audit_summary`."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from starlette.responses import Response
+
+from appliance.api.front.access import Bearer
+from appliance.api.front.services import Services
+from appliance.api.routes import audit_summary
+from appliance.audit.search.denial_summary import DenialSummary
+from appliance.audit.search.query import Filter
+from tests.unit.audit.conftest import key, make_log, notary, path
+
+pytestmark = pytest.mark.nightly
+
+__all__ = ["key", "make_log", "notary", "path"]
+
+
+_VIEWER = Bearer("v", "v", "viewer", 1e12, "shown")
+
+
+class _Log:
+    """The only part of `Services` that the route reads."""
+
+    def __init__(self, log: Path) -> None:
+        self.audit_log = log
+
+
+def route(log: Path) -> Callable[..., Coroutine[Any, Any, Response]]:
+    [one] = audit_summary.routes(cast(Services, _Log(log))).routes
+    return cast(Callable[..., Coroutine[Any, Any, Response]], one.endpoint)  # type: ignore[attr-defined]  # an APIRoute
+
+
+def test_one_summary_is_made_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    running, most, lock = 0, 0, threading.Lock()
+    second = threading.Event()
+
+    def slow(_path: Path, _wanted: Filter, _limit: int) -> DenialSummary:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        second.wait(0.05)  # long enough for the other to begin, if it could
+        with lock:
+            running -= 1
+        return DenialSummary(0, [], 0, 0, None)
+
+    monkeypatch.setattr(audit_summary, "summary_of_log", slow)
+
+    async def both() -> None:
+        ask = route(tmp_path)
+        await asyncio.gather(ask(_VIEWER, None, None, 20), ask(_VIEWER, None, None, 20))
+
+    asyncio.run(both())
+    assert most == 1

@@ -1,0 +1,194 @@
+"""The OpenAPI document: units of times and durations, ETags, examples and descriptions."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+from fastapi import FastAPI
+
+from appliance.api.front.request_gate import PUBLIC
+from appliance.api.routes.contract import EXAMPLES, WORDS, is_described
+from appliance.api.routes.contract_page import PATH
+from tests.support.asgi import requested
+from tests.unit.api.routes.test_operation_routes import BY_HAND
+
+_OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
+CONSOLE = Path(__file__).parents[4] / "appliance" / "api" / "console" / "js"
+_UNITS = ("seconds", "days")
+_IN_NAME = (*_UNITS, "_us", "_per_second", "_seconds")
+_IN_WORDS = (
+    *_UNITS, "microseconds", "milliseconds", "nanoseconds", "RFC 3339", "unit", "until the certificate ends",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def contract(app: FastAPI) -> dict[str, Any]:
+    return app.openapi()
+
+
+def _kinds(schema: dict[str, Any]) -> set[str]:
+    kind = schema.get("type", [])
+    kinds = {kind} if isinstance(kind, str) else set(kind)
+    return kinds.union(*map(_kinds, schema.get("anyOf", ())))
+
+
+def _words(schema: dict[str, Any]) -> str:
+    return " ".join([schema.get("description", ""), *map(_words, schema.get("anyOf", ()))])
+
+
+def test_a_wrong_method_lists_the_valid_ones(app: FastAPI, contract: dict[str, Any]) -> None:
+    paths = [*(path for path in contract["paths"] if "{" not in path), "/v1/tokens/{name}"]
+    answers = [requested(app, "TRACE", path.format(name="mallory")) for path in paths]
+    told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
+    found = [(answer.status_code, answer.headers["allow"]) for answer in answers]
+    assert found == [(405, methods) for methods in told]
+
+
+def test_times_have_units(contract: dict[str, Any]) -> None:
+    """Every field that holds a time has its unit in its name or its description, unless it is a whole number."""
+    without, seen = [], 0
+    for kind, schema in contract["components"]["schemas"].items():
+        for name, of in schema.get("properties", {}).items():
+            is_time = "number" in _kinds(of) or name in ("time", "since", "until") or name.endswith("_time")
+            if not is_time or _kinds(of) <= {"object", "array", "boolean"}:
+                continue
+            seen += 1
+            if not name.endswith(_IN_NAME) and not any(word in _words(of) for word in _IN_WORDS):
+                without.append(f"{kind}.{name}")
+    assert without == []
+    assert seen > 30
+
+
+def test_every_field_is_described(contract: dict[str, Any]) -> None:
+    fields = {
+        (kind, name): field
+        for kind, schema in contract["components"]["schemas"].items()
+        for name, field in schema.get("properties", {}).items()
+    }
+    assert [key for key, field in fields.items() if not is_described(field) and "$ref" not in field] == []
+    said = {
+        (place, field.get("description"))
+        for key, field in fields.items()
+        for place in (key[1], ".".join(key))
+    }
+    assert [place for place, words in WORDS.items() if (place, words) not in said] == []
+    assert len(fields) > 500
+
+
+def test_every_operation_has_a_summary_its_token_and_problems(contract: dict[str, Any]) -> None:
+    operations = {
+        f"{method.upper()} {path}": one
+        for path, row in contract["paths"].items()
+        for method, one in row.items()
+    }
+    own = {name for name in BY_HAND[None] if " /v1/openapi." in name}
+    assert {name for name, one in operations.items() if "security" not in one} == BY_HAND[None] - own
+    assert len({one["operationId"] for one in operations.values()}) == len(operations)
+    for name, one in operations.items():
+        assert one["summary"] and one["description"], name
+        for status, response in one["responses"].items():
+            if status >= "400":  # 400: of the server itself, which has no request yet, and so no application
+                media = "text/plain" if status == "400" else "application/problem+json"
+                assert list(response["content"]) == [media], (name, status)
+
+
+def test_every_json_answer_has_an_etag(contract: dict[str, Any]) -> None:
+    for path, operations in contract["paths"].items():
+        if "get" not in operations:
+            continue
+        responses = operations["get"]["responses"]
+        good = responses["200"]
+        if "application/json" not in good.get("content", {}):
+            assert "304" not in responses, path
+            continue
+        said = good["headers"]["ETag"]["description"]
+        assert ("If-None-Match" in said) == ("304" in responses), path
+        assert ("If-Match" in said) == (path in _OF_CHANGES), path
+
+
+def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) -> list[str]:
+    def without(content: dict[str, Any]) -> list[str]:
+        return [
+            media
+            for media, one in content.items()
+            if one["schema"].get("format") != "binary"
+            and "example" not in one
+            and "examples" not in kinds.get(one["schema"].get("$ref", "").rpartition("/")[2], {})
+        ]
+
+    parts = {
+        one["name"]: "examples" in one["schema"] or "examples" in one
+        for one in operation.get("parameters", ())
+        if one["in"] == "path"
+    }
+    missing = [part for part, there in parts.items() if not there]
+    missing += without(operation.get("requestBody", {}).get("content", {}))
+    for status, response in operation["responses"].items():
+        missing += without(response.get("content", {})) if status.startswith("2") else []
+    return [f"{name}: {one}" for one in missing]
+
+
+def test_every_operation_has_examples(contract: dict[str, Any]) -> None:
+    kinds = contract["components"]["schemas"]
+    operations = {
+        f"{method} {path}": one for path, row in contract["paths"].items() for method, one in row.items()
+    }
+    assert [line for name, one in operations.items() for line in _unexemplified(name, one, kinds)] == []
+    assert set(EXAMPLES) <= {*kinds, *(one["operationId"] for one in operations.values())}
+    assert len(operations) > 60
+
+
+def test_examples_match_their_schemas(contract: dict[str, Any]) -> None:
+    kinds = contract["components"]["schemas"]
+    told = [
+        ({"$ref": f"#/components/schemas/{kind}"}, one)
+        for kind, schema in kinds.items()
+        for one in schema.get("examples", ())
+    ]
+    for row in contract["paths"].values():
+        for operation in row.values():
+            for response in (operation.get("requestBody", {}), *operation["responses"].values()):
+                told += [
+                    (one["schema"], one["example"])
+                    for one in response.get("content", {}).values()
+                    if "example" in one
+                ]
+    for schema, value in told:
+        validator = jsonschema_rs.Draft202012Validator(schema | {"components": contract["components"]})
+        assert [str(error.message) for error in validator.iter_errors(value)] == [], schema
+    assert len(told) > len(EXAMPLES)
+
+
+def test_the_console_reads_fields_of_the_contract(contract: dict[str, Any]) -> None:
+    schemas = contract["components"]["schemas"].values()
+    fields = {name for schema in schemas for name in schema.get("properties", {})}
+    texts = [path.read_text() for path in CONSOLE.rglob("*.js")]
+    own = {
+        name for text in texts for name in re.findall(r"\b([a-z]\w*)\b(?=\s*[:,}=])(?<!\.)", _unread(text))
+    }
+    read = {
+        name
+        for text in texts
+        for name in re.findall(r"\b(?:row|one|body)\??\.([a-z][a-z0-9_]*)\b(?!\()", text)
+    }
+    assert {"would_drop", "shadow", "held"} <= read
+    assert sorted(read - fields - own - {"length"}) == []
+
+
+def _unread(text: str) -> str:
+    return re.sub(r"\??\.[a-z]\w*", "", text)
+
+
+def test_the_page_has_each_call(app: FastAPI, contract: dict[str, Any]) -> None:
+    """Without a token, people read every call of the contract, also after a path that does not exist."""
+    lost = requested(app, "GET", "/v1/nothing")
+    assert lost.status_code == 404
+    assert '</v1/openapi.html>; rel="service-doc"' in lost.headers["link"]
+    page = requested(app, "GET", "/v1/openapi.html")
+    assert "<script" not in page.text
+    assert PATH in PUBLIC
+    shown = re.findall(r"<h3><a href=\S+<code>(\w+) (\S+)</code>", page.text)
+    calls = [(method.upper(), path) for path, some in contract["paths"].items() for method in some]
+    assert sorted(shown) == sorted(calls)

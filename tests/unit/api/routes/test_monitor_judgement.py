@@ -1,0 +1,43 @@
+"""Tests of `appliance.api.routes.monitor_judgement`: describing specifications without an appliance."""
+
+import pytest
+
+from appliance.api.routes.monitor_judgement import Compiler, findings_of, refusal
+from appliance.channel.answers.monitor_answers import Monitors
+from tests.support.answers import example
+
+A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
+TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
+
+
+def test_findings_without_a_position_stay_in_the_detail() -> None:
+    problem = refusal(
+        "refused", ["a would also be removed: it is in the same file", "a.rv:1:2: error: odd: 1:2"]
+    )
+    assert problem.findings is not None
+    assert [(one.file, one.line, one.text) for one in problem.findings] == [("a.rv", 1, "odd: 1:2")]
+    assert "would also be removed" in problem.detail
+    assert findings_of(["nonsense", "a:b:c: error: x"]) == []
+
+
+def test_a_monitor_is_described() -> None:
+    compiler = Compiler()
+    a = compiler.described(
+        example(Monitors, revision=1, files={"a.rv": A, "b.rv": TICK}, definitions={}), "a"
+    )
+    again = example(Monitors, revision=1)  # already compiled: the same revision is not compiled again
+    b = compiler.described(again, "b")
+    (said,) = a.events
+    assert (said.name, said.topic, said.type, said.part, said.every) == (
+        "said", "/chatter", "std_msgs/String", None, None,
+    )  # fmt: skip
+    tick, asked = b.events
+    assert (tick.topic, tick.every) == (None, 0.5)
+    assert (asked.topic, asked.type, asked.part) == ("/set", "std_srvs/SetBool", "request")
+    (matched,) = a.properties
+    assert (matched.logic, matched.handled, matched.drawn) == ("ere", ["match"], True)
+    assert str(compiler.picture(again, "a")).startswith("<svg ")
+    assert compiler.picture(again, "b") is None
+    with pytest.raises(KeyError):
+        compiler.described(again, "nobody")
+    assert {one.file for one in compiler.warnings("a.rv")} <= {"a.rv"}

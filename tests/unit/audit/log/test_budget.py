@@ -1,0 +1,116 @@
+"""Tests of the quota of record bytes for each host, with a clock that the test moves."""
+
+from appliance.audit.log.budget import RATE, Budget, weight
+from appliance.audit.log.record import AuditRecord
+from appliance.quotas.pool import Bounds, QuotaClass
+
+ROBOT, GUEST = "10.0.0.1", "10.0.0.66"
+BOUNDS = Bounds(whole=1 << 40, host=1 << 20, unknown=0, kept=1 << 39)
+RESERVE = Bounds(whole=1 << 20, host=1 << 16, unknown=0, kept=1 << 18)
+
+
+class Desk:
+    """A budget, its clock, and the known hosts."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.registered = {ROBOT}
+        self.budget = Budget(
+            self.quota_class,
+            bounds=BOUNDS,
+            reserve=RESERVE,
+            kept_for=lambda host: host == ROBOT,
+            clock=lambda: self.now,
+        )
+
+    def quota_class(self, host: str) -> QuotaClass:
+        """Return the class of a host: registered with a registration, otherwise named."""
+        return QuotaClass.REGISTERED if host in self.registered else QuotaClass.NAMED
+
+    def spend(self, host: str, size: int = 1 << 21) -> AuditRecord:
+        """Charge one record about a host with this size on disk."""
+        record = AuditRecord(id="0", time=0, event="decision", host=host, detail={"key": "k" * (size // 2)})
+        self.budget.charge(record)
+        return record
+
+
+def test_a_host_in_debt_waits_until_it_is_paid() -> None:
+    """A host beyond its quota waits as long as its debt lasts; time pays the debt, and no other host waits."""
+    desk = Desk()
+    desk.spend(GUEST)
+    assert desk.budget.pause(GUEST) == 1.0
+    assert GUEST in desk.budget.owing(GUEST)
+    assert desk.budget.pause(ROBOT) == 0
+    desk.now += (1 << 20) / RATE + 1
+    assert desk.budget.pause(GUEST) == 0
+    desk.now += 60
+    assert desk.budget.pause(GUEST) == 0
+    assert not list(desk.budget.owed.holders())  # a host without debt uses no memory
+
+
+def test_a_folded_record_costs_nothing() -> None:
+    """If the log only counted a record, the host gets back its cost."""
+    desk = Desk()
+    record = desk.spend(GUEST)
+    desk.budget.folded(record)
+    assert desk.budget.pause(GUEST) == 0
+
+
+def test_two_hundred_hosts_leave_the_robot_its_quota() -> None:
+    """Two hundred hosts, each with the largest debt, are slowed down; the robot is not."""
+    desk = Desk()
+    guests = [f"10.1.{number // 100}.{number % 100}" for number in range(200)]
+    for guest in guests:
+        desk.spend(guest)
+    assert all(desk.budget.pause(guest) > 0 for guest in guests)
+    for _ in range(10):
+        desk.spend(ROBOT, 1 << 16)
+        desk.now += 1
+        assert desk.budget.pause(ROBOT) == 0
+
+
+def test_unknown_hosts_have_no_debt() -> None:
+    """Any number of addresses of unknown hosts uses no memory here."""
+    desk = Desk()
+    for number in range(1000):
+        unknown = AuditRecord(id="0", time=0, event="decision", host=f"10.9.0.{number}", unknown=True)
+        desk.budget.charge(unknown)
+        desk.budget.folded(unknown)
+    assert not list(desk.budget.owed.holders())
+    assert desk.budget.pause("10.9.0.1") == 0
+
+
+def test_a_nearly_full_disk_lowers_every_quota() -> None:
+    """In the reserve the quotas are small; a host within its quota is not slowed down."""
+    desk = Desk()
+    desk.spend(GUEST, 1 << 18)
+    assert desk.budget.pause(GUEST) == 0
+    desk.budget.room(RESERVE.whole - 1)
+    assert desk.budget.pause(GUEST) == 1.0
+    assert desk.budget.pause(ROBOT) == 0
+    desk.budget.room(None)
+    assert desk.budget.pause(GUEST) == 0
+
+
+def test_the_last_of_the_disk_is_kept() -> None:
+    """In the last quarter of the reserve other hosts are denied; with free space again they are served."""
+    desk = Desk()
+    desk.registered.clear()  # as after a restart
+    desk.budget.room(RESERVE.kept - 1)
+    assert "kept for the robot and for hosts that the policy names" in desk.budget.shut_out(GUEST)
+    assert desk.budget.shut_out(ROBOT) == ""
+    desk.budget.room(None)
+    assert desk.budget.shut_out(GUEST) == ""
+
+
+def test_every_text_of_a_peer_counts() -> None:
+    """Long names, resources, reasons and keys of a peer all count."""
+    plain = weight(AuditRecord(id="0", time=0, event="decision", host=GUEST))
+    long = "x" * 1000
+    for record in (
+        AuditRecord(id="0", time=0, event="decision", host=GUEST, caller_id=long),
+        AuditRecord(id="0", time=0, event="decision", host=GUEST, resource=long),
+        AuditRecord(id="0", time=0, event="decision", host=GUEST, reason=long),
+        AuditRecord(id="0", time=0, event="decision", host=GUEST, detail={"key": long}),
+    ):
+        assert weight(record) > plain + 1000

@@ -1,0 +1,44 @@
+"""Tests of the documented format of a record."""
+
+from pathlib import Path
+
+from appliance.audit.log.events import EVENTS
+from appliance.audit.log.record import AuditRecord, RuleReference
+from appliance.audit.log.record_format import LogEntry, as_object
+from appliance.audit.log.schema import json_schema
+from appliance.audit.proof.chain_proofs import ChainProof
+from distribution.audit_record_page import CHAIN, markdown
+
+_PAGE = Path(__file__).parents[4] / "docs" / "audit.md"
+
+
+def test_the_page_matches_the_code() -> None:
+    """The reviewer's page has the fields, events and schema of the code (python -m distribution.audit_record_page)."""
+    generated = _PAGE.read_text().split("<!-- generated: python -m distribution.audit_record_page -->\n")[1]
+    assert generated == markdown()
+
+
+def test_every_field_is_documented() -> None:
+    """A record's JSON has the fields of the schema, in its order, and no others."""
+    rule = RuleReference("Publishers", "/**", "a.ini", 1)
+    full = as_object(
+        LogEntry(1, AuditRecord(id="0" * 20, time=1, event="decision", decision="deny", rule=rule))
+    )
+    schema = json_schema()
+    assert list(full) == list(schema["properties"])
+    bare = as_object(LogEntry(1, AuditRecord(id="0" * 20, time=1, event="decision")))
+    assert list(bare) == schema["required"]
+    assert list(full["rule"]) == schema["properties"]["rule"]["required"]
+
+
+def test_a_line_of_an_export_is_a_record_and_its_position() -> None:
+    """The schema of an exported line has the fields that an export writes, including the position in the chain."""
+    assert list(CHAIN["properties"]) == list(ChainProof.__struct_fields__)
+
+
+def test_events_are_described() -> None:
+    """Every event has a name in lower-case words and a sentence."""
+    for name, text in EVENTS.items():
+        assert name == name.lower().strip()
+        assert text.endswith(".")
+        assert "|" not in text

@@ -1,0 +1,187 @@
+"""Tests of checkpoints copied to another machine. The attacker is root and also has the signer's key."""
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.log.retention import Retention
+from appliance.audit.proof.chain_findings import FindingKind, Verification
+from appliance.audit.proof.copies import (
+    SYSLOG_ELEMENT,
+    CopiesUnreadableError,
+    SignedCheckpoint,
+    read_copies,
+    signed_checkpoints,
+)
+from appliance.audit.proof.verification import verify
+from tests.support.audit import decision, settle
+from tests.support.forgery import write_anew
+from tests.unit.audit.conftest import MakeLog, Notary
+from tests.unit.audit.log.test_retention import retain
+
+
+@pytest.fixture
+def log(make_log: MakeLog, path: Path) -> Path:
+    """Return a closed log of two hundred records with signed checkpoints."""
+    log = make_log(checkpoint_every=50, checkpoint_seconds=3600)
+    for number in range(200):
+        log.record(decision(log, number))
+        if number % 25 == 24:
+            assert settle(log) is None
+    log.close()
+    assert verify(path).ok
+    return path
+
+
+def kinds(result: Verification) -> set[FindingKind]:
+    """Return the kinds of the findings."""
+    assert result.ok == (not result.findings)
+    return {one.kind for one in result.findings}
+
+
+def test_an_unchanged_log_agrees(log: Path) -> None:
+    """An unchanged log agrees with every copied checkpoint, and the result names the last one."""
+    copies = signed_checkpoints(log)
+    assert len(copies) >= 4
+    result = verify(log, copies=copies)
+    assert result.ok
+    assert result.elsewhere is not None
+    assert (result.elsewhere.checkpoints, result.elsewhere.through) == (len(copies), copies[-1].sequence)
+    assert result.elsewhere.other_logs == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE record SET decision = 'deny' WHERE sequence = 60",
+        "DELETE FROM record WHERE sequence BETWEEN 60 AND 70 AND event = 'decision'",
+        "UPDATE record SET host = '10.0.0.1' WHERE sequence = 2",
+    ],
+)
+def test_history_signed_by_root_is_found(
+    log: Path, key: Ed25519PrivateKey, tmp_path: Path, change: str
+) -> None:
+    """A history rewritten and signed with the real key passes every local check, but disagrees with the copy."""
+    copies = signed_checkpoints(log)
+    write_anew(log, key, tmp_path / "signer", change)
+    public = key.public_key().public_bytes_raw()
+    assert verify(log, public, tmp_path / "signer").ok
+    result = verify(log, public, tmp_path / "signer", copies)
+    assert FindingKind.REWRITTEN in kinds(result)
+
+
+def test_the_range_is_between_two_checkpoints(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """The reported range begins after the last checkpoint that agrees and ends at the first that disagrees."""
+    copies = signed_checkpoints(log)
+    write_anew(log, key, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 110")
+    result = verify(log, copies=copies)
+    finding = next(one for one in result.findings if one.kind is FindingKind.REWRITTEN)
+    assert finding.first <= 110 <= finding.last
+    assert finding.last in {one.sequence for one in copies}
+    assert finding.first - 1 in {one.sequence for one in copies}
+
+
+def test_an_end_removed_by_root_is_found(log: Path, key: Ed25519PrivateKey, tmp_path: Path) -> None:
+    """The copy reveals that the last records were removed, even with their checkpoints and the signer's memory gone."""
+    copies = signed_checkpoints(log)
+    with closing(sqlite3.connect(log)) as connection:
+        connection.execute("DELETE FROM record WHERE sequence > 90")
+        connection.execute("DELETE FROM checkpoint WHERE sequence > 90")
+        connection.commit()
+    result = verify(log, copies=copies)
+    cut = [one for one in result.findings if one.kind is FindingKind.TRUNCATED]
+    assert [(one.first, one.last) for one in cut] == [(91, copies[1].sequence)]
+
+
+def test_another_log_is_found(log: Path, make_log: MakeLog, path: Path) -> None:
+    """A new log, however well signed, does not match the copied checkpoints."""
+    copies = signed_checkpoints(log)
+    for one in path.parent.glob("audit.db*"):
+        one.unlink()
+    fresh = make_log(checkpoint_every=10)
+    fresh.record(decision(fresh))
+    assert settle(fresh) is None
+    fresh.close()
+    assert kinds(verify(path, copies=copies)) == {FindingKind.LOG_REPLACED}
+
+
+def test_a_forged_copy_proves_nothing(log: Path) -> None:
+    """A copy without a valid signature is reported and not compared with the log."""
+    copies = signed_checkpoints(log)
+    forged = msgspec.structs.replace(copies[0], hash="0" * 64)
+    result = verify(log, copies=[forged, *copies[1:]])
+    assert kinds(result) == {FindingKind.SIGNATURE_WRONG}
+    assert result.elsewhere is not None
+    assert result.elsewhere.checkpoints == len(copies) - 1
+
+
+def test_a_replaced_key_is_found(log: Path, tmp_path: Path) -> None:
+    """If root replaces the key, its pin and every signature, the key of the copies shows it."""
+    copies = signed_checkpoints(log)
+    other = Ed25519PrivateKey.generate()
+    write_anew(log, other, tmp_path / "signer", "UPDATE record SET reason = 'x' WHERE sequence = 60")
+    public = other.public_key().public_bytes_raw()
+    assert verify(log, public, tmp_path / "signer").ok
+    assert kinds(verify(log, public, tmp_path / "signer", copies)) == {FindingKind.WRONG_KEY}
+
+
+def test_checkpoints_of_removed_records_contradict_nothing(
+    make_log: MakeLog, path: Path, notary: Notary
+) -> None:
+    """Checkpoints whose records were removed prove nothing, and the result says so."""
+    notary.ago = 2 * 86_400_000_000_000
+    log = make_log(checkpoint_every=20, clock=lambda: 1)
+    for number in range(60):
+        log.record(decision(log, number, time=1))
+        settle(log)
+    log.close()
+    copies = signed_checkpoints(path)
+    notary.ago = 0
+    log = make_log(checkpoint_every=20, retention=Retention(days=1))
+    retain(log)
+    log.close()
+    newer = signed_checkpoints(path)
+    result = verify(path, copies=copies + newer)
+    assert result.ok, result.findings
+    assert copies[0].sequence <= result.removed
+    gone = [one for one in copies if one.sequence < result.removed]
+    assert gone
+    assert kinds(verify(path, copies=gone)) == {FindingKind.PROVES_NOTHING}
+
+
+def test_formats_of_a_copy(log: Path, tmp_path: Path) -> None:
+    """NDJSON and lines of a syslog receiver are read alike; other lines and a cut line are skipped."""
+    copies = signed_checkpoints(log)
+    fields = json.loads(copies[1].as_json())
+    element = " ".join(f'{name}="{value}"' for name, value in fields.items())
+    file = tmp_path / "kept"
+    file.write_text(
+        f"{copies[0].as_json()}\n"
+        '<110>1 2026-03-01T00:00:00Z robot rosrv - decision [rosrv@32473 x="1"] text\n'
+        f"<111>1 2026-03-01T00:00:00Z robot rosrv - checkpoint [{SYSLOG_ELEMENT} {element}] text\n"
+        f"{copies[2].as_json()[:50]}\n"
+    )
+    assert read_copies(file) == copies[:2]
+
+
+@pytest.mark.parametrize("text", ["", "{}\n", "[" * 100_000, '{"log": 1}\n', "\x00\xff\n"])
+def test_a_file_without_checkpoints_is_an_error(tmp_path: Path, text: str) -> None:
+    """A file without a checkpoint, or a missing file, is an error that names it."""
+    file = tmp_path / "kept"
+    file.write_text(text)
+    with pytest.raises(CopiesUnreadableError, match="kept: no checkpoint"):
+        read_copies(file)
+    with pytest.raises(CopiesUnreadableError, match="nowhere: No such file"):
+        read_copies(tmp_path / "nowhere")
+
+
+def test_json_and_back(log: Path) -> None:
+    """A checkpoint as JSON is read back unchanged, and its signature covers exactly these fields."""
+    one = signed_checkpoints(log, limit=1)[0]
+    assert msgspec.json.decode(one.as_json(), type=SignedCheckpoint) == one
+    assert signed_checkpoints(log, after=one.number)[0].number == one.number + 1

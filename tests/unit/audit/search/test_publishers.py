@@ -1,0 +1,83 @@
+"""Tests of the past publishers of a topic: gaps in a log without its first records, or after a loss."""
+
+from typing import Any
+
+from msgspec import structs
+
+from appliance.audit.log.record import AuditRecord
+from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.repetition import HOST, KIND, new_state, summary
+from appliance.audit.search.publishers import PastPublishers, publishers_at
+from appliance.audit.search.query import Filter
+
+
+def entry(sequence: int, event: str, **fields: Any) -> LogEntry:
+    """Return a record at the second of its sequence."""
+    return LogEntry(sequence, AuditRecord(id=str(sequence), time=sequence * 10**9, event=event, **fields))
+
+
+def unknown(log: list[LogEntry], at: int) -> tuple[str, ...]:
+    """Return the reported gaps for /a at this second."""
+    return found(log, at).unknown
+
+
+def found(log: list[LogEntry], at: int) -> PastPublishers:
+    """Return the publishers of /a at this second."""
+
+    def export(wanted: Filter) -> list[LogEntry]:
+        return [one for one in log if one.record.event == wanted.event]
+
+    return publishers_at(export, log[0] if log else None, "/a", at * 10**9)
+
+
+def test_gaps_of_the_log_are_reported() -> None:
+    """Removed records, an earlier log, lost records and an empty log are reported; a whole log has no such gap."""
+    begun = entry(1, "log begun")
+    assert unknown([begun, entry(2, "appliance started")], 5) == ()
+    [removed] = unknown([entry(4, "decision")], 5)
+    assert removed.startswith("records before 1970-01-01T00:00:04.000000000Z were removed")
+    [earlier] = unknown([entry(1, "log begun", detail={"earlier_log_missing": True})], 5)
+    assert earlier.startswith("an earlier log is missing")
+    [lost] = unknown([begun, entry(3, "records lost")], 5)
+    assert lost.startswith("records were lost")
+    [empty] = unknown([], 5)
+    assert empty.startswith("the log is empty")
+
+
+def counted(sequence: int, scope: str, event: str, **fields: Any) -> LogEntry:
+    """Return the summary of a record that was repeated two seconds earlier."""
+    first = entry(sequence - 2, event, host="10.0.0.9", caller_id="/n", **fields).record
+    state = new_state(structs.replace(first, folds=True), scope)
+    state.count_in(first)
+    return LogEntry(sequence, summary(state, str(sequence), sequence * 10**9))
+
+
+def test_registrations_that_were_only_counted_are_reported() -> None:
+    """A host above its budget cannot hide a publication: the log counts it, and the answer refers to the count."""
+    topic = {"category": "publication", "resource": "/a"}
+    log = [
+        entry(1, "log begun"),
+        entry(2, "registered", host="10.0.0.9", caller_id="/n", **topic),
+        entry(3, "unregistered", host="10.0.0.9", caller_id="/n", **topic),
+    ]
+    for summed in (
+        counted(6, KIND, "registered", **topic),
+        counted(6, HOST, "registered", category="publication", resource="/b"),
+        counted(6, KIND, "node returned", category=None, resource=None),
+    ):
+        assert [line[:13] for line in unknown([*log, summed], 5)] == ["registrations"]
+        assert unknown([*log, summed], 3) == (), "it was counted later"
+    for other in (
+        counted(6, KIND, "registered", category="publication", resource="/b"),
+        counted(6, KIND, "registered", category="subscription", resource="/a"),
+        counted(6, KIND, "decision", **topic),
+    ):
+        assert unknown([*log, other], 5) == ()
+
+
+def test_the_end_of_a_registration_shows_its_beginning_only_without_a_loss() -> None:
+    """A node that unregistered later was registered before the log begins, unless records were lost in between."""
+    end = entry(8, "unregistered", host="10.0.0.9", caller_id="/n", category="publication", resource="/a")
+    log = [entry(1, "decision"), counted(7, KIND, "decision"), end]
+    assert [one.node for one in found(log, 5).publishers] == ["/n"]
+    assert found([entry(1, "decision"), entry(7, "records lost"), end], 5).publishers == ()

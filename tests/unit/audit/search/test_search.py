@@ -1,0 +1,230 @@
+"""Tests of finding records in a running and in a closed log."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.log.log import AuditLog
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.record import RuleReference, Severity
+from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.search import Follower, export, search, show
+from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog
+
+_SECOND = 1_000_000_000
+_BEGIN = 1_700_000_000 * _SECOND
+
+
+@pytest.fixture
+def log(make_log: MakeLog) -> AuditLog:
+    """Return an open log with a hundred ordinary decisions a second apart, and some that differ."""
+    log = make_log(checkpoint_seconds=3600)
+    for number in range(100):
+        log.record(decision(log, number, time=_BEGIN + number * _SECOND))
+    other = RuleReference("Clients", "/reset/**", "robot.ini", 30)
+    odd: list[dict[str, Any]] = [
+        {"decision": "deny", "host": "10.66.0.1", "caller_id": "/evil", "resource": "/arm/joint_1"},
+        {"decision": "would deny", "resource": "/arm/joint_2", "rule": other, "category": "call"},
+        {
+            "event": "node lost",
+            "decision": None,
+            "severity": Severity.ALARM,
+            "reason": "No answer from Żółw 100%",
+        },
+        {"detail": {"type": "std_msgs/Float64", "quote": 'say "hi"'}, "reason": "a_b and a%b", "revision": 9},
+    ]
+    for number, fields in enumerate(odd):
+        log.record(decision(log, time=_BEGIN + (1000 + number) * _SECOND, **fields))
+    assert settle(log) is None
+    return log
+
+
+def sequences(path: Path, wanted: Filter, **arguments: Any) -> list[int]:
+    """Return the sequences of the records found, less two (the log's own first record is 1)."""
+    return [entry.sequence - 2 for entry in search(path, wanted, **arguments).entries]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"),
+    [
+        (Filter(decision=("deny",)), [100]),
+        (Filter(decision=("deny", "would deny")), [101, 100]),
+        (Filter(host="10.66.0.1"), [100]),
+        (Filter(host="10.66.*"), [100]),
+        (Filter(hosts=("10.66.0.1/32", "fd00::1/128")), [100]),
+        (Filter(hosts=("10.66.0.0/30", "fd00::/8"), decision=("deny",)), [100]),
+        (Filter(hosts=("10.66.0.4/30",)), []),
+        (Filter(caller_id="/evil"), [100]),
+        (Filter(resource="/arm/*"), [101, 100]),
+        (Filter(resource="/arm/joint_?"), [101, 100]),
+        (Filter(resource="/arm/joint_[13]"), [100]),
+        (Filter(resource="/arm"), []),
+        (Filter(category="call"), [101]),
+        (Filter(event="node *"), [102]),
+        (Filter(severity=Severity.WARNING), [102]),
+        (Filter(rule="Clients"), [101]),
+        (Filter(rule="/reset/**"), [101]),
+        (Filter(since=_BEGIN + 1001 * _SECOND, until=_BEGIN + 1003 * _SECOND), [102, 101]),
+        (Filter(until=_BEGIN + 2 * _SECOND), [1, 0]),
+        (Filter(text="float64"), [103]),
+        (Filter(text="Żółw"), [102]),
+        (Filter(text='say \\"hi'), [103]),
+        (Filter(text="a_b"), [103]),
+        (Filter(text="0%"), [102]),
+        (Filter(text="a%b"), [103]),
+        (Filter(text="nowhere"), []),
+        (Filter(text="arm", decision=("deny",)), [100]),
+        (Filter(text="joint", resource="/arm/*", decision=("would deny",)), [101]),
+        (Filter(decision=("deny",), category="call"), []),
+        (Filter(decision=("allow",), resource="/cmd_7", host="10.0.0.2"), [87, 67, 47, 27, 7]),
+    ],
+    ids=str,
+)
+def test_filters(log: AuditLog, path: Path, wanted: Filter, expected: list[int]) -> None:
+    """Each filter, alone or combined, finds exactly its records, newest first, in a running and a closed log."""
+    assert sequences(path, wanted) == expected
+    log.close()
+    assert sequences(path, wanted) == expected
+
+
+def test_a_text_is_found_before_and_after_indexing(log: AuditLog, path: Path) -> None:
+    """A text is found as soon as its record is on disk."""
+    for number in range(600):
+        log.record(decision(log, number, reason=f"needle {number}"))
+        if number % 100 == 0:
+            assert settle(log) is None
+            assert len(search(path, Filter(text=f"needle {number}")).entries) >= 1
+    assert settle(log) is None
+    assert len(search(path, Filter(text="needle"), limit=1000).entries) == 600
+
+
+@pytest.mark.parametrize("newest_first", [True, False])
+@pytest.mark.parametrize("wanted", [Filter(), Filter(resource="/cmd_*"), Filter(text="lets it")])
+def test_pages_give_every_record_once(log: AuditLog, path: Path, wanted: Filter, newest_first: bool) -> None:
+    """Pages are in order, even while records are added."""
+    everything = [entry.record.id for entry in search(path, wanted, limit=1000).entries]
+    found: list[str] = []
+    cursor = None
+    for _page in itertools.count():
+        page = search(path, wanted, cursor, 7, newest_first=newest_first)
+        found += [entry.record.id for entry in page.entries]
+        cursor = page.cursor
+        if cursor is None:
+            break
+        if newest_first:
+            log.record(decision(log))
+            assert settle(log) is None
+    assert found == (everything if newest_first else everything[::-1])
+
+
+def test_an_export_has_everything_oldest_first(log: AuditLog, path: Path) -> None:
+    """The export has every record once, oldest first, with pages of any size."""
+    entries = list(export(path, Filter(), page=9))
+    assert [entry.sequence for entry in entries] == list(range(1, len(entries) + 1))
+    assert len(entries) >= 105
+
+
+def test_a_record_is_shown_with_its_neighbours(log: AuditLog, path: Path) -> None:
+    """A record is found by its id or its sequence, with earlier and later actions of the same host or caller."""
+    entry = search(path, Filter(resource="/cmd_7", host="10.0.0.2")).entries[2]
+    shown = show(path, entry.record.id, neighbours=2)
+    assert shown is not None
+    assert shown == show(path, str(entry.sequence), neighbours=2)
+    assert shown.entry == entry
+    assert [one.sequence - entry.sequence for one in shown.before] == [-10, -5]
+    assert [one.sequence - entry.sequence for one in shown.after] == [5, 10]
+    for unknown in ("0" * 20, "99999999", "", "x' OR 1=1", "\0", "9" * 50, "½"):
+        assert show(path, unknown) is None
+
+
+def test_a_follower_gets_new_records(log: AuditLog, path: Path) -> None:
+    """A follower gets the matching records made after it began, once and in order."""
+    follower = Follower(path, Filter(decision=("deny",)))
+    assert follower.poll() == []
+    sent = [decision(log, number, decision="deny", resource=f"/n{number}") for number in range(25)]
+    for one in sent:
+        log.record(one)
+        log.record(decision(log))
+    assert settle(log) is None
+    got = [entry.record for _poll in range(10) for entry in follower.poll(limit=10)]
+    assert got == sent
+    assert follower.poll() == []
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        (Filter(resource="x" * 300), "resource: longer than 256"),
+        (Filter(resource="*a" * 20), r"resource: more than 8 times '\*'"),
+        (Filter(host="\udc80"), "host: not valid Unicode"),
+        (Filter(text="y" * 300), "text: longer"),
+    ],
+)
+def test_invalid_filters_are_errors(log: AuditLog, path: Path, wanted: Filter, message: str) -> None:
+    """A filter past its limits is an error that names the part and the reason."""
+    with pytest.raises(FilterError, match=message):
+        search(path, wanted)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"limit": 0}, {"limit": 10_001}, {"cursor": "x"}, {"cursor": "-1"}, {"cursor": "9" * 30}]
+)
+def test_invalid_pages_are_errors(log: AuditLog, path: Path, arguments: dict[str, Any]) -> None:
+    """A wrong limit or cursor is an error."""
+    with pytest.raises(FilterError):
+        search(path, Filter(), **arguments)
+
+
+def test_a_missing_log_is_an_error(tmp_path: Path) -> None:
+    """The error names the missing file and the option that sets the path."""
+    with pytest.raises(LogUnreadableError, match=r"no audit log yet.*--state"):
+        search(tmp_path / "audit.db", Filter())
+    with pytest.raises(LogUnreadableError, match=r"no such directory.*--state"):
+        search(tmp_path / "none" / "audit.db", Filter())
+
+
+def test_a_damaged_log_is_an_error(path: Path) -> None:
+    """Searching a file that is not a log is an error that names it."""
+    path.write_bytes(b"rubbish" * 1000)
+    with pytest.raises(LogUnreadableError, match=r"audit\.db"):
+        search(path, Filter())
+
+
+def test_reading_leaves_no_trace(log: AuditLog, path: Path) -> None:
+    """Searching a stopped log does not change its file."""
+    log.close()
+    before = path.read_bytes()
+    search(path, Filter(text="needle"))
+    assert path.read_bytes() == before
+
+
+def test_reads_over_rest_can_be_left_out(log: AuditLog, path: Path) -> None:
+    """The filter omits allowed GETs of REST; orders, refused reads, and unknown methods of clients stay."""
+    calls = [
+        ("GET", "allow", "rest call", "rest"), ("HEAD", "allow", "rest call", "rest"),
+        ("POST", "allow", "rest call", "rest"),
+        ("GET", "deny", "rest call", "rest"), ('X","method":"GET', "allow", "rest call", "rest"),
+        ("GET", "allow", "rest call", "publish"),
+    ]  # fmt: skip
+    for method, decided, event, category in calls:
+        fields: dict[str, Any] = {"event": event, "decision": decided, "category": category}
+        log.record(decision(log, resource="/v1/x", detail={"method": method, "status": 200}, **fields))
+    assert settle(log) is None
+    everything = Filter(resource="/v1/x")
+    assert len(sequences(path, everything)) == 6
+    shown = search(path, Filter(resource="/v1/x", without_looks=True), newest_first=False).entries
+    assert [entry.record.detail["method"] for entry in shown] == ["POST", "GET", 'X","method":"GET', "GET"]
+    followed = Follower(path, Filter(resource="/v1/x", without_looks=True), 0).poll(100)
+    assert [entry.sequence for entry in followed] == [entry.sequence for entry in shown]
+
+
+def test_records_are_found_by_token_name(log: AuditLog, path: Path) -> None:
+    """A token's name finds its requests, and a glob those of several tokens; text from a node never matches."""
+    details: list[dict[str, Any]] = [{"who": "alice"}, {"who": "bob"}, {"text": '"who":"alice"'}, {}]
+    for detail in details:
+        log.record(decision(log, resource="/v1/x", detail=detail))
+    assert settle(log) is None
+    assert [len(sequences(path, Filter(who=who))) for who in ("alice", "*", "a*", "eve")] == [1, 2, 1, 0]

@@ -1,0 +1,198 @@
+"""Limits of control's listeners: admission, and idle connections."""
+
+import asyncio
+import dataclasses
+import ipaddress
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import export
+from appliance.configuration.settings import Settings
+from appliance.control.assembly.listener_limits import ListenerLimits, class_of
+from appliance.policy.model import Address, address_of
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import QuotaClass
+from appliance.rpc.connection_table import ConnectionTable, Stage
+from appliance.rpc.server import HttpRequest, Peer, exceeds_limit
+from appliance.telemetry.audit_trail import AuditTrail
+from roswire.xmlrpc import build_call
+from tests.support.engines import open_log
+
+pytestmark = pytest.mark.anyio
+
+WAIT = 30.0
+CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("guarded", [True, False])
+async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
+    given = Settings()
+    settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
+    policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
+    log = open_log(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    listener_limits = ListenerLimits(settings, trail, lambda: policy, lambda _host: QuotaClass.NAMED)
+
+    async def answer(_request: HttpRequest) -> bytes:
+        return b"!"
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        await listener_limits.open(listener, answer, guarded=guarded)
+        table = listener_limits.connection_table if guarded else listener_limits.own_connection_table
+        sweep = asyncio.get_running_loop().create_task(table.sweep())
+        reader, writer = await asyncio.open_connection(*listener.getsockname())
+        writer.write(CALL)
+        async with asyncio.timeout(WAIT):
+            assert (await reader.read()).endswith(b"!")
+        writer.close()
+        sweep.cancel()
+        listener_limits.close()
+    log.close()
+
+
+def test_hosts_of_a_wildcard_share_processor_time() -> None:
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1 10.1.0.0/16\n/guest/** = *\n", file="a.ini")
+    registered = address_of("10.9.0.7")
+    quota_class = {registered: QuotaClass.REGISTERED}
+
+    def kind(text: str) -> str:
+        return class_of(
+            lambda: policy, lambda host: quota_class.get(host, QuotaClass.NAMED), address_of(text)
+        )
+
+    assert len({kind(f"10.9.1.{number}") for number in range(200)}) == 1
+    assert len({kind(text) for text in ("10.0.0.1", "10.1.0.1", "10.9.0.7", "10.9.1.1", "127.0.0.1")}) == 5
+    assert kind("10.1.0.1") == kind("10.1.255.9")
+
+
+@pytest.fixture
+def everybodys(tmp_path: Path) -> Iterator[ListenerLimits]:
+    """Return limits under a policy that names `ROBOT` and admits all others by `*`; one of the others is registered."""
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
+    log = open_log(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    yield ListenerLimits(
+        Settings(),
+        trail,
+        lambda: policy,
+        lambda host: {REGISTERED: QuotaClass.REGISTERED}.get(host, QuotaClass.NAMED),
+    )
+    log.close()
+
+
+def test_hosts_of_a_wildcard_leave_a_named_host_its_slot(everybodys: ListenerLimits) -> None:
+    arriving = everybodys.connection_table.arriving
+    for number in range(200):
+        for _ in range(20):
+            arriving.take(address_of(f"10.9.1.{number}"))
+    assert arriving.total == arriving.bounds.unknown
+    assert arriving.take(address_of("10.9.1.1"))
+    assert not arriving.take(ROBOT)
+    assert not arriving.take(REGISTERED)
+
+
+def test_registered_hosts_of_a_wildcard_leave_the_robot_its_slots(tmp_path: Path) -> None:
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
+    log = open_log(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    limits = ListenerLimits(Settings(), trail, lambda: policy, lambda _host: QuotaClass.REGISTERED)
+    table = limits.connection_table
+    for pool in (table.arriving, table.connected):
+        for number in range(200):
+            while not pool.take(address_of(f"10.9.1.{number}")):
+                pass
+        assert pool.total == pool.bounds.whole - pool.bounds.kept
+        assert [pool.take(ROBOT) for _ in range(pool.bounds.host)] == [""] * pool.bounds.host
+    log.close()
+
+
+class Opened:
+    """A connection in the middle of a request."""
+
+    deadline = 0.0
+    holding = 0
+    cut = False
+
+    def __init__(
+        self, connection_table: ConnectionTable[Address], host: Address, stage: Stage = Stage.UNFINISHED
+    ) -> None:
+        self._visitors = connection_table
+        self.refused = connection_table.enter(self, host)
+        connection_table.file(self, stage)
+
+    def expire(self) -> None:
+        """Do nothing: no connection expires in this test."""
+
+    def abort(self) -> None:
+        self.cut = True
+        self._visitors.leave(self)
+
+
+def test_connections_of_a_wildcard_displace_no_named_host(everybodys: ListenerLimits) -> None:
+    connection_table = everybodys.connection_table
+    robots = [Opened(connection_table, ROBOT, Stage.IDLE) for _ in range(100)]
+    crowd = [
+        Opened(connection_table, address_of(f"10.9.1.{number}")) for number in range(200) for _ in range(20)
+    ]
+    assert sum(not one.refused for one in crowd) == connection_table.connected.bounds.unknown
+    robots += [Opened(connection_table, host) for host in (ROBOT, REGISTERED)]
+    assert not any(one.refused or one.cut for one in robots)
+
+
+ROBOT, REGISTERED = address_of("10.0.0.1"), address_of("10.9.0.7")
+
+
+@pytest.mark.parametrize(
+    ("tell", "told"), [("rule", "10.0.0.1 is blocked by an operator ["), ("id", "denied [")]
+)
+def test_a_blocked_host_is_refused_before_its_request_is_read(tmp_path: Path, tell: str, told: str) -> None:
+    policy = compile_policy(
+        f"[Options]\ntell = {tell}\naudit-only = all\n[Nodes]\ndefault = *\n", file="a.ini"
+    )
+    blocked = dataclasses.replace(policy, blocks={ROBOT: "blocked by ann: odd"})
+    log = open_log(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    limits = ListenerLimits(Settings(), trail, lambda: blocked, lambda _host: QuotaClass.NAMED)
+    refusal = limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.9"))
+    assert refusal is not None
+    assert told in str(refusal(build_call("getPid", ("/node",))))
+    assert limits.refuse(Peer(address_of("10.0.0.2"), "10.0.0.2", "10.0.0.9")) is None
+    assert limits.refuse(Peer(ROBOT, "10.0.0.1", "10.0.0.1")) is None
+    log.close()
+    [record] = [entry.record for entry in export(tmp_path / "audit.db", Filter(decision=("deny",)))]
+    assert (record.reason, record.host, record.resource) == (
+        "10.0.0.1 is blocked by ann: odd",
+        "10.0.0.1",
+        "getPid",
+    )
+
+
+@pytest.mark.parametrize(
+    ("status", "event"),
+    [
+        ("400 Bad Request", "malformed"),
+        ("405 Method Not Allowed", "malformed"),
+        ("415 Unsupported Media Type", "malformed"),
+        ("501 Not Implemented", "malformed"),
+        ("413 Content Too Large", "limit exceeded"),
+        ("431 Request Header Fields Too Large", "limit exceeded"),
+        ("503 Service Unavailable", "limit exceeded"),
+    ],
+)
+def test_a_request_that_is_not_http_exceeds_no_limit(status: str, event: str) -> None:
+    records: list[tuple[str, str]] = []
+    trail = SimpleNamespace(
+        happened=lambda event, reason, **_more: records.append((event, reason)), pause=None, still_owing=None
+    )
+    limits = ListenerLimits(Settings(), cast(Any, trail), cast(Any, None), lambda _host: QuotaClass.NAMED)
+    peer = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
+    report = limits.troubled if exceeds_limit(status.encode()) else limits.malformed
+    report(peer, "10.0.0.9 sent something")
+    assert records == [(event, "10.0.0.9 sent something")]

@@ -1,0 +1,116 @@
+"""Acknowledged and silenced alarms."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.base.clock import using
+from appliance.channel.admin import AlarmAcknowledge, AlarmSilence, AlarmsWanted
+from appliance.channel.alarms import Alarm
+from appliance.channel.answers.status import Status
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
+from appliance.store.state_file import StateStore
+from tests.support.answers import example
+from tests.support.engines import InlineDatabase
+from tests.support.virtual_clock import VirtualClock
+
+GOOD: dict[str, Any] = {"probe": "passed", "relay": "connected", "rosmaster": "reachable"}
+BAD = {**GOOD, "recorder": {"running": False}}
+
+
+class Robot:
+    """The alarms of a robot, whose flight recorder is not running at first; its state survives `restart`."""
+
+    def __init__(self, state: Path) -> None:
+        self.state = state
+        self.fields = BAD
+        self.events: list[str] = []
+        self.restart()
+
+    def restart(self) -> None:
+        """Read the state again, as after a restart or a takeover."""
+        handled = HandledAlarms(StateStore(self.state, failed=pytest.fail, kind=InlineDatabase))
+        self.orders = AlarmOrders(handled, self, lambda: handled.marked(example(Status, **self.fields)))  # type: ignore[arg-type]  # it records
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """Note a record."""
+        self.events.append(f"{event} by {fields['who']}: {reason}")
+        return ""
+
+    def alarm(self) -> Alarm | None:
+        """Return the only alarm."""
+        alarms = asyncio.run(self.orders.listed(AlarmsWanted())).alarms
+        return alarms[0] if alarms else None
+
+    def silence(self, seconds: float | None) -> None:
+        """Silence the alarm, or end that."""
+        asyncio.run(self.orders.silence(AlarmSilence("recorder", seconds), "ann"))
+
+    def acknowledge(self) -> None:
+        """Acknowledge the alarm."""
+        asyncio.run(self.orders.acknowledge(AlarmAcknowledge("recorder", "spare part"), "ann"))
+
+
+@pytest.fixture(name="robot")
+def robot_of(tmp_path: Path) -> Robot:
+    return Robot(tmp_path)
+
+
+def test_an_acknowledged_alarm_stays_one_until_it_is_over(robot: Robot) -> None:
+    """It has the operator's name, also after a restart; the same condition is a new alarm when it comes back."""
+    robot.acknowledge()
+    robot.restart()
+    alarm = robot.alarm()
+    assert alarm is not None
+    assert (alarm.severity, alarm.handled) == ("warning", "acknowledged by ann: spare part")
+    assert alarm.text.endswith("(acknowledged by ann: spare part)")
+    robot.fields = GOOD
+    assert robot.alarm() is None
+    robot.fields = BAD
+    alarm = robot.alarm()
+    assert alarm is not None
+    assert alarm.handled == ""
+    assert robot.events == ["alarm acknowledged by ann: recorder is acknowledged: spare part"]
+
+
+@pytest.mark.parametrize(("passed", "severity"), [(3599, "notice"), (3601, "warning"), (-1, "warning")])
+def test_a_silenced_alarm_is_a_notice_for_its_time(robot: Robot, passed: float, severity: str) -> None:
+    """The silence survives a restart and a flapping condition; a clock that is set back ends it."""
+    clock = VirtualClock()
+    with using(clock):
+        robot.silence(3600)
+        robot.fields = GOOD
+        robot.alarm()
+        robot.fields = BAD
+        clock.set_wall(clock.wall_ns() / 1e9 + passed)
+        robot.restart()
+        alarm = robot.alarm()
+    assert alarm is not None
+    assert alarm.severity == severity
+
+
+def test_a_silence_is_ended_by_an_order(robot: Robot) -> None:
+    """Then it is an alarm at once, and both orders are recorded."""
+    robot.silence(3600)
+    robot.silence(None)
+    alarm = robot.alarm()
+    assert alarm is not None
+    assert alarm.severity == "warning"
+    assert [event.partition(":")[0] for event in robot.events] == [
+        "alarm silenced by ann",
+        "alarm sounds again by ann",
+    ]
+
+
+def test_only_a_present_alarm_is_handled(robot: Robot) -> None:
+    """A typing error is reported; an alarm is not silenced for ever, or in advance."""
+    with pytest.raises(SenselessError):
+        robot.silence(8 * 86_400)
+    with pytest.raises(UnknownThingError, match="neither silenced"):
+        robot.silence(None)
+    robot.fields = GOOD
+    with pytest.raises(UnknownThingError, match="'recorder'; there is none now"):
+        robot.acknowledge()

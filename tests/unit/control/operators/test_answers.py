@@ -1,0 +1,111 @@
+"""Messages between processes are typed, and each request has one method that answers it."""
+
+import inspect
+import typing
+from collections import Counter
+from typing import Any, cast, get_args
+
+from appliance.channel import admin, messages
+from appliance.channel.admin import answer_to
+from appliance.channel.answers.graph_answers import TopicMessage
+from appliance.channel.messages import api
+from appliance.control.assembly.policies import Policies
+from appliance.control.evidence_orders import EvidenceOrders
+from appliance.control.operators.alarm_orders import AlarmOrders
+from appliance.control.operators.block_orders import BlockOrders
+from appliance.control.operators.limit_use import LimitQueries
+from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_methods import request_methods
+from appliance.control.operators.token_orders import TokenOrders
+from appliance.control.recording_orders import RecordingOrders
+from appliance.control.standby_orders import StandbyOrders
+from appliance.hosts.certification import Certification
+from appliance.hosts.checked_ports import PortChecks
+from appliance.hosts.enrolment import HostEnrolment
+from appliance.hosts.self_service import HostSelfService
+from appliance.specifications.specification_manager import SpecificationManager
+
+
+class Hosts(HostEnrolment):
+    """The classes of the parts of host enrolment, in place of the parts."""
+
+    itself = cast(HostSelfService, HostSelfService)
+    ports = cast(PortChecks, PortChecks)
+
+
+CLASSES: dict[str, Any] = {
+    "queries": Queries,
+    "policies": Policies,
+    "monitors": SpecificationManager,
+    "hosts": Hosts,
+    "certification": Certification,
+    "tokens": TokenOrders,
+    "recordings": RecordingOrders,
+    "blocks": BlockOrders,
+    "evidence": EvidenceOrders,
+    "standby": StandbyOrders,
+    "limits": LimitQueries,
+    "alarms": AlarmOrders,
+}
+METHODS = request_methods(**CLASSES)
+REQUESTS: tuple[type[Any], ...] = tuple(
+    dict.fromkeys([*get_args(admin.AnyRequest), *get_args(admin.RestRequest)])
+)
+# Exceptions: a record's fields depend on its event, and a child's readiness on its role.
+OPEN = {
+    (messages.MonitorEvent, "detail"),
+    (messages.Ready, "detail"),
+    (messages.MessageSeen, "fields"),  # a message of any type
+    (TopicMessage, "fields"),
+}
+
+
+def kinds(base: type[Any]) -> set[type[Any]]:
+    below = [kinds(one) for one in base.__subclasses__()]
+    return set().union(*below) if below else {base}
+
+
+def test_every_request_is_in_a_union() -> None:
+    assert kinds(admin.AdminRequest) - set(REQUESTS) == set()
+
+
+def parts(kind: Any, seen: set[Any]) -> typing.Iterator[tuple[Any, str, Any]]:
+    if isinstance(kind, type) and hasattr(kind, "__struct_fields__"):
+        if kind not in seen:
+            seen.add(kind)
+            for name, hint in typing.get_type_hints(kind).items():
+                if name in kind.__struct_fields__:
+                    yield kind, name, hint
+                    yield from parts(hint, seen)
+        return
+    for one in get_args(kind):
+        yield from parts(one, seen)
+
+
+# `RestLink` answers a challenge itself.
+ANSWERED = [one for one in REQUESTS if one is not admin.ChallengeWanted]
+
+
+def test_one_method_answers_each_request() -> None:
+    assert Counter(method.request for method in METHODS) == Counter(ANSWERED)
+    for method in METHODS:
+        hints = typing.get_type_hints(method.answer)
+        del hints["return"]
+        assert list(hints.values()) == [method.request, *([str] if method.who else [])]
+
+
+def test_every_field_between_processes_has_a_type() -> None:
+    kinds = [
+        *(one for file in (messages, api) for _name, one in inspect.getmembers(file, inspect.isclass)),
+        *REQUESTS,
+        *map(answer_to, REQUESTS),
+    ]
+    seen: set[Any] = set()
+    found = [
+        (kind, name)
+        for one in kinds
+        for kind, name, hint in parts(one, seen)
+        if hint in (Any, object) or {Any, object} & {*get_args(hint)}
+    ]
+    assert len(seen) > 100, "the walk goes through all of them"
+    assert set(found) == OPEN

@@ -1,0 +1,397 @@
+"""Blocked hosts: the decision, what ends and returns, the end of a block, restarts, and what cannot be blocked."""
+
+import asyncio
+import contextlib
+import ipaddress
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from appliance.base.clock import using
+from appliance.base.withdrawal import WithdrawnError, awaited
+from appliance.channel.admin import HostBlock, HostBlocks, HostUnblock, PolicyReload
+from appliance.channel.answers.host_answers import BlockEnded, HostBlocked
+from appliance.control.assembly import host_blocks
+from appliance.control.assembly.policies import Policies
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.operators import block_orders
+from appliance.control.operators.block_orders import BlockOrders
+from appliance.hosts.host_table import HostRefusedError
+from appliance.master.graph.registry import Kind
+from appliance.master.graph.revocation import revoked
+from appliance.policy.model import Category, Request, address_of
+from appliance.policy.policy import Policy
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from tests.support.control_parts import OPEN, ControlParts
+from tests.support.engines import InlineDatabase
+from tests.support.virtual_clock import VirtualClock
+
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+NODE, ROBOT, OTHER = "10.0.0.5", "10.0.0.1", "10.0.0.7"
+SECOND = 1_000_000_000
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(10):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+async def at_once() -> None:
+    """Return as if the relays had applied the change."""
+
+
+class Clock:
+    """An age clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.now = 1_700_000_000 * SECOND
+        self.reads = 0
+
+    def __call__(self) -> int:
+        self.reads += 1
+        return self.now
+
+    def read_again(self) -> Callable[[], bool]:
+        """Return the condition that the timer has read the clock twice more, so it has acted on one of the answers."""
+        reads = self.reads
+        return lambda: self.reads >= reads + 2
+
+    def advance(self, seconds: float) -> None:
+        self.now += int(seconds * SECOND)
+
+
+class Control(ControlParts):
+    """Control with a store, a policy file and the orders about blocks; a test may start it again on the same state."""
+
+    def __init__(self, state: Path, clock: Clock, connected: list[set[str]], text: str = OPEN) -> None:
+        super().__init__()
+        state.mkdir(exist_ok=True)
+        (state / "policy.ini").write_text(text)
+        self.state = StateStore(state, failed=print, kind=InlineDatabase)
+        self.blocks = host_blocks.BlockTable(self.state, clock)
+        self.remotes: dict[str, str] = {}
+        self.policies = Policies(
+            state / "policy.ini", self.state, cast(Any, self.records), robot=[ipaddress.ip_network(ROBOT)],
+            hosts=dict, blocks=lambda: self.blocks.reasons, live=list, changed=self.changed, carried_out=at_once,
+            site_keys=(),
+        )  # fmt: skip
+        self.policies.start(restarted=False)
+        self.current = self.policies.current
+        self.orders = BlockOrders(
+            self.blocks, self.policies, self.state, cast(Any, self.records), live=self.revocation.live,
+            connected=lambda: connected, enrolled=self.enrolled, remotes=lambda: self.remotes, carried_out=at_once,
+        )  # fmt: skip
+
+    def keep(self, task: asyncio.Task[None]) -> None:
+        self._not_ours.add(task)
+
+    def enrolled(self) -> Mapping[str, str]:
+        return {"ocu-1": "10.99.0.2"}
+
+    def changed(self, before: Policy, policy: Policy) -> int:
+        self.current = policy
+        effects = self.revocation.policy_changed(before, policy)
+        self.enactor.carry_out(effects)
+        return revoked(effects)
+
+    async def block(self, address: str, seconds: float | None = None, **more: Any) -> HostBlocked:
+        return await self.orders.block(HostBlock(address, seconds, **more), "ann")
+
+    async def unblock(self, address: str) -> int:
+        """Lift a block; return how many registrations returned."""
+        return (await self.orders.unblock(HostUnblock(address), "ann")).restored
+
+    async def blocked(self) -> list[str]:
+        return [row.address for row in (await self.orders.listed(HostBlocks())).blocks]
+
+    def denial(self, host: str, text: str = "") -> str | None:
+        """Return the reason why a host may not publish, by the policy in force; None if it may."""
+        decision = self.current.decide(Request(address_of(host), "/node", Category.PUBLISH, "/scan"))
+        return None if decision.allowed else decision.reason
+
+
+@contextlib.asynccontextmanager
+async def control(
+    tmp_path: Path, clock: Clock, connected: list[set[str]] | None = None, text: str = OPEN
+) -> AsyncIterator[Control]:
+    made = Control(tmp_path / "state", clock, connected or [], text)
+    timer = asyncio.create_task(made.orders.watch())
+    made.keep(timer)
+    await made.round()
+    try:
+        yield made
+    finally:
+        timer.cancel()
+        await asyncio.gather(timer, return_exceptions=True)
+        await made.settle()
+        made.state.close()
+
+
+async def test_a_block_ends_everything_and_what_is_lifted_returns(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock(), [{NODE, ROBOT}, {ROBOT, OTHER}]) as made:
+        node = made.node("/talker")
+        await made.register(node, Kind.PUBLICATION, "/scan")
+        await made.register(node, Kind.PUBLICATION, "/odom")
+        await made.register(node, Kind.SERVICE, "/reset")
+        answer = await made.block(NODE, note="strange traffic")
+        assert answer.ended == BlockEnded(2, 0, 1, 0, 1)
+        assert (answer.until, answer.replaced, answer.who) == (None, None, "ann")
+        await made.settle()
+        assert not made.hidden.has(Kind.PUBLICATION, "/scan")
+        assert made.denial(OTHER) is None
+        assert await made.unblock(NODE) == 3
+        await made.settle()
+        assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
+        assert made.denial(NODE) is None
+        events = [event for event, _resource in made.records.events]
+        assert events.count("revoked") == 3
+        assert [event for event in events if event.startswith("host")] == ["host blocked", "host unblocked"]
+
+
+async def test_the_reason_names_who_until_note_and_remedy(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        await made.block(NODE, 3600, note="strange traffic")
+        reason = made.denial(NODE)
+        assert reason is not None
+        assert reason.startswith(f"{NODE} is blocked by ann until 20")
+        assert reason.endswith(f"Z: strange traffic; lift it with `rosrv host unblock {NODE}`")
+        await made.orders.block(HostBlock("fd00:1111:2222:3333:4444:5555:6666:7777", 9, "n" * 200), "w" * 63)
+        reason = made.denial("fd00:1111:2222:3333:4444:5555:6666:7777")
+        assert reason is not None
+        assert len(reason) < 300
+
+
+async def test_audit_only_sections_deny_a_blocked_host(tmp_path: Path) -> None:
+    text = "[Options]\naudit-only=all\n" + OPEN.replace("default=*", "default=10.0.0.9")
+    async with control(tmp_path, Clock(), text=text) as made:
+        assert made.denial(NODE) is None
+        await made.block(NODE)
+        assert made.denial(NODE) is not None
+
+
+async def test_a_registration_that_is_under_way_during_the_block_ends(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        made.fill_queue()
+        call = asyncio.create_task(
+            made.ask("registerPublisher", "/talker", "/scan", "t/T", f"http://{NODE}:4001/")
+        )
+        await until(lambda: ("allow", "/scan") in made.records.events)
+        assert (await made.block(NODE)).ended.publications == 0
+        await made.round()
+        await call
+        await made.settle()
+        assert ("registered", "/scan") in made.records.events
+        assert not [one for one in made.revocation.live() if str(one.host) == NODE]
+
+
+async def test_an_order_whose_client_gave_up_changes_nothing(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        await made.block(OTHER)
+        with awaited(lambda: True):
+            with pytest.raises(WithdrawnError):
+                await made.block(NODE)
+            with pytest.raises(WithdrawnError):
+                await made.unblock(OTHER)
+        assert await made.blocked() == [OTHER]
+
+
+async def test_a_block_ends_by_the_age_clock_and_not_by_the_system_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(block_orders, "_LOOK_SECONDS", 0.01)
+    clock, machine = Clock(), VirtualClock()
+    with using(machine):
+        async with control(tmp_path, clock) as made:
+            node = made.node("/talker")
+            await made.register(node, Kind.PUBLICATION, "/scan")
+            await made.block(NODE, 3600)
+            await made.block(OTHER)
+            machine.set_wall(4e9)
+            clock.advance(3599.9)
+            await until(clock.read_again())
+            assert await made.blocked() == [NODE, OTHER]
+            clock.advance(0.1)
+            await until(lambda: made.denial(NODE) is None)
+            await made.settle()
+            assert made.hidden.has(Kind.PUBLICATION, "/scan") == ["/talker"]
+            assert await made.blocked() == [OTHER]
+            assert ("host block ended", None) in made.records.events
+
+
+async def test_blocks_survive_restarts_and_end_while_the_machine_is_off(tmp_path: Path) -> None:
+    clock = Clock()
+    async with control(tmp_path, clock) as made:
+        await made.block(NODE, 3600, note="a")
+        await made.block(OTHER, 60)
+    clock.advance(61)
+    async with control(tmp_path, clock) as made:
+        await until(lambda: made.denial(OTHER) is None)
+        assert (made.denial(NODE) or "").startswith(f"{NODE} is blocked by ann until")
+        [row] = (await made.orders.listed(HostBlocks())).blocks
+        assert (row.address, row.note) == (NODE, "a")
+        assert row.until is not None
+        assert abs(row.until - (time.time() + 3539)) < 30
+    async with control(tmp_path, clock) as made:
+        assert await made.blocked() == [NODE]
+
+
+async def test_a_second_block_replaces_the_first(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        await made.block(NODE, 60, note="first")
+        answer = await made.block(f"::ffff:{NODE}", note="second")
+        assert answer.replaced is not None
+        assert (answer.address, answer.replaced.note, answer.until) == (NODE, "first", None)
+        assert await made.blocked() == [NODE]
+        assert "second" in (made.denial(NODE) or "")
+
+
+async def test_spellings_and_names_of_a_host_are_one_block(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        for text in (f"::ffff:{NODE}", "::FFFF:a00:5", "fd00::0:1", "fe80::1%eth0", "ocu-1", "host:ocu-1"):
+            await made.block(text)
+        assert await made.blocked() == [NODE, "fd00::1", "fe80::1", "10.99.0.2"]
+        assert (made.denial("10.99.0.2") or "").startswith("10.99.0.2 is blocked")
+        assert (made.denial(f"::ffff:{NODE}") or "").startswith(f"{NODE} is blocked")
+        assert (await made.orders.listed(HostBlocks())).blocks[-1].name == "ocu-1"
+        await made.unblock("ocu-1")
+        await made.unblock("fd00:0::1")
+        assert await made.blocked() == [NODE, "fe80::1"]
+
+
+async def test_the_answer_names_other_addresses_of_the_machine(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        made.remotes = {"ocu-1": "192.0.2.20"}
+        assert (await made.block("192.0.2.20")).other_addresses == ["10.99.0.2"]
+        assert (await made.block("ocu-1")).other_addresses == []
+        await made.unblock("192.0.2.20")
+        assert (await made.block("ocu-1")).other_addresses == ["192.0.2.20"]
+
+
+@pytest.mark.parametrize(
+    "text", ["10.0.0.300", "10.0.0.0/24", "", "ocu-2", "10.0.0.5%eth0", "010.0.0.5", "x" * 500, "10.0.0.5\n"]
+)
+async def test_a_malformed_address_is_rejected(tmp_path: Path, text: str) -> None:
+    async with control(tmp_path, Clock()) as made:
+        with pytest.raises(SenselessError, match=r"is not (an address|one host)"):
+            await made.block(text)
+        assert await made.blocked() == []
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("127.0.0.1", "own address"), ("127.1.2.3", "own address"), ("::1", "own address"),
+        ("::ffff:127.0.0.1", "own address"), ("0.0.0.0", "cannot be"), ("::", "cannot be"),
+        ("255.255.255.255", "cannot be"), ("224.0.0.1", "cannot be"), ("ff02::1", "cannot be"),
+    ],
+)  # fmt: skip
+async def test_addresses_of_no_other_host_are_refused(tmp_path: Path, text: str, reason: str) -> None:
+    async with control(tmp_path, Clock()) as made:
+        with pytest.raises(HostRefusedError, match=reason):
+            await made.block(text, force=True)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, 0.5, 365 * 86_400 + 1, float("nan"), float("inf")])
+async def test_a_duration_out_of_bounds_is_rejected(tmp_path: Path, seconds: float) -> None:
+    async with control(tmp_path, Clock()) as made:
+        with pytest.raises(SenselessError, match="1 second to 365 days"):
+            await made.block(NODE, seconds)
+
+
+@pytest.mark.parametrize("note", ["n" * 201, "a\nb", "\x1b[31m"])
+async def test_a_note_is_short_and_printable(tmp_path: Path, note: str) -> None:
+    async with control(tmp_path, Clock()) as made:
+        with pytest.raises(SenselessError, match="at most 200 characters"):
+            await made.block(NODE, note=note)
+
+
+async def test_the_robot_is_blocked_only_by_force(tmp_path: Path) -> None:
+    """The refusal has the numbers of what would end."""
+    async with control(tmp_path, Clock(), [{ROBOT, OTHER}, {OTHER}]) as made:
+        with pytest.raises(HostRefusedError, match=r"robot's own host: .* 0 registrations and 1 connections"):
+            await made.block(ROBOT)
+        assert made.denial(ROBOT) is None
+        assert (await made.block(ROBOT, force=True)).ended.connections == 1
+        assert made.denial(ROBOT) is not None
+
+
+async def test_a_host_with_most_registrations_is_blocked_only_by_force(tmp_path: Path) -> None:
+    """One wrong digit must not stop the robot, whose nodes may be on any host."""
+    async with control(tmp_path, Clock()) as made:
+        for host, name in ((NODE, "/driver"), (OTHER, "/console")):
+            node = made.node(name, host=address_of(host))
+            for number in range(11):
+                await made.register(node, Kind.PUBLICATION, f"{name}/{number}")
+            with pytest.raises(HostRefusedError, match=r"has 11 of 11 registrations, .* would end 11 regis"):
+                await made.block(host)
+            assert made.denial(host) is None
+            if host == NODE:
+                assert (await made.block(host, force=True)).ended.publications == 11
+        await made.unblock(NODE)
+        assert (await made.block(OTHER)).ended.publications == 11
+
+
+async def test_the_number_of_blocks_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(block_orders, "MOST", 2)
+    async with control(tmp_path, Clock()) as made:
+        await made.block(NODE)
+        await made.block(OTHER)
+        with pytest.raises(HostRefusedError, match="2 hosts are blocked, the limit"):
+            await made.block("10.0.0.8")
+        await made.block(NODE, 60)
+        await made.unblock(OTHER)
+        await made.block("10.0.0.8")
+
+
+async def test_only_a_blocked_host_can_be_unblocked(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        with pytest.raises(UnknownThingError, match=f"{NODE} is not blocked: `rosrv host blocks`"):
+            await made.unblock(NODE)
+
+
+async def test_an_order_at_the_moment_of_the_end_finds_one_state(tmp_path: Path) -> None:
+    clock = Clock()
+    async with control(tmp_path, clock) as made:
+        await made.block(NODE, 60)
+        clock.advance(60)
+        outcomes = await asyncio.gather(
+            made.unblock(NODE), made.unblock(NODE), made.block(OTHER), return_exceptions=True
+        )
+        await until(lambda: made.denial(NODE) is None)
+        ends = [event for event, _ in made.records.events if event in {"host unblocked", "host block ended"}]
+        assert len(ends) == 1
+        assert sum(isinstance(outcome, UnknownThingError) for outcome in outcomes) == 2 - ends.count(
+            "host unblocked"
+        )
+
+
+async def test_a_block_that_is_not_stored_is_in_force_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk must not keep an attacker in."""
+
+    async def full() -> None:
+        raise StoreError("state.db: no space left")
+
+    async with control(tmp_path, Clock()) as made:
+        monkeypatch.setattr(made.state, "settled", full)
+        with pytest.raises(StoreError, match="is blocked now, but a stop of the appliance ends it"):
+            await made.block(NODE)
+        assert made.denial(NODE) is not None
+
+
+async def test_a_policy_that_is_loaded_keeps_the_blocks(tmp_path: Path) -> None:
+    async with control(tmp_path, Clock()) as made:
+        await made.block(NODE)
+        made.policies.file.write_text(OPEN + "# changed\n")
+        await made.policies.reload(PolicyReload(), "operator")
+        assert made.current.text.endswith("# changed\n")
+        assert made.denial(NODE) is not None
+        made.policies.hosts_changed()
+        assert made.denial(NODE) is not None
+        assert made.policies.known.blocks.keys() == {address_of(NODE)}

@@ -1,0 +1,77 @@
+"""Tests of control's records about the machine's clock: one for each event, without blocking."""
+
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from appliance.base import shipped
+from appliance.base.clock import using
+from appliance.channel.answers.status import ClockState
+from appliance.cli.status_verb import doubted_clock
+from appliance.control.operators.clock_check import ClockCheck
+from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.virtual_clock import VirtualClock
+
+
+class Trail:
+    """Collects records."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def happened(self, event: str, _text: str, **_more: Any) -> None:
+        self.events.append(event)
+
+
+@pytest.fixture
+def trail() -> Trail:
+    return Trail()
+
+
+def test_an_unsynchronised_clock_is_recorded_once(trail: Trail) -> None:
+    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+    for synchronised in (None, False, False, True, True, None, False):
+        clock.synchronisation_reported(synchronised)
+        assert clock.state() == ClockState(synchronised, 0.0)
+    assert trail.events == ["clock not synchronised", "clock synchronised", "clock not synchronised"]
+
+
+def test_a_right_clock_is_not_recorded(trail: Trail) -> None:
+    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+    clock.synchronisation_reported(True)
+    clock.look()
+    assert trail.events == []
+
+
+def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
+    behind = [1.5]
+    clock = ClockCheck(cast(AuditTrail, trail), lambda: behind[0])
+    clock.look()
+    assert (trail.events, clock.state().behind_seconds) == ([], 0.0)
+    for behind[0] in (3600.0, 3590.0, 0.5, 90.0):
+        clock.look()
+    assert trail.events == ["clock set back"] * 2
+    assert clock.state().behind_seconds == 90.0
+
+
+def test_each_step_forward_is_recorded(trail: Trail) -> None:
+    """The record says that less time passed than the timestamps suggest; a step of one second is ignored."""
+    started = [1000.0]
+    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0, lambda: started[0])
+    for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):
+        clock.look()
+    assert trail.events == ["clock set forward"] * 2
+
+
+@pytest.mark.parametrize(
+    ("days", "said"), [(0.5, None), (2000.0, "wrong: 2000 days before this program was built")]
+)
+def test_a_clock_before_the_build_date_is_reported(trail: Trail, days: float, said: str | None) -> None:
+    made = Path(shipped.__file__).stat().st_mtime
+    clock = ClockCheck(cast(AuditTrail, trail), lambda: 0.0)
+    clock.synchronisation_reported(True)
+    with using(VirtualClock(wall=made - days * 86_400)):
+        told = doubted_clock(clock.state())
+    assert (told or "").startswith(said or "")
+    assert (told is None) is (said is None)

@@ -1,0 +1,61 @@
+"""The use of finite resources, as `rosrv limits` shows it."""
+
+import asyncio
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from appliance.channel.admin import LimitsWanted
+from appliance.channel.answers.limit_answers import LimitUse
+from appliance.channel.answers.status import RecorderState
+from appliance.configuration.config_sources import read
+from appliance.control.operators.limit_use import LimitQueries
+from appliance.quotas.pool import Bounds, Pool, QuotaClass
+
+
+def used(state: Path, memory: dict[int, dict[str, int]]) -> dict[str, LimitUse]:
+    """Return the rows of a robot with three nodes of two hosts, and relays with this memory."""
+    pool: Pool[str] = Pool("ports", Bounds(100, 75, 10, 0), lambda _host: QuotaClass.REGISTERED)
+    pool.charge("10.0.0.9/32", 40)
+    pool.charge("10.0.0.8/32", 2)
+    nodes = [
+        SimpleNamespace(host=host, own=host == "here")
+        for host in ("10.0.0.9", "10.0.0.9", "10.0.0.8", "here")
+    ]
+    registry = SimpleNamespace(all=lambda: nodes, registrations_by_host={"10.0.0.9": 7}.items)
+    core: Any = SimpleNamespace(
+        registry=registry,
+        carried=SimpleNamespace(connections={}, memory=memory),
+        parameters=SimpleNamespace(charges=SimpleNamespace(pool=pool)),
+    )
+    parts: Any = SimpleNamespace(core=core, endpoints=SimpleNamespace(places=SimpleNamespace(taken=pool)))
+    listeners: Any = SimpleNamespace(connection_table=SimpleNamespace(connected=pool))
+    settings = read({"state": str(state), "audit": {"retention_bytes": 4 << 20}, "relays": 2})
+    queries = LimitQueries(parts, settings, listeners, lambda: RecorderState(True, 1, 12))
+    return {row.resource: row for row in asyncio.run(queries.use(LimitsWanted())).limits}
+
+
+def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> None:
+    """A row counts all hosts, and names the host that is nearest to its own quota."""
+    (tmp_path / "control").mkdir()
+    (tmp_path / "control" / "audit.db").write_bytes(bytes(1000))
+    (tmp_path / "control" / "audit.db-wal").write_bytes(bytes(24))
+    rows = used(tmp_path, {0: {"frames": 5}, 1: {"frames": 9, "queues": 1}})
+    assert rows["nodes"] == LimitUse("nodes", 3, None, "limits.nodes_per_host", "10.0.0.9", 2, 500)
+    assert rows["ports of nodes"] == LimitUse(
+        "ports of nodes", 42, 100, "[Ports] range", "10.0.0.9/32", 40, 75
+    )
+    assert (rows["registrations"].used, rows["registrations"].host_used) == (7, 7)
+    assert rows["connections to the relays"].allowed == 2 * 16_384
+    fullest = rows["bytes of unfinished messages, one relay"]
+    assert (fullest.used, fullest.allowed) == (9, 512 << 20)
+    records = rows["bytes of audit records"]
+    assert (records.used, records.allowed) == (1024, 4 << 20)
+    assert (rows["bytes of recordings"].used, rows["bytes of recordings"].allowed) == (12, 2 << 30)
+
+
+def test_without_retention_the_disk_is_the_limit(tmp_path: Path) -> None:
+    """The log may grow until the disk is full; a robot without relays and recordings uses nothing."""
+    (tmp_path / "control").mkdir()
+    queries = used(tmp_path, {})
+    assert queries["bytes of latched messages, one relay"].used == 0

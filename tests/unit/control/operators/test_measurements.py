@@ -1,0 +1,92 @@
+"""Tests of control's measurements: bounded, whatever names clients choose."""
+
+import ipaddress
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel.messages import TopicTraffic
+from appliance.control.assembly.monitor_states import published_now
+from appliance.control.operators.measurements import by_resource, carried_of, from_zero
+from appliance.master.endpoints import traffic
+from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, RelayTraffic
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.specifications.live_topics import LiveType
+from roswire.uris import parse_node_uri
+from tests.support.virtual_clock import let_time_pass
+
+API = parse_node_uri("http://10.0.0.5:4000/")
+
+
+def test_sums_by_name() -> None:
+    """Several incarnations of one topic are summed."""
+    rows = [("/a", (1, 10)), ("/b", (2, 20)), ("/a", (3, 30))]
+    assert by_resource(rows) == {"/a": [4, 40], "/b": [2, 20]}
+
+
+def test_counters_begin_at_zero() -> None:
+    """A counter exists with value 0 before its first event, so that Prometheus sees the first event as an increase."""
+    counts = from_zero({("fault", "safe"): 2}, [("fault", "safe"), ("drop", "safe")])
+    assert counts == {("fault", "safe"): 2, ("drop", "safe"): 0}
+
+
+def test_names_are_bounded() -> None:
+    sums = by_resource((f"/topic{number}", (1,)) for number in range(MOST_RESOURCES + 500))
+    assert len(sums) == MOST_RESOURCES + 1
+    assert sums[OTHERS] == [500]
+    assert sum(row[0] for row in sums.values()) == MOST_RESOURCES + 500
+
+
+def test_few_topics_have_their_own_histogram() -> None:
+    sums = by_resource(((f"/topic{number}", (1, 0.5)) for number in range(5)), 3)
+    assert sums == {"/topic0": [1, 0.5], "/topic1": [1, 0.5], "/topic2": [1, 0.5], OTHERS: [2, 1.0]}
+
+
+def test_counters_of_a_topic_survive_its_publishers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
+    registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
+    for number in range(4):
+        uri = f"http://10.0.0.5:400{number}/"
+        registry.add(Incarnation(f"k{number}", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2))
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    for number in range(4):
+        rows = [
+            TopicTraffic(f"k{number}", "/a", 10, 100, 1, 1, [1, 2], 0.5),
+            TopicTraffic(f"k{number}", f"/own{number}", 1, 1, 0, 1),
+        ]
+        counted.reported(rows)
+        before = carried_of(counted)
+        counted.forgotten(f"k{number}")
+        after = carried_of(counted)
+        assert (after[0]["/a"], after[1]) == (before[0]["/a"], before[1])
+    assert (counted.total.messages, counted.total.dropped) == (44, 4)
+    assert carried_of(counted) == (
+        {"/a": [40, 400, 4], "/own0": [1, 1, 0], OTHERS: [3, 3, 0]},
+        {"/a": [4, 8, 2.0]},
+    )
+
+
+def test_a_publishers_md5sum_is_known_once_a_relay_has_seen_its_header() -> None:
+    registry = Registry()
+    node = Incarnation("k", "/node", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2)
+    registry.add(node)
+    registry.register(node, Kind.PUBLICATION, "/a", "std_msgs/String")
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    assert published_now(registry, counted) == {"/a": {"/node": LiveType("std_msgs/String")}}
+    for md5sum in ("992c", ""):
+        counted.reported([TopicTraffic("k", "/a", 1, 1, 0, 1, md5sum=md5sum)])
+        assert published_now(registry, counted) == {"/a": {"/node": LiveType("std_msgs/String", "992c")}}
+
+
+def test_a_topic_moves_for_a_minute_after_its_last_message() -> None:
+    """For the first minute of control it counts as moving, because an earlier control may have seen messages."""
+    registry = Registry()
+    registry.add(Incarnation("k", "/n", ipaddress.ip_address("10.0.0.5"), API, str(API), "10.0.0.1", 1, 2))
+    counted = RelayTraffic(cast(Any, None), registry, 1, lambda _node, _topic: None)
+    seen = []
+    for messages in (None, None, 1, 0, None):
+        if messages is not None:
+            counted.reported([TopicTraffic("k", "/a", messages, 1, 0, 1)])
+        seen.append(counted.moving("k", "/a"))
+        let_time_pass(61.0 if messages is None else 30.0)
+    assert seen == [True, False, True, True, False]
