@@ -1,6 +1,7 @@
 """Control's end of the link to the lease, on one of two appliances."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -70,6 +71,17 @@ class LeaseClient:
         """Whether the witness on the robot has just answered this appliance."""
         answered = None if self.state is None else self.state.answered
         return answered is not None and clock.since_boot() - answered <= EXPIRY
+
+    async def standby_hears_witness(self) -> bool:
+        """Whether the witness answers a request that the standby sends after this call; wait an expiry at most."""
+        asked = clock.since_boot()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(EXPIRY):
+                while self.state is None or (self.state.other_witnessed or 0.0) < asked:
+                    self._news.clear()
+                    await self._news.wait()
+                return True
+        return False
 
     async def until_active(self) -> None:
         """Wait until this appliance may answer. If the lease has ended, the supervisor ends this process."""

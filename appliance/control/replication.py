@@ -279,8 +279,11 @@ class Replication:
             self.sender.lag().connected and heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
         )
 
-    def require_ready(self) -> None:
-        """Raise `HandOverError`, with the reason, unless the standby could take over now."""
+    async def require_ready(self) -> None:
+        """Raise `HandOverError`, with the reason, unless the standby could take over now.
+
+        An answer of the witness from before the order proves nothing: the standby's cable may just have been unplugged.
+        """
         if not self._in_sync() or not self._connected():
             raise HandOverError(
                 f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
@@ -292,6 +295,11 @@ class Replication:
         lease = self._lease.state
         if lease is not None and lease.handover_obstacle:
             raise HandOverError(lease.handover_obstacle)
+        if not await self._lease.standby_hears_witness():
+            other = self._membership.other
+            raise HandOverError(
+                f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
+            )
 
     async def hand_over(self) -> None:
         """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""

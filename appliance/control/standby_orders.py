@@ -73,7 +73,7 @@ class ActiveAppliance:
 
     async def hand_over(self) -> None:
         """Make the standby the active appliance. Raises `HandOverError`."""
-        self._replication.require_ready()
+        await self._replication.require_ready()
         try:
             await self._leaving()
             await self._replication.hand_over()

@@ -25,7 +25,9 @@ from appliance.store.writer_thread import StoreError
 _INTRODUCED_SECONDS = 3600.0
 _FEW = 16  # changes
 _SMALL = 16 << 10  # bytes of one value
-_REFUSAL_SECONDS = 3.0  # the active appliance waits for 2 s at most until its changes are stored here
+_REFUSAL_SECONDS = (
+    4.0  # the active appliance waits 1.2 s for the witness, and 2 s until its changes are stored here
+)
 _SILENCE_SECONDS = 10.0  # the active appliance sends something every second
 
 
@@ -56,21 +58,24 @@ class ReplicationReceiver:
         self._reported = ""  # the obstacle that the active appliance knows
         self._revised = revised
         self._refusal: asyncio.Future[str] | None = None
+        self._messages = 0
 
     async def want_switchover(self) -> str:
         """Ask the active appliance to hand over; return why it refuses, or an empty text.
 
-        Raises `ReplicationError` if it is not connected.
+        Raises `ReplicationError` if it is not connected, or does not answer.
         """
         if self._link is None:
             raise ReplicationError("the active appliance is not connected")
         refusal: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._refusal = refusal
+        self._refusal, before = refusal, self._messages
         await self._link.send(SwitchoverWanted())
         try:
             async with asyncio.timeout(_REFUSAL_SECONDS):
                 return await refusal
         except TimeoutError:
+            if self._messages == before:  # it sends something every second
+                raise ReplicationError("the active appliance does not answer") from None
             return ""
 
     def _refused(self, reason: str) -> None:
@@ -88,6 +93,7 @@ class ReplicationReceiver:
                 await self._introduce(link)
                 await self._report_obstacle(link)
                 message = await link.receive(_SILENCE_SECONDS)
+                self._messages += 1
                 if isinstance(message, Refused):
                     raise ReplicationError(f"the active appliance refuses: {message.reason}")
                 if isinstance(message, SwitchoverRefused):

@@ -722,7 +722,7 @@ async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str 
 
 
 async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link(tmp_path: Path) -> None:
-    """The operator of the standby need not wait for a takeover that does not come."""
+    """The operator of the standby need not wait for a takeover that does not come, also if the link has just been cut."""
     (tmp_path / "active").mkdir()
     (tmp_path / "standby").mkdir()
     store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
@@ -745,6 +745,12 @@ async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link
             else:
                 sender.close()
             assert await order == reason
+        ends, others = await pair_of_streams()
+        tasks.append(asyncio.create_task(receiver.follow(*others)))
+        await ends[0].read(1)  # it follows now
+        with pytest.raises(ReplicationError, match="does not answer"):
+            await receiver.want_switchover()
+        ends[1].close()
     await asyncio.gather(*tasks, return_exceptions=True)
     replica.close()
     store.close()
