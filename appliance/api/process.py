@@ -190,6 +190,8 @@ class _Api:
                 self._report(messages.Pong(number))
             case messages.Stop():
                 self._end()
+            case messages.ServicePaused(reason):
+                self._control.paused = reason
             case messages.SocketRestored(name) if name == "api":
                 self._socket = socket.socket(fileno=descriptors[0])
                 self._given.set()

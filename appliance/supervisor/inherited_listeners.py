@@ -49,6 +49,10 @@ class InheritedListeners:
         if descriptor is not None:
             os.close(descriptor)
 
+    def copy_of(self, name: str) -> socket.socket:
+        """Return a copy of a kept socket, which the caller closes."""
+        return socket.socket(fileno=os.dup(self._sockets[name]))
+
     def close(self) -> None:
         """Close all sockets."""
         for name in list(self._sockets):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from appliance.base import clock
 
-_LONGEST_LAPSE = 10.0  # seconds; then the appliance stands by, and answers its operators again
+LONGEST_LAPSE = 10.0  # seconds; then the appliance stands by, and answers its operators again
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class LeaseWatch:
             self.ended()
             return
         self.suspended = True
-        self._timer = asyncio.get_running_loop().call_later(_LONGEST_LAPSE, self.ended)
+        self._timer = asyncio.get_running_loop().call_later(LONGEST_LAPSE, self.ended)
 
     def ended(self) -> None:
         """Take a report: the lease is not valid any more, and is not renewed."""

@@ -113,6 +113,11 @@ class Role:
     nice: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
 
+    @property
+    def serves_robot(self) -> bool:
+        """Whether the role may run only while this appliance is active; a lapse of the lease stops it."""
+        return not (self.outlives_takeover or self.stands_by)
+
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
     """Return the environment of a ROS program; its ROS_IP makes rosmaster listen on loopback only."""

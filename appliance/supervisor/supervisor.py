@@ -9,8 +9,9 @@
 4. If one end of a link is new, both ends get a new link. A new control first gets every kept socket, then its links,
    then the list of processes.
 5. One of two appliances (docs/standby.md) is passive until the lease is held. When the lease lapses, all processes that
-   serve the robot are stopped (SIGSTOP). They go on if the lease is renewed in the same epoch. Otherwise they are
-   killed and start again, passive: no state in memory is older than the next takeover.
+   serve the robot are stopped (SIGSTOP), and operators learn that the appliance is paused. They go on if the lease is
+   renewed in the same epoch. Otherwise they are killed and start again, passive: no state in memory is older than the
+   next takeover.
 6. Stopping the appliance takes less than five seconds, even if children hang, and leaves no process behind.
 """
 
@@ -21,6 +22,7 @@ import socket
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -36,6 +38,7 @@ from appliance.supervisor.inherited_listeners import InheritedListeners, Listene
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
+from appliance.supervisor.lapse_answers import PAUSED, answer_paused
 from appliance.supervisor.lease_watch import LeaseWatch, RoleChanges
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
@@ -137,6 +140,7 @@ class Supervisor:
             member=stands_by is not None,
         )
         self._suspended_at = 0.0
+        self._pause: asyncio.Task[None] | None = None  # answers operators during a lapse
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self.reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
@@ -240,7 +244,7 @@ class Supervisor:
     def start(self, slot: ProcessSlot) -> None:
         """Start the process of a slot; after a failure try again with growing delays."""
         slot.due = None
-        if self._lease.suspended and not slot.role.outlives_takeover:
+        if self._lease.suspended and slot.role.serves_robot:
             slot.due = asyncio.get_running_loop().call_later(_SUSPENDED_SECONDS, self.start, slot)
             return
         slot.wanted = False
@@ -433,6 +437,7 @@ class Supervisor:
     def _passivate(self) -> None:
         """End everything that serves the robot; each process starts again, passive."""
         log.warning("this appliance is not active any more; its processes start again as a standby")
+        self._end_pause()
         for name, _descriptor in self.kept:
             if name != ADMIN:
                 self.kept.drop(name)
@@ -446,24 +451,34 @@ class Supervisor:
 
     def _suspend(self) -> bool:
         """Stop everything that serves the robot; return False if something is only starting."""
-        serving = [slot for slot in self.slots if not slot.role.outlives_takeover]
+        serving = [slot for slot in self.slots if slot.role.serves_robot]
         if any(slot.is_starting for slot in serving):
             return False
         for slot in serving:
             if slot.process is not None:
                 slot.process.kill(signal.SIGSTOP)
         self._suspended_at = clock.now()
+        self._pause = self._spawn(answer_paused(partial(self.kept.copy_of, ADMIN)))
+        self._tell("api", messages.ServicePaused(PAUSED))
         log.warning("the lease has lapsed; nothing is answered or relayed until it is renewed")
         return True
 
     def _resume(self) -> None:
         """Let everything go on that `_suspend` stopped."""
         seconds = clock.now() - self._suspended_at
+        self._end_pause()
         for slot in self.slots:
-            if slot.process is not None and not slot.role.outlives_takeover:
+            if slot.process is not None and slot.role.serves_robot:
                 slot.process.kill(signal.SIGCONT)
                 slot.process.discount_pause(seconds)
         log.warning("the lease is renewed in the same epoch; the service goes on", seconds=round(seconds, 3))
+
+    def _end_pause(self) -> None:
+        """Leave the answers to control again."""
+        if self._pause is not None:
+            self._pause.cancel()
+            self._pause = None
+            self._tell("api", messages.ServicePaused(""))
 
     # --- readiness ----------------------------------------------------------------------------------------
 
@@ -547,7 +562,7 @@ class Supervisor:
             now = clock.now()
             slept, before = now - before - 1.0, now
             for slot in self.slots:
-                suspended = self._lease.suspended and not slot.role.outlives_takeover
+                suspended = self._lease.suspended and slot.role.serves_robot
                 if slot.process is not None and not suspended:
                     self._look_at(slot, slot.process, slept)
                 if slot.recovers():
@@ -592,7 +607,7 @@ class Supervisor:
             return
         if slot.role.name == "lease":
             self._lease.not_renewable()
-        elif self._lease.suspended and not slot.role.outlives_takeover:
+        elif self._lease.suspended and slot.role.serves_robot:
             self._lease.ended()
         if slot.role.on_demand and code == 0:
             self._ended(slot)
@@ -637,8 +652,11 @@ class Supervisor:
         self._tell_control(messages.ProcessesChanged([own, *rows]))
 
     def _tell_control(self, message: messages.Message) -> None:
+        self._tell("control", message)
+
+    def _tell(self, role: str, message: messages.Message) -> None:
         for slot in self.slots:
-            if slot.role.name == "control" and slot.process is not None:
+            if slot.role.name == role and slot.process is not None:
                 slot.process.send(message)
 
     # --- ending -------------------------------------------------------------------------------------------
@@ -649,7 +667,7 @@ class Supervisor:
         for task in self._tasks:
             task.cancel()
         for slot in self.slots if self._lease.suspended else ():
-            if slot.process is not None and not slot.role.outlives_takeover:
+            if slot.process is not None and slot.role.serves_robot:
                 slot.process.kill()  # it is stopped, and cannot end in order
         await end_all(self.slots, self._process_died)
 

@@ -77,6 +77,7 @@ class ControlLink:
         self._dropped = 0
         self._served = RestServed("")
         self.known = False  # whether this link has stated the tokens
+        self.paused = ""  # why control is stopped
 
     @property
     def connected(self) -> bool:
@@ -110,6 +111,8 @@ class ControlLink:
         if seconds is None:
             operation = operation_of(request)
             seconds = operation.seconds if operation is not None else ANSWER_SECONDS
+        if self.paused:
+            raise ControlAwayError(self.paused)
         if self._link.channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
         if self._link.unanswered >= _MOST_OPEN:

@@ -32,6 +32,10 @@ def routes(services: Services) -> Routes:
 
     async def ready() -> Health:
         """Whether nodes are served: 503 while they are not; no token needed, so it does not say why."""
+        if services.control.paused:
+            raise ProblemError(
+                503, "not-served", "nodes are not served: the appliance is paused", retry_after=1
+            )
         if not services.control.connected:
             raise ProblemError(503, "not-available", "RVMaster is being restarted", retry_after=1)
         seen = services.history.seen

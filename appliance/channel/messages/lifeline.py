@@ -126,6 +126,12 @@ class FirewallReported(Message):
     report: FirewallState
 
 
+class ServicePaused(Message):
+    """The supervisor tells the api that a lapse of the lease has stopped control; without `reason`, control goes on."""
+
+    reason: str
+
+
 class ProbeFailed(Message):
     """Another user could reach the port of the ROS master. Control stops serving nodes and reports the reason."""
 
@@ -229,5 +235,5 @@ Lifeline = (
     | TunnelsWanted | TunnelsEnclosed
     | RingGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
     | SignatureWanted | SignatureMade
-    | LeaseHeld | LeaseEnded | Activated
+    | LeaseHeld | LeaseEnded | Activated | ServicePaused
 )  # fmt: skip

@@ -28,6 +28,8 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
         site.start("a")
         site.until_active("a")
         one = site.appliances["a"]
+        assert one.process is not None
+        one.token = one.process.wait_for(event="ready")["token"]
         one.ask(admin.PolicyLoad(OPEN_POLICY + "[Options]\ntakeover = granted\n"))
         one.ask(admin.MonitorLoad({"seen.rv": RULE}))
         one.ask(admin.TokenAdd("colleague", "viewer", 3600.0))

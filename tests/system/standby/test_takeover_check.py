@@ -1,7 +1,7 @@
 """A standby that could not serve: both appliances report it, it does not claim, and recovers automatically.
 
-The standby `b` has keys of the site, which `a` does not know. All tests of the file use the same appliances; each brings
-the policy that it needs into force, so it also passes alone.
+The standby `b` has keys of the site, which `a` does not know. All tests of the file use the same appliances; each
+brings the policy that it needs into force, so it also passes alone.
 """
 
 from collections.abc import Iterator

@@ -8,8 +8,12 @@ import os
 import select
 import signal
 import socket
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +22,15 @@ import pytest
 from appliance.channel import admin
 from appliance.standby.membership import PORT
 from appliance.standby.witness import EXPIRY
+from appliance.supervisor.lapse_answers import PAUSED
 from examples.landshark.lab import Host
+from tests.support.appliance import Appliance
+from tests.support.rest import Answer, Rest
 from tests.support.standby_robot import StandbyRobot
 from tests.support.standby_site import ADDRESSES, MASTER_PORT, OCU, ROBOT, StandbySite
-from tests.support.waiting import eventually
+from tests.support.waiting import allowed, eventually
 
+REST = "https://127.0.0.1:8443"
 ROLES = ("control", "relay", "rosmaster", "signer", "api", "lease")
 
 
@@ -133,9 +141,11 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
 def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
     """Nothing serves until the lease is renewed; then all goes on in the same epoch, with the same processes.
 
-    Without the standby no other appliance can claim, however long the process of the lease is paused.
+    Without the standby no other appliance can claim, however long the process of the lease is paused. Meanwhile
+    operators learn the reason within seconds, over the socket, REST and the health check of a container.
     """
     active, passive = site.pair()
+    rest = rest_of(site.appliances[active], site.appliances["a"].token)
     site.cut(passive)
     eventually(lambda: site.in_sync() == {active}, site.story)
     epoch, before = site.lease.read().epoch, site.pids(active)
@@ -143,11 +153,45 @@ def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
     (lease,) = site.pids(active, "lease")
     os.kill(lease, signal.SIGSTOP)
     eventually(lambda: all(stopped(pid) for pid in serving), site.story)
+    learn_of_the_pause(site.appliances[active], rest)
     os.kill(lease, signal.SIGCONT)
     robot.lost_nothing()
     assert (site.lease.read().epoch, site.pids(active)) == (epoch, before)
     site.restore(passive)
     site.until_both_in_sync()
+
+
+def rest_of(one: Appliance, token: str) -> Callable[[str], Answer]:
+    """Return a function that gets a path of REST; the api has served once, which loads its routes."""
+    assert isinstance(one.host, Host)
+    host = one.host
+    rest = Rest(REST, token, one.state / "api" / "certificate.pem")
+
+    def get(path: str) -> Answer:
+        return host.run(partial(rest.get, path))
+
+    eventually(lambda: get("/v1/status").status == 200, one.story)
+    return get
+
+
+def learn_of_the_pause(one: Appliance, get: Callable[[str], Answer]) -> None:
+    """Check that each way to the appliance gives the reason of its pause, and soon."""
+    began = time.monotonic()
+    for verb in (("status",), ("standby", "status"), ("policy", "show")):
+        done = one.rosrv(*verb, check=False)
+        assert (done.returncode, PAUSED in done.stderr) == (1, True), done
+    health = subprocess.run(
+        [sys.executable, "-m", "appliance.cli.healthy"],
+        env={**os.environ, "ROSRV_STATE": str(one.state)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (health.returncode, PAUSED in health.stderr) == (1, True), health
+    for path in ("/v1/status", "/metrics", "/readyz"):
+        answer = get(path)
+        assert (answer.status, b"paused" in answer.body) == (503, True), answer
+    assert time.monotonic() - began < allowed(5.0)
 
 
 def stopped(pid: int) -> bool:

@@ -209,12 +209,20 @@ async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyP
 async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
     tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A renewal in the same epoch lets it go on. Otherwise it is killed, also if a process ends in the meantime."""
-    roles = (CONTROL, Role("relay", "u", "p", "m:f"), Role("lease", "u", "p", "m:f", outlives_takeover=True))
+    """A renewal in the same epoch lets it go on. Otherwise it is killed, also if a process ends in the meantime.
+
+    The api goes on, and hears of the pause, so that it can answer operators.
+    """
+    roles = (
+        CONTROL,
+        Role("relay", "u", "p", "m:f"),
+        Role("lease", "u", "p", "m:f", outlives_takeover=True),
+        Role("api", "u", "p", "m:f", stands_by=True),
+    )
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "config.json", rosmaster_port=1)
     supervisor = Supervisor(roles, facts, admin=admin, ready=lambda _said: None, stands_by=lambda: None)
-    control, relay, lease = stand_ins = [StandIn() for _ in roles]
+    control, relay, lease, api = stand_ins = [StandIn() for _ in roles]
     for slot, process in zip(supervisor.slots, stand_ins, strict=True):
         slot.process, process.ready, process.role = cast(ProcessHandle, process), True, slot.role.name
 
@@ -223,7 +231,7 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
 
     report(LeaseHeld(clock.since_boot() + 60, 5))
     report(LeaseEnded(renewable=True))
-    assert [one.signals for one in stand_ins] == [[signal.SIGSTOP], [signal.SIGSTOP], []]
+    assert [one.signals for one in stand_ins] == [[signal.SIGSTOP], [signal.SIGSTOP], [], []]
     supervisor.start(supervisor.slots[1])
     assert supervisor.slots[1].due is not None  # a start that was due waits
     supervisor.slots[1].due.cancel()
@@ -241,4 +249,8 @@ async def test_a_lapse_of_the_lease_stops_what_serves_the_robot(
         report(LeaseHeld(clock.since_boot() + 60, 5 if end == "renewed" else 7))
     assert control.signals[1:] == [signal.SIGCONT if end == "renewed" else signal.SIGKILL]
     assert lease.signals == []
+    assert (api.told, signal.SIGSTOP in api.signals) == (
+        ["ServicePaused"] * (1 if end == "a stop" else 2),
+        False,
+    )
     supervisor.kept.close()

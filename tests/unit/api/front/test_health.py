@@ -28,7 +28,8 @@ class Probed:
         self._statuses = list(statuses)
         self.looks = 0
         self.history = SampleHistory(self._measures)
-        services = SimpleNamespace(control=SimpleNamespace(connected=True), history=self.history)
+        self.control = SimpleNamespace(connected=True, paused="")
+        services = SimpleNamespace(control=self.control, history=self.history)
         (self._ready,) = [
             one.endpoint  # type: ignore[attr-defined]  # it is a route with one
             for one in routes(cast(Services, services)).routes
@@ -74,6 +75,14 @@ async def test_it_is_not_ready_while_nodes_are_not_served(wrong: dict[str, Any] 
     async with sampled(probed):
         assert await probed.ready() == "not-served"
         assert await probed.ready() == "ready"
+
+
+async def test_it_is_not_ready_during_a_lapse_of_the_lease() -> None:
+    """The last sample may be from before the lapse."""
+    probed = Probed(SERVING)
+    async with sampled(probed):
+        probed.control.paused = "the lease has lapsed"
+        assert await probed.ready() == "not-served"
 
 
 async def test_a_log_that_may_fail_does_not_make_it_unready() -> None:
