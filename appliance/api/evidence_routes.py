@@ -14,9 +14,11 @@ from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, in_thread, peer_of
 from appliance.api.recording_routes import OneId
+from appliance.api.routes.named_hosts import host_in_words
 from appliance.audit.log.log_database import LogUnreadableError
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
 from appliance.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
+from appliance.evidence.page import Names
 
 _ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {
     404: {"description": "There is no such recording, or the log has no record of that time."}
@@ -57,7 +59,10 @@ async def _bundle(
 
     give_back = services.exports.take(bearer, peer_of(request), "exports")
     try:
-        pieces = await asyncio.to_thread(export, services.audit_log, wanted, ask)
+        policy = await services.control.ask(PolicyWanted(), bearer)
+        named = await asyncio.to_thread(host_in_words, policy.given() if policy.ok else None)
+        names = Names(services.settings.name, named)
+        pieces = await asyncio.to_thread(export, services.audit_log, wanted, ask, names)
     except BaseException as error:
         give_back()
         if isinstance(error, BundleError):

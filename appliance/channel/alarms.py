@@ -33,6 +33,7 @@ class AlarmList(msgspec.Struct, frozen=True):
     """The present alarms."""
 
     alarms: Annotated[list[Alarm], doc("the most severe first, then denials and drops of the last minute")]
+    robot: Annotated[str, doc("the `name` of the robot in `appliance.yaml`")] = ""
 
 
 def open_alarms(status: Status) -> list[Alarm]:

@@ -62,6 +62,8 @@ def silence(
 
 
 def _say(body: AlarmList, *, as_json: bool) -> None:
+    if body.robot and not as_json:
+        say(f"robot  {body.robot}")
     for alarm in body.alarms:
         if as_json:
             say_json(alarm)

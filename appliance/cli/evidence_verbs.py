@@ -18,12 +18,14 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.connection.admin_client import AdminSocket
+from appliance.cli.connection.host_labels import robot_name
 from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, say_json, usage_error
 from appliance.evidence import bundle_verifier as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export
+from appliance.evidence.page import Names
 from appliance.signing.fingerprints import fingerprint
 from rosmop.tool.terminal import say
 
@@ -82,7 +84,8 @@ def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:
     match appliance.way:
         case AdminSocket(state=state):
             asked = RecordingSelection(wanted, state / "recordings") if isinstance(wanted, str) else wanted
-            yield from export(state / "control" / "audit.db", asked, appliance.ask)
+            names = Names(robot_name(state), appliance.host_in_words)
+            yield from export(state / "control" / "audit.db", asked, appliance.ask, names)
         case RestWay(client=client):
             path, params = "/v1/evidence", {}
             if isinstance(wanted, str):

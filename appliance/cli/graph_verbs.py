@@ -14,6 +14,8 @@ def list_nodes(appliance: Appliance) -> None:
     """
     nodes = sorted(appliance.ask_or_exit(GraphWanted()).nodes, key=lambda node: node.name)
     width = max((len(node.name) for node in nodes), default=0)
+    hosts = {node.host: "" if appliance.as_json else appliance.host_in_words(node.host) for node in nodes}
+    room = max(map(len, hosts.values()), default=0)
     for node in nodes:
         if appliance.as_json:
             say_json(node)
@@ -25,7 +27,9 @@ def list_nodes(appliance: Appliance) -> None:
             )
         )  # fmt: skip
         lost = "  lost: it does not answer" if node.state == "lost" else ""
-        say_row([f"{node.name:<{width}}", f"{node.host:<15}", f"{counts}{lost}"], "red" if lost else "")
+        say_row(
+            [f"{node.name:<{width}}", f"{hosts[node.host]:<{room}}", f"{counts}{lost}"], "red" if lost else ""
+        )
     if not nodes and not appliance.as_json:
         say("no node is registered")
 

@@ -4,6 +4,7 @@ from appliance.channel.admin import LimitsWanted
 from appliance.channel.answers.limit_answers import LimitUse
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import say_json, say_row
+from appliance.policy.host_names import HostInWords
 
 _NEARLY = 0.8  # of a limit: the row is marked
 _UNITS = (("GB", 1e9), ("MB", 1e6), ("kB", 1e3))
@@ -24,7 +25,10 @@ def limits(appliance: Appliance) -> None:
             say_json(row)
             continue
         near = _is_near(row)
-        say_row([f"{'!' if near else ' '} {row.resource:<{width}}", *_cells(row)], "yellow" if near else "")
+        say_row(
+            [f"{'!' if near else ' '} {row.resource:<{width}}", *_cells(row, appliance.host_in_words)],
+            "yellow" if near else "",
+        )
 
 
 def _is_near(row: LimitUse) -> bool:
@@ -32,11 +36,11 @@ def _is_near(row: LimitUse) -> bool:
     return whole or (row.host != "" and row.host_used >= _NEARLY * row.host_allowed)
 
 
-def _cells(row: LimitUse) -> list[str]:
+def _cells(row: LimitUse, host_in_words: HostInWords) -> list[str]:
     shown = _bytes if row.resource.startswith("bytes ") else "{:,}".format
     cells = [shown(row.used) + ("" if row.allowed is None else f" of {shown(row.allowed)}")]
     if row.host:
-        cells.append(f"{row.host}: {shown(row.host_used)} of {shown(row.host_allowed)}")
+        cells.append(f"{host_in_words(row.host)}: {shown(row.host_used)} of {shown(row.host_allowed)}")
     return [*cells, f"({row.setting})"] if row.setting else cells
 
 

@@ -17,13 +17,14 @@ from appliance.base import clock
 from appliance.base.atomic_files import name_to_make
 from appliance.base.timestamps import parse_timestamp
 from appliance.channel import admin
-from appliance.channel.answers.recording_answers import RecordedMessages, Recording, Timeline
+from appliance.channel.answers.recording_answers import RecordedMessages, Recording, Sender, Timeline
 from appliance.cli import completion
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
 from appliance.cli.output import say_json, usage_error
 from appliance.cli.topic_verbs import lines_of
+from appliance.policy.host_names import HostInWords
 from appliance.recorder.bag_reader import MessagePosition
 from appliance.recorder.mcap import as_mcap
 from appliance.recorder.timeline import (
@@ -98,7 +99,7 @@ def show(appliance: Appliance, recording: _Id) -> None:
     Example: rosrv record show 1879f3c2a4b5d6e7f012
     """
     body = appliance.answer_or_exit(admin.RecordingWanted(recording))
-    for line in _described(body):
+    for line in _described(body, appliance.host_in_words):
         say(line)
 
 
@@ -134,7 +135,7 @@ def show_timeline(
     if appliance.as_json:
         say_json(found)
         return
-    for line in _drawn(found):
+    for line in _drawn(found, appliance.host_in_words):
         say(line)
 
 
@@ -182,7 +183,7 @@ def messages(
             say_json(message)
             continue
         mark = "->" if number == found.chosen else "  "
-        sender = " ".join(filter(None, (message.sender.node, message.sender.host)))
+        sender = _sender(message.sender, appliance.host_in_words)
         words = (rfc3339(message.time), message.topic, sender, f"{message.size} bytes", message.why)
         say(f"{mark} {'  '.join(printable(word) for word in words if word)}", "dim")
         for line in lines_of(message.fields, 2):
@@ -300,7 +301,11 @@ def _moment_given(option: str, text: str | None) -> int | None:
         raise usage_error(f"{option}: {error}") from None
 
 
-def _drawn(found: Timeline) -> Iterator[str]:
+def _sender(sender: Sender, host_in_words: HostInWords) -> str:
+    return " ".join(filter(None, (sender.node, sender.host and host_in_words(sender.host))))
+
+
+def _drawn(found: Timeline, host_in_words: HostInWords) -> Iterator[str]:
     """Yield a line of bars for each topic and kind of event, then the events."""
     yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
     lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
@@ -309,12 +314,13 @@ def _drawn(found: Timeline) -> Iterator[str]:
     for name, counts, what, senders in lanes:
         most = max(counts) or 1
         bars = "".join(_BARS[-(-count * (len(_BARS) - 1) // most)] for count in counts)
-        by = ", ".join(f"{sender.node} {sender.host}".strip() for sender in senders)
+        by = ", ".join(_sender(sender, host_in_words) for sender in senders)
         yield f"  {printable(name):{width}} {bars} {counted(sum(counts), what)}  {printable(by)}".rstrip()
     if found.more_topics:
         yield f"  {counted(found.more_topics, 'more topic')} with fewer messages"
     for event in found.events:
-        who = " ".join(filter(None, (event.resource, event.caller_id, event.host)))
+        host = event.host and host_in_words(event.host)
+        who = " ".join(filter(None, (event.resource, event.caller_id, host)))
         offset = (event.time - found.since) / _SECOND
         what = f"{event.event}: {event.reason}" if event.reason else event.event
         kind = event.kind if event.times == 1 else f"{event.kind} {event.times} times"
@@ -363,12 +369,12 @@ def _summary(recording: Recording) -> str:
     )
 
 
-def _described(recording: Recording) -> Iterator[str]:
+def _described(recording: Recording, host_in_words: HostInWords) -> Iterator[str]:
     yield f"{recording.id}  {_summary(recording)}"
     yield f"  from {_moment(recording.began)} to {_moment(recording.ended)}"
     yield f"  policy revision {recording.policy}, specifications revision {recording.monitors}"
     yield f"  sha256 {recording.sha256}"
-    yield f"  charged to {recording.charged_to}"
+    yield f"  charged to {host_in_words(recording.charged_to)}"
     if recording.why_not:
         yield f"  missing: {recording.why_not}"
     for trigger in recording.triggers:
@@ -377,4 +383,4 @@ def _described(recording: Recording) -> Iterator[str]:
         missed = f", {topic.missed} missed" if topic.missed else ""
         yield f"  {topic.topic}  {topic.type}  {counted(topic.messages, 'message')}, {topic.bytes} bytes{missed}"
     for row in recording.left_out:
-        yield f"  {row.topic}  {row.type}  left out: {row.why} ({row.host})"
+        yield f"  {row.topic}  {row.type}  left out: {row.why} ({host_in_words(row.host)})"

@@ -115,7 +115,7 @@ def publishers(
                 if row["since"]
                 else "before the log begins"
             )
-            say(f"  {row['node']} on {row['host']}, registered {began}")
+            say(f"  {row['node']} on {appliance.host_in_words(row['host'])}, registered {began}")
         if not found.publishers:
             say("  no publisher is found")
         for line in found.unknown:

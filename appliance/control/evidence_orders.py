@@ -17,9 +17,11 @@ class NotSealedError(Exception):
 class EvidenceOrders:
     """The answers to the requests of an evidence export. Its methods raise `NotSealedError`."""
 
-    def __init__(self, log: AuditLog, trail: AuditTrail) -> None:
+    def __init__(self, log: AuditLog, trail: AuditTrail, robot: str = "") -> None:
+        """Start without an export; `robot` is its name, empty if it has none."""
         self._log = log
         self._trail = trail
+        self._robot = {"robot": robot} if robot else {}
 
     async def seal(self, _request: admin.LogSealed) -> Sealed:
         """Wait until a signed checkpoint seals all records."""
@@ -37,6 +39,7 @@ class EvidenceOrders:
             until=request.until,
             records=request.records,
             recording=request.recording,
+            more=self._robot,
         )
         await self._seal()
         return Sealed(record)

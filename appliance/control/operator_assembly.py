@@ -135,7 +135,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             tokens=tokens,
             recordings=ends.recordings,
             blocks=blocks,
-            evidence=EvidenceOrders(base.audit, trail),
+            evidence=EvidenceOrders(base.audit, trail, base.settings.name),
             standby=orders,
             alarms=AlarmOrders(handled, trail, looks.present),
             limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),

@@ -195,7 +195,8 @@ class _Control:
         uri = node_uri(told, base.port(RVMASTER))
         base.lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
-            base.trail.happened("appliance started", f"nodes may connect at {uri}")
+            name = {"robot": settings.name} if settings.name else {}
+            base.trail.happened("appliance started", f"nodes may connect at {uri}", more=name)
         detail = {
             "master": uri.rstrip("/"),
             "revision": base.policies.revision,

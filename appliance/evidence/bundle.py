@@ -41,7 +41,7 @@ from appliance.channel.admin import (
     Trouble,
 )
 from appliance.channel.answers.recording_answers import Recording
-from appliance.evidence.page import Page
+from appliance.evidence.page import Names, Page
 from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
@@ -82,8 +82,10 @@ class RecordingSelection(NamedTuple):
     folder: Path
 
 
-def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterator[bytes]:
+def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Names) -> Iterator[bytes]:
     """Record and seal an export, then return the bytes of its bundle; `ask` queries the appliance.
+
+    The page of the bundle has the `names`; its records are as they are stored.
 
     The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError` and
     `LogUnreadableError`, also during the iteration.
@@ -96,7 +98,7 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterat
         wanted = TimeSpan(recording.began, recording.ended + 1)
     _given(ask(LogSealed()))
     span = TimeSpan(wanted.since, min(wanted.until, clock.wall_ns()))
-    bundle = _Bundle(log, span, ask, recording, bag)
+    bundle = _Bundle(log, span, ask, recording, bag, names)
     manifest = bundle.manifest()
     text = json.dumps(manifest, indent=1).encode() + b"\n"
     order = EvidenceExported(hashlib.sha256(text).hexdigest(), *span, bundle.count, manifest["recording"])
@@ -109,8 +111,11 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask) -> Iterat
 class _Bundle:
     """The members of a bundle."""
 
-    def __init__(self, log: Path, span: TimeSpan, ask: Ask, recording: Recording | None, bag: Path) -> None:
+    def __init__(  # noqa: PLR0917  one caller
+        self, log: Path, span: TimeSpan, ask: Ask, recording: Recording | None, bag: Path, names: Names
+    ) -> None:
         self._log, self._span, self._ask, self._recording, self._bag = log, span, ask, recording, bag
+        self._names = names
         with reading(log) as connection:
             connection.execute("BEGIN")
             self._find(connection.execute)
@@ -210,7 +215,7 @@ class _Bundle:
             about = msgspec.json.format(msgspec.json.encode(self._recording), indent=1) + b"\n"
             yield "recording/recording.json", [about]
             yield "recording/recording.bag", _file(self._bag)
-        page = Page(self._recording)
+        page = Page(self._recording, self._names)
         within = itertools.chain.from_iterable(range(first, last + 1) for first, last in self._runs)
         yield "records.ndjson", _noted(_records(self._log, heapq.merge(self._alone, within)), page.add)
         yield "index.html", (page.html(manifest) for _once in "1")

@@ -3,8 +3,8 @@
 import html
 import json
 from collections import Counter
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 from appliance.audit.log.record_format import printable, rfc3339
 from appliance.channel.answers.recording_answers import Recording
@@ -41,11 +41,19 @@ bundle can also change the copies inside it. The command lists the changed and m
 """
 
 
+class Names(NamedTuple):
+    """The name of the robot (empty if it has none), and the function that shows a host as text for people."""
+
+    robot: str
+    host_in_words: Callable[[str], str]
+
+
 class Page:
     """The page of a bundle, which collects its rows while the records are written."""
 
-    def __init__(self, recording: Recording | None) -> None:
+    def __init__(self, recording: Recording | None, names: Names) -> None:
         self._recording = recording
+        self._names = names
         self._events: Counter[str] = Counter()
         self._rows: list[str] = []
         self._left_out = 0
@@ -63,7 +71,8 @@ class Page:
             self._left_out += 1
             return
         kind = record["severity"] if record["decision"] in (None, "allow") else "deny"
-        who = " ".join(filter(None, (record["host"], record["caller_id"], _who(record["detail"]))))
+        host = record["host"] and self._names.host_in_words(record["host"])
+        who = " ".join(filter(None, (host, record["caller_id"], _who(record["detail"]))))
         cells = [str(record["sequence"]), record["event"], record["decision"] or "", who, record["resource"] or "",
                  record["reason"]]  # fmt: skip
         shown = "".join(f"<td>{_text(cell)}" for cell in cells)
@@ -73,6 +82,7 @@ class Page:
         """Return the page; `manifest` has all members except the page."""
         runs = ", ".join(f"{first} to {last}" for first, last in manifest["runs"])
         facts = {
+            "robot": self._names.robot,
             "span": f"{rfc3339(manifest['since'])} to {rfc3339(manifest['until'])}",
             "log": manifest["log"],
             "records": runs,

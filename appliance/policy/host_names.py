@@ -9,7 +9,7 @@ Invariants:
 """
 
 import ipaddress
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from appliance.base.validation_messages import meant
@@ -19,6 +19,9 @@ from appliance.policy.ini_reader import read
 from appliance.policy.model import Address
 from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import GROUPS
+
+HostInWords = Callable[[str], str]
+"""A function that returns a host as text for people: `tablet (10.0.0.7)`, or the address alone if it has no name."""
 
 _HOST = "host:"
 _MOST_NAMED = 20
@@ -94,6 +97,12 @@ def label_of(address: str, labels: Iterable[tuple[Network, str]]) -> str:
     except ValueError:
         return ""
     return next((name for network, name in labels if found in network), "")
+
+
+def in_words(address: str, labels: Iterable[tuple[Network, str]]) -> str:
+    """Return a host as text for people, as `HostInWords` does."""
+    name = label_of(address, labels)
+    return f"{name} ({address})" if name else address
 
 
 def _define(

@@ -18,6 +18,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.front.access import Bearer
+from appliance.api.front.control import ControlAwayError
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.route_roles import Operator, Viewer, ask, reads_contents
@@ -26,7 +27,7 @@ from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
 from appliance.api.routes.denials import asks_policy
 from appliance.api.routes.dry_run_policy import explained, granted
-from appliance.api.routes.named_hosts import has_name, with_networks
+from appliance.api.routes.named_hosts import has_name, host_in_words, with_networks
 from appliance.api.routes.shown_records import (
     PAGE,
     RECORD_REFERENCE,
@@ -281,7 +282,7 @@ def _add_proofs(router: Routes, services: Services, desk: LogReader) -> None:
         shows them to viewers, without what messages said and without `chain`: only what is whole can be proven.
         """
         wanted = await desk.named(bearer, wanted)
-        found = await desk.read(bearer, _exported, desk.path, wanted, bearer)
+        found = await desk.read(bearer, _exported, desk.path, wanted, bearer, services.settings.name)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         return StreamResponse(
             StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
@@ -311,12 +312,18 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         """
         shown = await desk.record(bearer, record_id, 0)
         record = readable_by(shown.entry, bearer).record
-        known, first = None, await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
+        first = await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
         in_full = None if first is None else readable_by(first, bearer)
-        if asks_policy(record):
-            known = await ask(services.control, PolicyWanted(), bearer)
+        try:
+            policy = await ask(services.control, PolicyWanted(), bearer)
+        except (ControlAwayError, ProblemError):  # such as on a standby
+            if asks_policy(record):
+                raise
+            policy = None
+        known = policy if asks_policy(record) else None
         async with services.judging.turn(bearer):
-            return await asyncio.to_thread(explained, record, known, in_full)
+            words = await asyncio.to_thread(host_in_words, policy)
+            return await asyncio.to_thread(explained, record, known, in_full, words)
 
     @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer, *, tool: bool = False) -> Granted:
@@ -356,11 +363,12 @@ async def _follow(
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
 
 
-def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[str]:
+def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer, robot: str) -> Iterator[str]:
     if reads_contents(bearer):
-        return _begun(evidence_line(*record) for record in evidence(path, wanted))
+        return _begun(evidence_line(*record, robot) for record in evidence(path, wanted))
     shown = (readable([entry], bearer, wanted.text) for entry in export(path, wanted))
-    return _begun(_as_line(as_object(entry)) for entries in shown for entry in entries)
+    name = {"robot": robot} if robot else {}
+    return _begun(_as_line(as_object(entry) | name) for entries in shown for entry in entries)
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:

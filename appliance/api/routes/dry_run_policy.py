@@ -23,6 +23,7 @@ from appliance.policy.actions import BadWordError, check_resource, find_host
 from appliance.policy.decision_reasons import DecisionExplanation, explain
 from appliance.policy.diff import diff
 from appliance.policy.grant import UngrantableError, grant
+from appliance.policy.host_names import HostInWords
 from appliance.policy.judgement import PolicyContext, PolicyJudgement, judge
 from appliance.policy.live_rights import LiveRight, endings
 from appliance.policy.model import Category, Request
@@ -86,7 +87,12 @@ def granted(record: AuditRecord, current: PolicyKnown, *, whole_tool: bool = Fal
     )
 
 
-def explained(record: AuditRecord, current: PolicyKnown | None, in_full: LogEntry | None = None) -> Why:
+def explained(
+    record: AuditRecord,
+    current: PolicyKnown | None,
+    in_full: LogEntry | None = None,
+    host_in_words: HostInWords = str,
+) -> Why:
     """Explain a record; if it is a denial that a policy might allow, `current` must be given.
 
     `in_full`: the record that a record of repetitions continues.
@@ -101,7 +107,7 @@ def explained(record: AuditRecord, current: PolicyKnown | None, in_full: LogEntr
     except UngrantableError as error:
         refusal = str(error)
     added = [f"would be allowed by: {line}" for line in found.added] if found is not None else []
-    return Why(lines=[*lines_of(record, in_full), *added], grant=found, refusal=refusal)
+    return Why(lines=[*lines_of(record, in_full, host_in_words), *added], grant=found, refusal=refusal)
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> PolicyJudgement:

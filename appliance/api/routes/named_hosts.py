@@ -1,13 +1,14 @@
 """Hosts by their names: what a search for a name means, and the labels of addresses, by the policy in force."""
 
 import ipaddress
+from functools import partial
 from typing import Annotated
 
 import msgspec
 
 from appliance.audit.search.query import Filter, FilterError
 from appliance.channel.answers.policy_answers import PolicyInForce
-from appliance.policy.host_names import HostNames, UnknownHostNameError
+from appliance.policy.host_names import HostInWords, HostNames, UnknownHostNameError, in_words
 from appliance.policy.model import address_of
 
 _GLOB = frozenset("*?[")
@@ -35,6 +36,11 @@ def names_of(known: PolicyInForce) -> HostNames:
 def labels_of(known: PolicyInForce) -> HostLabels:
     """Return the labels of addresses."""
     return HostLabels([HostLabel(str(network), name) for network, name in names_of(known).labels()])
+
+
+def host_in_words(known: PolicyInForce | None) -> HostInWords:
+    """Return the function that shows a host as text for people; it shows addresses if no policy is known."""
+    return str if known is None else partial(in_words, labels=names_of(known).labels())
 
 
 def has_name(wanted: Filter) -> bool:

@@ -98,8 +98,8 @@ EVENTS: dict[str, str] = {
     "rest call": "A REST call was answered; `detail` has the token's name in `who`, the method and the status.",
     "rest certificate replaced": "REST has another certificate, because the earlier one ended soon or lacked a name;"
     " `detail` has the SHA-256 of both. Clients that trust exactly the earlier one refuse it.",
-    "evidence exported": "An evidence bundle was made; `detail` has who requested it, the hash of its manifest and its"
-    " time span.",
+    "evidence exported": "An evidence bundle was made; `detail` has who requested it, the hash of its manifest, its"
+    " time span, and the name of the `robot`.",
     "order refused": "RVMaster rejected an order over REST: no valid token, role or proof; `detail.verb` is the order.",
     "token added": "An access token for REST was made; `detail` has its name, role, id and expiry.",
     "token revoked": "An access token for REST was revoked before its expiry.",
@@ -111,7 +111,7 @@ EVENTS: dict[str, str] = {
     "process died": "A process of the appliance ended unexpectedly.",
     "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
     " the last lines that it printed. It is restarted at growing intervals of up to a minute.",
-    "appliance started": "The appliance is in service.",
+    "appliance started": "The appliance is in service; `detail.robot` is the `name` of the robot in `appliance.yaml`.",
     "appliance stopped": "The appliance was shut down in an orderly way.",
     "took over": "This appliance of a pair became the active one; `detail` has the epoch, both names, the last"
     " checkpoint of the other appliance's log that was replicated (null: none), and the takeover before.",

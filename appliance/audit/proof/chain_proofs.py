@@ -5,6 +5,7 @@ records that the filter omits. It ends at the next exported record, or at the si
 (`checkpoint`). `appliance/evidence` verifies this with the public key alone.
 """
 
+import json
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,9 +52,10 @@ def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[Log
         waiting = entries[-1] if entries and not last else None
 
 
-def evidence_line(entry: LogEntry, chain: ChainProof) -> str:
-    """Return one line of NDJSON without the newline: the record, and `chain`."""
-    return f'{as_json(entry)[:-1]},"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
+def evidence_line(entry: LogEntry, chain: ChainProof, robot: str = "") -> str:
+    """Return one line of NDJSON without the newline: the record, the name of the `robot` if it has one, and `chain`."""
+    name = f'"robot":{json.dumps(robot)},' if robot else ""
+    return f'{as_json(entry)[:-1]},{name}"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:

@@ -1,6 +1,6 @@
 """Explain a record in a few lines: author, events, values, location in the specification, recording."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from appliance.audit.log.record import AuditRecord
@@ -14,19 +14,21 @@ _TALLIES = ("reasons", "hosts", "callers", "resources", "calls")
 """The counts by name in a summary of repetitions (`repetition.py`)."""
 
 
-def lines_of(record: AuditRecord, in_full: LogEntry | None = None) -> Iterator[str]:
+def lines_of(
+    record: AuditRecord, in_full: LogEntry | None = None, host_in_words: Callable[[str], str] = str
+) -> Iterator[str]:
     """Yield the lines of the explanation; the caller must escape untrusted text in them.
 
     `in_full`: the record of the first event, if this record counts repetitions.
     """
-    yield from _own_lines(record)
-    yield from _counted(record.detail)
+    yield from _own_lines(record, host_in_words)
+    yield from _counted(record.detail, host_in_words)
     if in_full is not None:
         yield f"the first, in full: record {in_full.sequence}, {rfc3339(in_full.record.time)}"
-        yield from (f"  {line}" for line in lines_of(in_full.record))
+        yield from (f"  {line}" for line in lines_of(in_full.record, None, host_in_words))
 
 
-def _counted(detail: Mapping[str, Any]) -> Iterator[str]:
+def _counted(detail: Mapping[str, Any], host_in_words: Callable[[str], str]) -> Iterator[str]:
     """Yield the monitor, number, time and reasons of counted repetitions."""
     if "count" not in detail:
         return
@@ -38,19 +40,26 @@ def _counted(detail: Mapping[str, Any]) -> Iterator[str]:
     yield f"counted: {detail['count']}{f', {times[0]} to {times[-1]}' if times else ''}"
     for what in _TALLIES:
         if found := _mapping(detail.get(what)):
-            yield f"{what}: {', '.join(f'{name} ({number} times)' for name, number in found.items())}"
+            names = {
+                host_in_words(name) if what == "hosts" else name: number for name, number in found.items()
+            }
+            yield f"{what}: {', '.join(f'{name} ({number} times)' for name, number in names.items())}"
     texts = dict.fromkeys(str(detail[name]) for name in ("first_text", "last_text") if name in detail)
     if texts:
         yield f"from first to last: {' … '.join(texts)}"
 
 
-def _own_lines(record: AuditRecord) -> Iterator[str]:
+def _own_lines(record: AuditRecord, host_in_words: Callable[[str], str]) -> Iterator[str]:
     detail = record.detail
     yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]
     author = detail.get("who")
     by = author and actor(str(author))
-    who = [str(part) for part in (record.caller_id, by, record.host and f"on {record.host}") if part]
+    who = [
+        str(part)
+        for part in (record.caller_id, by, record.host and f"on {host_in_words(record.host)}")
+        if part
+    ]
     if who or sent:
         message = f"message {', '.join(sent)} of " if sent else ""
         when = f", {rfc3339(record.time)}" if author else ""

@@ -80,9 +80,9 @@ def search(
     """
     page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
     if appliance.as_json:
-        _print_lines(page.entries, appliance.as_json)
+        _print_lines(page.entries, appliance)
     else:
-        print_entries(page.entries, each=each)
+        print_entries(page.entries, appliance.host_in_words, each=each)
     if page.cursor is not None:
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
@@ -103,7 +103,7 @@ def tail(
     Example: rosrv audit tail --deny
     """
     for entries in appliance.audit().follow(wanted, lines, on=follow):
-        _print_lines(entries, appliance.as_json)
+        _print_lines(entries, appliance)
 
 
 @speaks_with(_Json)
@@ -129,7 +129,7 @@ def show(
             }
             write(json.dumps(as_object(shown.entry) | {"neighbours": around}))
         else:
-            print_shown(shown)
+            print_shown(shown, appliance.host_in_words)
 
 
 @speaks_with(_Json)
@@ -309,10 +309,9 @@ def export(
         note(f"{count} records in {output}")
 
 
-def _print_lines(entries: list[LogEntry], as_json_lines: bool) -> None:
-    formatted = as_json if as_json_lines else line
+def _print_lines(entries: list[LogEntry], appliance: Appliance) -> None:
     for entry in entries:
-        write(formatted(entry))
+        write(as_json(entry) if appliance.as_json else line(entry, appliance.host_in_words))
     sys.stdout.flush()
 
 

@@ -19,6 +19,7 @@ from appliance.audit.search.equality import FOLDED, EqualRecords, grouped
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
 from appliance.evidence.export_verification import ExportVerification
+from appliance.policy.host_names import HostInWords
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
 _SECONDS, _MILLISECONDS = 19, 23  # characters of a time
@@ -28,22 +29,24 @@ _COLUMNS = ("record", "time (UTC)", "decision", "event", "who", "what", "why")
 _GAP = 2
 
 
-def print_entries(entries: list[LogEntry], *, each: bool = False) -> None:
+def print_entries(entries: list[LogEntry], host_in_words: HostInWords, *, each: bool = False) -> None:
     """Print records in the order given: on a terminal equal ones as one row unless `each`, else each in a line.
 
     The rows are a table. If the terminal is too narrow for its names, the reason of each row is below it.
     """
     if sys.stdout.isatty():
         rows = [row for entry in entries for row in grouped([entry])] if each else grouped(entries)
-        cells = [(Text(str(row.first.sequence)), Text(_times(row)), *_cells(row)) for row in rows]
+        cells = [
+            (Text(str(row.first.sequence)), Text(_times(row)), *_cells(row, host_in_words)) for row in rows
+        ]
         console = Console(highlight=False)
         console.print(_table(cells) if _has_room(cells, console.width) else _below(cells))
     else:
         for entry in entries:
-            write(line(entry))
+            write(line(entry, host_in_words))
 
 
-def line(entry: LogEntry) -> str:
+def line(entry: LogEntry, host_in_words: HostInWords) -> str:
     """Return a record as one line: time, sequence, decision, event, host, caller, resource, author, reason."""
     record = entry.record
     parts = [
@@ -51,7 +54,7 @@ def line(entry: LogEntry) -> str:
         f"#{entry.sequence}",
         (record.decision or record.severity.value).upper(),
         record.event,
-        record.host,
+        _host(record, host_in_words),
         record.caller_id,
         requested(record),
         record.resource,
@@ -61,13 +64,14 @@ def line(entry: LogEntry) -> str:
     return shown + (f": {_why(record)}" if _why(record) else "")
 
 
-def print_shown(shown: RecordInContext) -> None:
+def print_shown(shown: RecordInContext, host_in_words: HostInWords) -> None:
     """Print a record in full, then the records before and after it."""
     record = shown.entry.record
     fields = {
         "id": record.id,
         "time": rfc3339(record.time),
         **fields_of(shown.entry),
+        "host": _host(record, host_in_words),
         "reason": record.reason,
         "duration": None if record.duration_us is None else f"{record.duration_us} us",
         **{f"detail.{name}": str(value) for name, value in record.detail.items()},
@@ -80,7 +84,7 @@ def print_shown(shown: RecordInContext) -> None:
             f"\n{title}, same host or caller:" if entries else f"\nnothing {title} by the same host or caller"
         )
         for entry in entries:
-            write("  " + line(entry))
+            write("  " + line(entry, host_in_words))
 
 
 def print_verification(result: Verification) -> None:
@@ -187,13 +191,13 @@ def _below(rows: list[tuple[Text, ...]]) -> Table:
     return grid
 
 
-def _cells(row: EqualRecords) -> tuple[Text, ...]:
+def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
     record = row.first.record
     alarming = record.severity is Severity.ALARM
     return (
         Text(printable(record.decision or ""), style=_STYLES.get(record.decision or "", "")),
         Text(printable(record.event), style="bold red" if alarming else ""),
-        Text(_joined(record.host, record.caller_id, _by(record))),
+        Text(_joined(_host(record, host_in_words), record.caller_id, _by(record))),
         Text(_joined(requested(record), _monitor(record), record.resource)),
         Text(_why(record) if row.records == 1 else _why_of_several(row)),
     )
@@ -205,6 +209,10 @@ def _times(row: EqualRecords) -> str:
         return first[:_MILLISECONDS]
     same_day = first[:_DATE] == last[:_DATE]
     return f"{first[:_SECONDS]} to {last[_DATE if same_day else 0 : _SECONDS]}"
+
+
+def _host(record: AuditRecord, host_in_words: HostInWords) -> str | None:
+    return record.host and host_in_words(record.host)
 
 
 def _monitor(record: AuditRecord) -> str | None:

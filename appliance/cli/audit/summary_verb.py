@@ -13,6 +13,7 @@ from appliance.cli.audit.audit_errors import Errors
 from appliance.cli.audit.record_table import write
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import say_json
+from appliance.policy.host_names import HostInWords
 from rosmop.tool.terminal import counted
 
 _SECONDS = 19  # characters of a time
@@ -42,16 +43,17 @@ def summarise(
         if appliance.as_json:
             say_json(found)
             return
-        for line in _lines(found):
+        for line in _lines(found, appliance.host_in_words):
             write(printable(line))
 
 
-def _lines(found: DenialSummary) -> Iterator[str]:
+def _lines(found: DenialSummary, host_in_words: HostInWords) -> Iterator[str]:
     if not found.hosts:
         yield "no denials"
-    width = max((len(row.host) for row in found.hosts), default=0)
-    for row in found.hosts:
-        yield f"{row.host:<{width}}  {counted(row.count, 'denial')}, {_span(row)}{_callers(row)}"
+    hosts = [host_in_words(row.host) for row in found.hosts]
+    width = max(map(len, hosts), default=0)
+    for host, row in zip(hosts, found.hosts, strict=True):
+        yield f"{host:<{width}}  {counted(row.count, 'denial')}, {_span(row)}{_callers(row)}"
         for reason in row.reasons:
             yield f"{reason.count:>8}  {_cut(reason.name)}"
         if row.more_reasons:

@@ -30,11 +30,15 @@ class AccessDeniedError(NotRunningError):
 
 
 class AdminSocket:
-    """A client of the appliance that runs with a state directory; each answer may take `seconds`."""
+    """A client of the appliance that runs with a state directory; each answer may take `seconds`.
 
-    def __init__(self, state: Path, seconds: float = SECONDS) -> None:
+    After that time the request is withdrawn, and its outcome may take `grace` seconds.
+    """
+
+    def __init__(self, state: Path, seconds: float = SECONDS, grace: float = _GRACE_SECONDS) -> None:
         self.state = state
         self._seconds = seconds
+        self._grace = grace
 
     def audit(self) -> "FileLog":
         """Return the audit log, read from its file even while the appliance is stopped."""
@@ -83,7 +87,7 @@ class AdminSocket:
             _read_line(sock, line)
         except TimeoutError:
             sock.shutdown(socket.SHUT_WR)
-            sock.settimeout(_GRACE_SECONDS)
+            sock.settimeout(self._grace)
             _read_line(sock, line)
         return bytes(line)
 

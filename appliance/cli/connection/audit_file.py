@@ -22,6 +22,7 @@ from appliance.audit.search.search import (
     search,
     show,
 )
+from appliance.cli.connection.host_labels import robot_name
 
 _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]
@@ -63,7 +64,8 @@ class FileLog:
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         """Yield the sequence and the NDJSON line of all matching records, oldest first."""
-        return ((entry.sequence, evidence_line(entry, chain)) for entry, chain in evidence(self.path, wanted))
+        found, robot = evidence(self.path, wanted), robot_name(self._state)
+        return ((entry.sequence, evidence_line(entry, chain, robot)) for entry, chain in found)
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:
         """Yield the last matching records, oldest first; then, if `on`, yield new records without end."""

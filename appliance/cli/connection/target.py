@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from appliance.cli.connection.audit_over_rest import RestLog
     from appliance.cli.connection.rest_orders import RestWay
     from appliance.cli.connection.rest_session import RestClient
+    from appliance.policy.host_names import HostInWords
 
 DEFAULT_STATE = Path(
     "/var/lib/rosrv"
@@ -69,6 +70,13 @@ class Appliance:
     def audit(self) -> "FileLog | RestLog":
         """Return the appliance's audit log; with a state directory, the appliance may be stopped."""
         return self.way.audit()
+
+    @functools.cached_property
+    def host_in_words(self) -> "HostInWords":
+        """Return the function that names hosts by the policy in force; it returns addresses if no appliance answers."""
+        from appliance.cli.connection.host_labels import named_by  # noqa: PLC0415  only for text with hosts
+
+        return named_by(self.way)
 
     def ask_or_exit(self, request: AdminRequest[A]) -> A:
         """Return the answer's body. Exits with status 1 for a rejected request, and 2 if no appliance answers."""

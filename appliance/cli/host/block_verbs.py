@@ -14,7 +14,10 @@ from appliance.cli.output import moment, say_json, say_row
 from rosmop.tool.terminal import counted, say
 
 _Address = Annotated[
-    str, typer.Argument(help="An IPv4 or IPv6 address, or the name of an enrolled host", show_default=False)
+    str,
+    typer.Argument(
+        help="An address, or the name of an enrolled host or a group of one host", show_default=False
+    ),
 ]
 
 
@@ -55,7 +58,7 @@ def block(
         if body.until is not None
         else f"until `rosrv host unblock {body.address}`"
     )
-    say(f"{_named(body)} is blocked {end}; it lost {_in_words(body.ended)}")
+    say(f"{_named(body, running)} is blocked {end}; it lost {_in_words(body.ended)}")
     if body.replaced is not None:
         say(f"this replaces the block by {_whose(body.replaced)}")
     for other in body.other_addresses:
@@ -72,7 +75,7 @@ def unblock(running: Appliance, address: _Address) -> None:
     Example: rosrv host unblock 10.0.0.7
     """
     body = running.answer_or_exit(HostUnblock(address))
-    say(f"{_named(body)} is no longer blocked; {counted(body.restored, 'registration')} returned")
+    say(f"{_named(body, running)} is no longer blocked; {counted(body.restored, 'registration')} returned")
 
 
 @speaks
@@ -89,7 +92,7 @@ def list_blocks(running: Appliance) -> None:
             end = "no end" if row.until is None else f"until {moment(row.until)}"
             say_row(
                 [
-                    f"{_named(row):<37}",
+                    f"{_named(row, running):<37}",
                     f"since {moment(row.since)}",
                     f"{end:<23}",
                     f"by {row.who}{_note(row)}",
@@ -99,8 +102,8 @@ def list_blocks(running: Appliance) -> None:
         say("no host is blocked")
 
 
-def _named(row: BlockedHost) -> str:
-    return f"{row.address} ({row.name})" if row.name else row.address
+def _named(row: BlockedHost, running: Appliance) -> str:
+    return f"{row.name} ({row.address})" if row.name else running.host_in_words(row.address)
 
 
 def _whose(row: BlockedHost) -> str:

@@ -26,6 +26,7 @@ from appliance.cli.policy.policy_input import (
 )
 from appliance.cli.policy.policy_verbs import decision_fields
 from appliance.policy.diff import Difference, diff
+from appliance.policy.host_names import HostNames, in_words
 from appliance.policy.judgement import PolicyContext
 from appliance.policy.model import Request
 from appliance.policy.policy import Policy
@@ -157,8 +158,9 @@ def _say_decisions(appliance: Appliance, old: Policy, new: Policy, requests: Pat
         for difference in differences:
             say_json(_difference_fields(difference))
     else:
+        labels = HostNames.of(new.text, new.enrolled, new.robot).labels()
         for host, its in by_host(differences, lambda one: str(one.request.host)):
-            say(f"{host}: {counted(len(its), 'request')}")
+            say(f"{in_words(host, labels)}: {counted(len(its), 'request')}")
             _say_requests(its)
         say(f"{counted(len(differences), 'request')} would be decided differently")
     return bool(differences)

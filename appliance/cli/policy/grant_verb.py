@@ -59,7 +59,9 @@ def _explained(appliance: Appliance, record: str) -> Why:
             )
             known = None
         assert isinstance(appliance.way, AdminSocket)  # noqa: S101  it has no place
-        return explained(found, known, recorded_in_full(appliance.way.audit().path, entry))
+        return explained(
+            found, known, recorded_in_full(appliance.way.audit().path, entry), appliance.host_in_words
+        )
 
 
 @speaks

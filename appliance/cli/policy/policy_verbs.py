@@ -67,18 +67,18 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
             f"{verdict}, {counted(warnings, 'warning')}" if warnings else verdict,
             "red" if errors else "green",
         )
-    _say_endings(impact.ends, as_json=appliance.as_json)
+    _say_endings(impact.ends, appliance)
     raise typer.Exit(1 if errors else 0)
 
 
-def _say_endings(endings: list[Ending], *, as_json: bool) -> None:
-    if as_json:
+def _say_endings(endings: list[Ending], appliance: Appliance) -> None:
+    if appliance.as_json:
         for ending in endings:
             fields = asdict(ending)
             say_json({"ends": fields.pop("what"), **fields})
         return
     for host, its in by_host(endings, lambda ending: ending.host):
-        say(f"would end on {host}: {counted(len(its), 'connection')}", "yellow")
+        say(f"would end on {appliance.host_in_words(host)}: {counted(len(its), 'connection')}", "yellow")
         for ending in its:
             say(
                 f"  {ending.what} {ending.resource} of {ending.caller_id or 'a client'}: {ending.reason}",

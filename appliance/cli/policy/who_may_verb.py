@@ -56,8 +56,7 @@ def list_who_may(
 
 
 def _line(answer: HostAnswer) -> str:
-    names = f" ({', '.join(answer.names)})" if answer.names else ""
-    hosts = f"{answer.hosts}{names}"
+    hosts = f"{', '.join(answer.names)} ({answer.hosts})" if answer.names else answer.hosts
     if answer.decision.word != "allow":
         only = "passes only in audit-only mode" if answer.decision.would_deny else "denied"
         return f"{hosts}: {only}: {answer.decision.reason}"

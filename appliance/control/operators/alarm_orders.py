@@ -105,7 +105,7 @@ class AlarmOrders:
 
     def _list(self) -> AlarmList:
         status = self._status()
-        return AlarmList([*open_alarms(status), *activity(status)])
+        return AlarmList([*open_alarms(status), *activity(status)], status.name)
 
     def _must_be_present(self, kind: str) -> None:
         present = [alarm.kind for alarm in self._list().alarms]

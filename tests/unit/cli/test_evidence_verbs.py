@@ -28,7 +28,7 @@ def test_a_bundle_gets_its_name_when_complete(
         yield b"whole"
 
     monkeypatch.setattr(evidence_verbs, "export", export)
-    order = ("evidence", "export", "--since", "1h", "-o", str(place), "--state", str(tmp_path))
+    order = ("evidence", "export", "--since", "1h", "-o", str(place), "--state", "nowhere")
     done = rosrv(*order)
     assert done.returncode == breaks, done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ([] if breaks else ["incident.zip"])

@@ -17,6 +17,7 @@ from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.answers.recording_answers import Recording
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
 from appliance.evidence.bundle import RecordingSelection, TimeSpan, export
+from appliance.evidence.page import Names
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
@@ -32,6 +33,7 @@ STRANGE: dict[str, Any] = {
     "whole": -(2**62),
     "deep": {"b": [1, None], "a": True},
 }
+NAMES = Names("arm-3", lambda host: f"tablet ({host})")
 LENGTHS = (0, 1, 31, 32, 255, 256, 4000)
 NUMBERS = (
     0,
@@ -60,7 +62,7 @@ class Control:
     def __init__(self, log: AuditLog) -> None:
         self.log = log
         self.trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
-        self.orders = EvidenceOrders(log, self.trail)
+        self.orders = EvidenceOrders(log, self.trail, NAMES.robot)
         self.policies: dict[int, str] = {}
         self.specifications: dict[int, dict[str, str]] = {}
         self.begun = wall_ns()
@@ -137,7 +139,7 @@ class Control:
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
         """Write a bundle to a file and return its path."""
         span = TimeSpan(self.begun if since is None else since, wall_ns() + 1 if until is None else until)
-        place.write_bytes(b"".join(export(self.log.path, span, self.ask)))
+        place.write_bytes(b"".join(export(self.log.path, span, self.ask, NAMES)))
         return place
 
 

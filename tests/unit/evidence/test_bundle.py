@@ -40,7 +40,7 @@ from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import make_old, retain
-from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
+from tests.unit.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control
 
 Members = dict[str, bytes]
 
@@ -139,6 +139,10 @@ def test_it_has_the_events_and_the_rules_in_force(bundle: Path, control: Control
     assert [record["event"] for record in records[:2]] == ["policy loaded", "specifications loaded"]
     page = found["index.html"].decode()
     assert "\x1b" not in page
+    assert "<th>robot<td>arm-3" in page
+    assert f"<td>tablet ({decisions[1]['host']})<td>" in page
+    [proof] = found["proof.json"].splitlines()
+    assert json.loads(json.loads(proof)["detail"])["robot"] == "arm-3"
     assert page.count('<tr class="deny">') == sum(record["decision"] == "deny" for record in decisions[1:])
 
 
@@ -558,7 +562,7 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
     kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(RecordedTopic, topic="/scan")])
     control.work(2)
     place = tmp_path / "incident.zip"
-    place.write_bytes(b"".join(export(control.log.path, kept, control.ask)))
+    place.write_bytes(b"".join(export(control.log.path, kept, control.ask, NAMES)))
     members = members_of(place)
     assert members["recording/recording.bag"] == bag
     assert "&lt;b&gt;\\x1b" in members["index.html"].decode()
@@ -571,9 +575,9 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
     assert record.record.detail["recording"] == kept.id
     (tmp_path / kept.id / "recording.bag").unlink()
     with pytest.raises(BundleError, match=r"recording\.bag: No such file"):
-        export(control.log.path, kept, control.ask)
+        export(control.log.path, kept, control.ask, NAMES)
     with pytest.raises(BundleError, match="no such"):
-        export(control.log.path, kept._replace(id="../audit"), control.ask)
+        export(control.log.path, kept._replace(id="../audit"), control.ask, NAMES)
 
 
 @pytest.mark.nightly
@@ -666,10 +670,10 @@ def test_empty_and_too_large_time_spans_are_rejected(
 ) -> None:
     """The error is a sentence, and no export is recorded."""
     with pytest.raises(BundleError, match="no record in that period"):
-        export(control.log.path, TimeSpan(0, 1), control.ask)
+        export(control.log.path, TimeSpan(0, 1), control.ask, NAMES)
     monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
     with pytest.raises(BundleError, match="more than 3 records"):
-        export(control.log.path, TimeSpan(0, wall_ns() + 1), control.ask)
+        export(control.log.path, TimeSpan(0, wall_ns() + 1), control.ask, NAMES)
 
 
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -686,7 +690,7 @@ def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch,
 @pytest.mark.nightly
 def test_a_text_changed_during_the_export_ends_it(control: Control) -> None:
     """If a text changes during the export, the bundle matches its manifest or the export fails."""
-    pieces = export(control.log.path, TimeSpan(control.begun, wall_ns() + 1), control.ask)
+    pieces = export(control.log.path, TimeSpan(control.begun, wall_ns() + 1), control.ask, NAMES)
     control.policies[7] = "[Nodes]\n"
     with pytest.raises(BundleError, match=r"policies/7\.ini changed during the export"):
         list(pieces)
