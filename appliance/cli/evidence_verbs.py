@@ -18,7 +18,6 @@ from appliance.base.timestamps import parse_timestamp
 from appliance.cli import completion
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.connection.admin_client import AdminSocket
-from appliance.cli.connection.host_labels import robot_name
 from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
@@ -82,9 +81,9 @@ def export_evidence(
 
 def _bundle(appliance: Appliance, wanted: str | TimeSpan) -> Iterator[bytes]:
     match appliance.way:
-        case AdminSocket(state=state):
+        case AdminSocket(state=state) as socket:
             asked = RecordingSelection(wanted, state / "recordings") if isinstance(wanted, str) else wanted
-            names = Names(robot_name(state), appliance.host_in_words)
+            names = Names(socket.robot_name(), appliance.host_in_words)
             yield from export(state / "control" / "audit.db", asked, appliance.ask, names)
         case RestWay(client=client):
             path, params = "/v1/evidence", {}

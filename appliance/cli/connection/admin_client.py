@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, StatusWanted, decode
 
 if TYPE_CHECKING:
     from appliance.cli.connection.audit_file import FileLog
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 ADMIN_SOCKET = "admin.sock"
 SECONDS = 60.0
 """Time limit in seconds; longer than control's slowest answers (enrolment through charon, compiling specifications)."""
+QUICK_SECONDS = 2.0
+"""Time limit in seconds for names: an appliance that hangs must not keep an operator from reading the log."""
 _GRACE_SECONDS = 10.0
 UNKNOWN = (
     "the change may have taken effect; if it has not by now, it never will. List recent changes:"
@@ -44,7 +46,15 @@ class AdminSocket:
         """Return the audit log, read from its file even while the appliance is stopped."""
         from appliance.cli.connection.audit_file import FileLog  # noqa: PLC0415  only for the verbs that read it
 
-        return FileLog(self.state)
+        return FileLog(self.state, self.robot_name)
+
+    def robot_name(self) -> str:
+        """Return the name of the robot; empty if it has none, or no appliance is in service."""
+        try:
+            answer = AdminSocket(self.state, QUICK_SECONDS, 0.1).ask(StatusWanted())
+        except NotRunningError:
+            return ""
+        return answer.given().name if answer.ok else ""
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Send one request to the running appliance. Raises `NotRunningError`."""

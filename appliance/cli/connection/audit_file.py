@@ -22,7 +22,6 @@ from appliance.audit.search.search import (
     search,
     show,
 )
-from appliance.cli.connection.host_labels import robot_name
 
 _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]
@@ -31,11 +30,12 @@ Progress = Callable[[int], None]
 class FileLog:
     """The log in the state directory of a running or stopped appliance, or in a copy of the directory.
 
-    All methods raise `LogUnreadableError`.
+    All methods raise `LogUnreadableError`. `robot` returns the name of the robot, empty if it is not known.
     """
 
-    def __init__(self, state: Path) -> None:
+    def __init__(self, state: Path, robot: Callable[[], str] = str) -> None:
         self._state = state
+        self._robot = robot
 
     @property
     def path(self) -> Path:
@@ -64,7 +64,7 @@ class FileLog:
 
     def evidence(self, wanted: Filter) -> Iterator[tuple[int, str]]:
         """Yield the sequence and the NDJSON line of all matching records, oldest first."""
-        found, robot = evidence(self.path, wanted), robot_name(self._state)
+        found, robot = evidence(self.path, wanted), self._robot()
         return ((entry.sequence, evidence_line(entry, chain, robot)) for entry, chain in found)
 
     def follow(self, wanted: Filter, lines: int, *, on: bool) -> Iterator[list[LogEntry]]:

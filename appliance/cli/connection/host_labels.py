@@ -1,4 +1,4 @@
-"""Name hosts and the robot in text for people and in exports, as the running appliance does.
+"""Name hosts in text for people, as the running appliance does.
 
 A stopped appliance, a copy of a log and a standby have no policy in force, so their hosts are shown by address.
 """
@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from appliance.api.routes.named_hosts import HostLabels, host_in_words
-from appliance.channel.admin import PolicyWanted, StatusWanted
-from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
+from appliance.channel.admin import PolicyWanted
+from appliance.cli.connection.admin_client import QUICK_SECONDS, AdminSocket, NotRunningError
 from appliance.policy.host_names import HostInWords, in_words
 
 if TYPE_CHECKING:
     from appliance.cli.connection.rest_orders import RestWay
-
-_SECONDS, _GRACE_SECONDS = 2.0, 0.1  # an appliance that hangs must not keep an operator from reading the log
 
 
 def named_by(way: "AdminSocket | RestWay") -> HostInWords:
@@ -28,18 +26,9 @@ def named_by(way: "AdminSocket | RestWay") -> HostInWords:
     return _named_by_rest(way)
 
 
-def robot_name(state: Path) -> str:
-    """Return the name of the robot; empty if it has none, or no appliance is in service."""
-    try:
-        answer = AdminSocket(state, _SECONDS, _GRACE_SECONDS).ask(StatusWanted())
-    except NotRunningError:
-        return ""
-    return answer.given().name if answer.ok else ""
-
-
 def _named_by_socket(state: Path) -> HostInWords:
     try:
-        answer = AdminSocket(state, _SECONDS, _GRACE_SECONDS).ask(PolicyWanted())
+        answer = AdminSocket(state, QUICK_SECONDS, 0.1).ask(PolicyWanted())
     except NotRunningError:
         return str
     return host_in_words(answer.given() if answer.ok else None)
