@@ -32,14 +32,19 @@ class _Requires:
         return bearer
 
 
-VIEWER = Depends(_Requires("viewer"))
+def requires(least: TokenRole) -> Any:
+    """Return the dependency for a bearer with this role or a higher one."""
+    return Depends(_Requires(least))
+
+
+VIEWER = requires("viewer")
 """Use it in `dependencies=` of a route that requires the role and does not use the bearer."""
 
-OPERATOR = Depends(_Requires("operator"))
+OPERATOR = requires("operator")
 Viewer = Annotated[Bearer, VIEWER]
-Investigator = Annotated[Bearer, Depends(_Requires("investigator"))]
+Investigator = Annotated[Bearer, requires("investigator")]
 Operator = Annotated[Bearer, OPERATOR]
-Admin = Annotated[Bearer, Depends(_Requires("admin"))]
+Admin = Annotated[Bearer, requires("admin")]
 
 
 def reads_contents(bearer: Bearer) -> bool:
@@ -72,14 +77,6 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
     """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
-
-
-LEAST: dict[str, Any] = {
-    "viewer": Viewer,
-    "investigator": Investigator,
-    "operator": Operator,
-    "admin": Admin,
-}
 
 
 def answered(answer: AdminAnswer[A]) -> A:

@@ -193,14 +193,14 @@ class Routes(APIRouter):
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         """Add a handler, and add its name, answer, ETag and body to the contract."""
-        options["operation_id"] = options.get("operation_id") or endpoint.__name__
+        options["operation_id"] = options.get("operation_id") or options.get("name") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
         for hint in hints.values():
             for part in getattr(hint, "__metadata__", ()):
                 if isinstance(getattr(part, "dependency", None), _Body):
                     options["openapi_extra"] = part.dependency.schema()
                     options["responses"] = part.dependency.responses() | (options.get("responses") or {})
-        given = hints.get("return")
+        given = options.get("response_model") or hints.get("return")
         tagged = typing.get_origin(given) is Tagged
         kind = typing.get_args(given)[0] if tagged else given
         if tagged or (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):

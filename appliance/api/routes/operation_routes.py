@@ -10,32 +10,55 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Generic, TypeVar, get_args, get_origin, get_type_hints
 
-from fastapi import Header, Path, Query, Request, Response
-from pydantic import StringConstraints
+from fastapi import Depends, Header, Path, Query, Request, Response
+from pydantic import StringConstraints, create_model
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.etags import etag
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.request_gate import asked_of
-from appliance.api.front.route_roles import LEAST, answered, problem_of
+from appliance.api.front.route_roles import answered, problem_of, requires
 from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.monitor_judgement import refusal
 from appliance.channel.admin import MONITORS, OPERATIONS, A, AdminAnswer, AdminRequest, answer_to
 from appliance.channel.answers.token_answers import may
+from appliance.channel.messages.api import ClientRequest
 from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
 from appliance.channel.rest_operation import Operation, parameter_of, plain
 
 Q = TypeVar("Q", bound=AdminRequest[Any])
-DryRun = Annotated[bool, Query(description="only report the effect; for operators, without If-Match")]
-IfMatch = Annotated[
-    str | None,
-    Header(
-        alias="If-Match",
-        max_length=100,
-        description="The ETag of the state that the change is for, or `*` for any state.",
-    ),
-]
+
+
+async def _if_match(
+    if_match: Annotated[
+        str | None,
+        Header(
+            alias="If-Match",
+            max_length=100,
+            description="The ETag of the state that the change is for, or `*` for any state.",
+        ),
+    ] = None,
+) -> str | None:
+    return if_match
+
+
+async def _dry_run(
+    dry_run: Annotated[
+        bool, Query(description="only report the effect; for operators, without If-Match")
+    ] = False,
+) -> bool:
+    return dry_run
+
+
+async def _none() -> None:
+    return None
+
+
+async def _nothing() -> dict[str, Any]:
+    return {}
+
+
 _CONVERTORS = {"{recording_id}": "{recording_id:recording}"}  # of Starlette
 
 
@@ -85,10 +108,27 @@ def routes(services: Services, answers: Mapping[str, Answer]) -> Routes:
 
 
 def _add(router: Routes, services: Services, operation: Operation, own: Answer | None) -> None:
-    parameters, given = _parameters(operation), _answer_type(operation, own)
+    given = _answer_type(operation, own)
+    least = "operator" if operation.dry_run else operation.role or "viewer"
+    subject = _of_path(operation)
+    sent = body(operation.body, text=operation.text or None) if operation.body is not None else Depends(_none)
+    tag = Depends(_if_match if operation.is_change and operation.of is not None else _none)
+    trial = Depends(_dry_run if operation.dry_run else _none)
+    wanted = _of_query(operation)
 
-    async def endpoint(**received: Any) -> Any:
-        call = _call(services, operation, received)
+    async def endpoint(
+        *,
+        request: Request,
+        of_path: Annotated[dict[str, Any], subject],
+        of_body: Annotated[Any, sent],
+        bearer: Annotated[Bearer, requires(least)],
+        if_match: Annotated[str | None, tag],
+        dry_run: Annotated[bool | None, trial],
+        of_query: Annotated[dict[str, Any], wanted],
+    ) -> Any:
+        _check(operation, bearer, if_match, dry_run=bool(dry_run), given=of_path | of_query)
+        order = _order(bearer.asked or asked_of(request.scope, request.headers, b""), dry_run=bool(dry_run))
+        call = OperationCall(services, operation, bearer, order, of_body, bool(dry_run))
         if own is not None:
             return await own.function(call)
         done = await call.ask(call.order)
@@ -96,17 +136,16 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
             return answer(done, operation.status)
         return tagged(done) if operation.of is not None else done
 
-    endpoint.__name__ = operation.name
-    endpoint.__doc__ = inspect.cleandoc(operation.words)
-    endpoint.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # FastAPI reads it
-    endpoint.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": given}
     path = operation.path
     for name, converted in _CONVERTORS.items():
         path = path.replace(name, converted)
-    options: dict[str, Any] = {"response_class": Response} if given is Response else {}
+    has_model = given is not Response
+    options: dict[str, Any] = {"response_model": given} if has_model else {"response_class": Response}
     router.add_api_route(
         path,
         endpoint,
+        name=operation.name,
+        description=inspect.cleandoc(operation.words),
         methods=[operation.method],
         tags=[operation.tag],
         status_code=operation.status,
@@ -115,24 +154,27 @@ def _add(router: Routes, services: Services, operation: Operation, own: Answer |
     )
 
 
-def _call(services: Services, operation: Operation, received: Mapping[str, Any]) -> OperationCall[Any]:
-    """Return the requested operation. Raises `ProblemError` if the role, `If-Match` or the request is invalid."""
-    bearer, request = received["bearer"], received["request"]
-    dry_run, if_match = received.get("dry_run", False), received.get("if_match")
-    role, reason = operation.least(received, dry_run=dry_run)
+def _check(
+    operation: Operation, bearer: Bearer, if_match: str | None, *, dry_run: bool, given: Mapping[str, Any]
+) -> None:
+    """Raise `ProblemError` if the bearer's role does not permit the operation, or `If-Match` is missing."""
+    role, reason = operation.least(given, dry_run=dry_run)
     if not may(bearer.role, role):
         raise problem_of("forbidden", reason)
     if operation.is_change and operation.of is not None and if_match is None and not dry_run:
         seen = f"the ETag of the {operation.of.what} that you have seen"
         text = f"If-Match is missing: send {seen}, from GET {operation.of.where}"
         raise ProblemError(428, "precondition-required", text)
+
+
+def _order(asked: ClientRequest, *, dry_run: bool) -> AdminRequest[Any]:
+    """Return the order of a request as control understands it. Raises `ProblemError`."""
     try:
-        order = meant(bearer.asked or asked_of(request.scope, request.headers, b""), dry_run=dry_run)
+        return meant(asked, dry_run=dry_run)
     except BadTagError as error:
         raise ProblemError(412, "changed-meanwhile", str(error)) from None
     except NoOrderError as error:
         raise ProblemError(422, "bad-input", str(error)) from None
-    return OperationCall(services, operation, bearer, order, received.get("body"), dry_run)
 
 
 def _answer_type(operation: Operation, own: Answer | None) -> Any:
@@ -144,44 +186,42 @@ def _answer_type(operation: Operation, own: Answer | None) -> Any:
     return Tagged[kind] if operation.of is not None else kind  # type: ignore[valid-type]  # a type at run time
 
 
-def _parameters(operation: Operation) -> list[inspect.Parameter]:
+def _of_path(operation: Operation) -> Any:
+    """Return the dependency for the field in the path, if it has one; a list has one element there."""
+    in_path = [(name, field) for name, field in operation.fields().items() if f"{{{name}}}" in operation.path]
+    if not in_path:
+        return Depends(_nothing)
+    [(name, field)] = in_path
+    kind: Any = get_args(plain(field.type))[0] if get_origin(plain(field.type)) is list else field.type
+    rule = Path(alias=name, **parameter_of(kind).rules)
+
+    async def of_path(subject: Annotated[plain(kind), rule]) -> dict[str, Any]:  # type: ignore[valid-type]  # at run time
+        return {name: subject}
+
+    return Depends(of_path)
+
+
+def _of_query(operation: Operation) -> Any:
+    """Return the dependency for the query of all operations with this method and path."""
     same = [one for one in OPERATIONS if (one.method, one.path) == (operation.method, operation.path)]
-    found: dict[str, tuple[Any, Any]] = {"request": (Request, inspect.Parameter.empty)}
-    for name, field in operation.fields().items():
-        if f"{{{name}}}" in operation.path:
-            kind, rules = _of_path(field.type)
-            found[name] = (Annotated[kind, Path(**rules)], inspect.Parameter.empty)
-    if operation.body is not None:
-        kind = Annotated[operation.body, body(operation.body, text=operation.text or None)]
-        found["body"] = (kind, inspect.Parameter.empty)
-    found["bearer"] = (
-        LEAST["operator" if operation.dry_run else operation.role or ""],
-        inspect.Parameter.empty,
-    )
-    if operation.is_change and operation.of is not None:
-        found["if_match"] = (IfMatch, None)
-    if operation.dry_run:
-        found["dry_run"] = (DryRun, False)
-    for one in same:
-        for wanted in one.query:
-            name, field = next((name, field) for name, field in one.fields().items() if field.name == wanted)
-            default = inspect.Parameter.empty if field.required else field.default
-            found[name] = (_of_query(field.type), default)
-    return [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=kind, default=default)
-        for name, (kind, default) in found.items()
-    ]
+    fields: dict[str, Any] = {
+        name: (_in_query(field.type), ... if field.required else field.default)
+        for one in same
+        for wanted in one.query
+        for name, field in one.fields().items()
+        if field.name == wanted
+    }
+    if not fields:
+        return Depends(_nothing)
+    model: Any = create_model(operation.name, **fields)
+
+    async def of_query(query: Annotated[model, Query()]) -> dict[str, Any]:
+        return {**vars(query)}
+
+    return Depends(of_query)
 
 
-def _of_path(kind: Any) -> tuple[Any, Mapping[str, Any]]:
-    """Return the type and the bounds of a field in a path; for a list, those of its only element."""
-    base = plain(kind)
-    if get_origin(base) is list:
-        (kind,) = get_args(base)
-    return plain(kind), parameter_of(kind).rules
-
-
-def _of_query(kind: Any) -> Any:
+def _in_query(kind: Any) -> Any:
     base = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     if get_origin(base) is list:
         (element,) = get_args(base)
