@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from rosmop.check import cursors, members, order
+from rosmop.check import cursors, event_ages, members, order
 from rosmop.check.assignables import Value, path, root
 from rosmop.check.assignments import require_place, store
 from rosmop.check.conversion import condition, convert, number
@@ -62,6 +62,8 @@ def _named(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ..
 
 def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value | None:
     """Compile a call of a predefined function; return None for any other name."""
+    if len(parts) == 1 and parts[0] in event_ages.FUNCTIONS:
+        return event_ages.age_or_seen(scope, node, parts[0])
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
@@ -90,7 +92,15 @@ def _unknown(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, 
             node.position,
             f"{shown(name)} is a function of {owners[0]}; functions belong to their specification",
         )
-    known = [*scope.names.functions, *LIBRARY, "printf", "ROS_INFO", "ROS_WARN", "ROS_ERROR"]
+    known = [
+        *scope.names.functions,
+        *LIBRARY,
+        *event_ages.FUNCTIONS,
+        "printf",
+        "ROS_INFO",
+        "ROS_WARN",
+        "ROS_ERROR",
+    ]
     hint = nearest(parts[-1], known)
     return SpecificationError.at(
         node.position, f"unknown function {shown(name)}{hint if 'mean' in hint else ''}"

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from rosmop.check.assignables import Variable
 from rosmop.check.conversion import condition, refusal
+from rosmop.check.event_ages import note_age
 from rosmop.check.locate import type_of_path
 from rosmop.check.message_fields import PatternField, check_overlaps, read_fields, writes
 from rosmop.check.scope import CompilationContext, FunctionScope, SpecificationNames
@@ -44,7 +45,7 @@ def compile_event(
     scope.message_type = kind
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    happens = _assemble(scope, event, bound, *_body(scope, event, trigger))
+    happens, is_aged = _assemble(scope, event, bound, *_body(scope, event, trigger))
     whole = scope.function(function, ("m",), happens=happens)
     shared.define(whole)
     service = trigger.type if trigger.part is not None else None
@@ -59,7 +60,7 @@ def compile_event(
         binds=binds(names, event),
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
-        plain=not event.action.statements and trigger.when is None,
+        plain=not event.action.statements and trigger.when is None and not is_aged,
         acts=acts(whole, shared),
     )
 
@@ -276,8 +277,11 @@ def _assemble(
     bound: list[PatternField],
     conditions: list[nodes.Statement],
     action: list[nodes.Statement],
-) -> int:
-    """Write all statements of the function; return the number of statements before the action."""
+) -> tuple[int, bool]:
+    """Write all statements of the function.
+
+    Return the number of statements before the action, and whether the event's age is used.
+    """
     site = scope.lines.site = scope.site(event)
     read_fields(scope, bound)
     written = [field for field in bound if field.variable is not None and field.variable.assigned]
@@ -291,5 +295,6 @@ def _assemble(
     before = len(scope.lines.found)
     scope.lines.found += action
     scope.add(nodes.WriteBack(site, fields, scope.temporary("w")))
+    is_aged = note_age(scope, event.name)
     scope.add(nodes.Leave(site, True))
-    return before
+    return before, is_aged

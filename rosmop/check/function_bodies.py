@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Set
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
+from rosmop.check.event_ages import NEVER, ages_of
 from rosmop.check.loops import charge
 from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
 from rosmop.check.slicing import check_own
@@ -117,6 +118,9 @@ def _constants(
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
         scope.evaluate(nodes.Assign(parameter.type, parameter.code, nodes.Zero(parameter.type)))
+    for variable in ages_of(names):
+        scope.written.add(variable.code)
+        scope.evaluate(nodes.Assign(variable.type, variable.code, NEVER))
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)

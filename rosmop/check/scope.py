@@ -64,6 +64,8 @@ class SpecificationNames:
     """The parameters of the specification, in order; they are also variables."""
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions with rejected declarations; using them is not reported again."""
+    events: list[str] = field(default_factory=list)
+    """The events with a message."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
@@ -257,7 +259,7 @@ class FunctionScope:
         if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())
         known = [local for block in self._blocks for local in block]
-        known += [*self.names.variables, *self.names.functions]
+        known += [*filter(str.isidentifier, self.names.variables), *self.names.functions]
         advice = instead(name.split("::"))
         hint = f"; {advice}" if advice else nearest(name, known)
         return SpecificationError.at(position, f"unknown {what} {shown(name)}{hint}")

@@ -8,6 +8,7 @@ from functools import partial
 from typing import TypeVar
 
 from rosmop.check.enforcement import blocking_refused, enforcement, topics_of_remedy, with_remedy
+from rosmop.check.event_ages import declare_ages
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
 from rosmop.check.function_bodies import (
@@ -101,6 +102,7 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
     declare_parameters(shared, names, specification)
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
+    declare_ages(shared, names, specification)
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
     if MOST_BYTES < size <= MAX_BYTES:
         text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"
@@ -141,7 +143,11 @@ def _same_names(specifications: Sequence[SpecificationNames]) -> Iterator[Diagno
     for first, second in sorted(pairs):
         other, names = specifications[first], specifications[second]
         for name, variable in names.variables.items():
-            if name in other.variables and not (variable.sliced or other.variables[name].sliced):
+            if (
+                name.isidentifier()
+                and name in other.variables
+                and not (variable.sliced or other.variables[name].sliced)
+            ):
                 text = f"{shown(name)} is also a variable of {other.name}; each has its own"
                 yield Diagnostic(variable.position, "warning", text)
 

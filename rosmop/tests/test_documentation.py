@@ -29,7 +29,7 @@ def test_the_example_loads() -> None:
 def test_the_example_of_a_property_loads() -> None:
     """Each example property of the page is valid."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
-    text = CODE[1]
+    text = CODE[2]
     assert load(f"s() {{ {events} {text} }}").monitors[0].properties
 
 
@@ -44,7 +44,14 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
 
 
 @pytest.mark.parametrize(
-    "text", [CODE[0], in_specification(CODE[1]), CODE[2], in_specification(HELPER, "v = half(v);")]
+    "text",
+    [
+        CODE[0],
+        f"s() {{ {CODE[1]} }}",
+        in_specification(CODE[2]),
+        CODE[3],
+        in_specification(HELPER, "v = half(v);"),
+    ],
 )
 def test_every_sample_is_loaded_as_a_relay_loads_it(text: str) -> None:
     """The samples are not only checked: their modules are built and loaded."""

@@ -1,0 +1,77 @@
+"""`age` and `seen`, compared with a naive account of the same messages."""
+
+from math import inf
+from random import Random
+
+import pytest
+
+from rosmop.check.sources import compiled_from
+from rosmop.fast.build import require_loadable
+from rosmop.fast.serialization import encoded
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import message
+from rosmop.tests.both_ways import BothWays, plain, state_of
+from rosmop.tests.examples import examples
+from rosmop.tests.on_module import on_module
+from rosmop.tests.random_specifications import definitions
+
+TEXT = """s() { double own = 0; double other = 0; bool ever = false;
+    event a(int c) /plain own/Plain '{count:c}' when (c > 0) {
+        own = age(a); other = age(b); ever = seen(a);
+        if (c == 1) { return; } if (c == 2) { DROP; } if (c == 3) { c = 1 / (c - 3); } }
+    event b(int c) /plain own/Plain '{count:c}' when (c < 5) { } }"""
+
+
+@pytest.mark.parametrize("seed", range(examples(60)))
+def test_ages_are_those_of_a_naive_account(seed: int) -> None:
+    """An event counts if its `when` holds and its action neither drops the message nor faults."""
+    both, random = BothWays(TEXT), Random(seed)  # noqa: S311  draws examples, not keys
+    last, time = {"a": -inf, "b": -inf}, 1 << 60
+    for _ in range(40):
+        time += random.choice((-5, 0, 1, 10**8, 3 * 10**9, 10**17))
+        count = random.randrange(8)
+        expected = {name: (time - then) / 1e9 if -inf < then <= time else inf for name, then in last.items()}
+        both.check([plain(count)], time=time)
+        if count > 0:
+            values = [both.interpreter.value("s", name) for name in ("own", "other", "ever")]
+            assert values == [expected["a"], expected["b"], last["a"] > -inf]
+        if count > 3:
+            last["a"] = time
+        if count in {0, 4}:
+            last["b"] = time
+    assert both.came["together"]
+
+
+def test_an_age_outlives_the_process() -> None:
+    """The time is part of the saved state, also if the module has it."""
+    sets = [on_module(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)]
+    sets[0].start(0)
+    [group] = sets[0].kept_groups()
+    sets[0].judge("/plain", plain(7), 3)
+    base = group.base()
+    sets[0].judge("/plain", plain(7), 5)
+    assert group.cells()
+    sets[1].recover([(group.names, group.layout, base, group.cells())], {}, 9)
+    sets[1].judge("/plain", plain(7), 9)
+    assert sets[1].value("s", "own") == 4e-9
+    assert state_of(sets[1])[-2:] == ["age(a) 9", "age(b) -1"]
+
+
+def test_each_slice_has_ages_of_its_own() -> None:
+    """A parametric specification knows when the event happened with the binding."""
+    text = """s(int c) { event a(int c) /t std_msgs/Int32 '{data:c}' { }
+        event b(int c) /u std_msgs/Int32 '{data:c}' { ROS_INFO("%g", age(a)); } }"""
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
+    monitors.start(0)
+    said = []
+    for time, topic, number in ((1, "/t", 1), (2, "/t", 2), (4, "/u", 1), (5, "/u", 2), (6, "/u", 3)):
+        outcome = monitors.process(topic, message("std_msgs/Int32", data=number), time * 10**9)
+        said += [line.text for line in outcome.log]
+    assert said == ["3", "3", "inf"]
+
+
+def test_equal_texts_with_ages_give_equal_sets() -> None:
+    """The bytes of a compiled set identify it."""
+    data = {encoded(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)}
+    [one] = data
+    require_loadable(one)
