@@ -1,0 +1,127 @@
+"""TCP with one source address, and the tasks and errors of a node.
+
+Every connection of a node leaves from its source address, and its servers listen only there, so that a peer can
+identify the node by its address. Tests replace `SourceNetwork` by a network in memory.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import Any, Protocol
+
+from roswire.errors import RosError
+
+BUFFER_BYTES = 1 << 19
+"""The number of received bytes at which a connection stops reading is twice this number."""
+
+
+class NodeCallError(RosError):
+    """A call of the master, a node or a service without a usable result; the text says which and why."""
+
+
+class PeerUnreachableError(NodeCallError):
+    """The peer cannot be reached, broke off the connection, or did not answer in time."""
+
+
+class MasterDenialError(NodeCallError):
+    """The master answered that the call failed; the text is the master's."""
+
+
+class ServiceFailedError(NodeCallError):
+    """The service answered that the call failed; the text is the service's."""
+
+
+class ByteWriter(Protocol):
+    """The part of `asyncio.StreamWriter` that a node uses."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes, after all earlier ones."""
+
+    async def drain(self) -> None:
+        """Wait until the peer has room for more. Raises `OSError` if the connection has ended."""
+
+    def close(self) -> None:
+        """End the connection."""
+
+
+Serve = Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]]
+
+
+class ListeningServer(Protocol):
+    """A server at a port of the source address."""
+
+    @property
+    def port(self) -> int:
+        """Return the port."""
+
+    def close(self) -> None:
+        """Accept no further connection."""
+
+
+class NodeNetwork(Protocol):
+    """A network as a node uses it, from one source address."""
+
+    @property
+    def source(self) -> str:
+        """Return the source address."""
+
+    async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
+        """Return a new connection. Raises `OSError`."""
+
+    async def serve(self, serve: Serve) -> ListeningServer:
+        """Call `serve` for each connection to a free port. Raises `OSError`."""
+
+
+class SourceNetwork:
+    """The network of this machine, from one of its addresses."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+
+    async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
+        """Return a new connection. Raises `OSError`."""
+        return await asyncio.open_connection(host, port, local_addr=(self.source, 0), limit=BUFFER_BYTES)
+
+    async def serve(self, serve: Serve) -> ListeningServer:
+        """Call `serve` for each connection to a free port. Raises `OSError`."""
+        server = await asyncio.start_server(serve, self.source, 0, limit=BUFFER_BYTES)
+        return _AsyncioServer(server)
+
+
+class _AsyncioServer:
+    def __init__(self, server: asyncio.Server) -> None:
+        self._server = server
+        self.port = int(server.sockets[0].getsockname()[1])
+
+    def close(self) -> None:
+        self._server.close()
+
+
+class OwnedTasks:
+    """Tasks that end with their owner."""
+
+    def __init__(self) -> None:
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    def __len__(self) -> int:
+        return len(self._tasks)
+
+    def start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Start a task."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def own_current(self) -> None:
+        """Own the task that calls this."""
+        task = asyncio.current_task()
+        if task is not None:
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def close(self) -> None:
+        """Cancel all tasks, and return when they have ended."""
+        tasks = [task for task in self._tasks if task is not asyncio.current_task()]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

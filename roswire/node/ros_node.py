@@ -1,0 +1,265 @@
+"""The node: registers with the master, serves its API, and owns its topics and services.
+
+Invariants:
+
+1. A topic or service is in the tables of the node from before its registration until after the end of it, so that a
+   call of the master about it always finds it.
+2. Registrations of one name happen one after another.
+3. After `close`, the node has no task and no connection.
+"""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Awaitable, Callable
+from typing import Literal
+from weakref import WeakValueDictionary
+
+from roswire.errors import InvalidUriError, ProtocolError, RosError
+from roswire.node.network import (
+    ByteWriter,
+    ListeningServer,
+    MasterDenialError,
+    NodeNetwork,
+    OwnedTasks,
+)
+from roswire.node.node_api import NodeApi
+from roswire.node.services import ServiceServer, ServiceType, call_service, probe_service
+from roswire.node.tcpros_streams import ANY_TYPE, MessageType, NodeLimits, read_header, refuse
+from roswire.node.topics import NodeLink, NodePublication, NodeSubscription, Received
+from roswire.node.xmlrpc_http import call_xmlrpc, serve_xmlrpc
+from roswire.uris import NodeUri, node_uri, parse_node_uri, parse_service_uri, service_uri
+from roswire.xmlrpc import Value
+
+_CLOSE_SECONDS = 2.0  # for all unregistrations together
+_Kind = Literal["publisher", "subscriber", "service"]
+
+
+class RosNode:
+    """A node with the canonical name `name`, registered with the master at the URI `master`.
+
+    `shut_down` is called with the reason if the master ends the node, for example because another node has its name.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        master: str,
+        network: NodeNetwork,
+        *,
+        limits: NodeLimits,
+        shut_down: Callable[[str], None],
+    ) -> None:
+        self.name = name
+        self.publishers: dict[str, NodePublication] = {}
+        self.subscribers: dict[str, NodeSubscription] = {}
+        self.services: dict[str, ServiceServer] = {}
+        self._master: NodeUri = parse_node_uri(master)
+        self._network = network
+        self._limits = limits
+        self._link = NodeLink(name, network, limits)
+        self._api = NodeApi(self, master, os.getpid(), shut_down)
+        self._tasks = OwnedTasks()
+        self._servers: list[ListeningServer] = []
+        self._uri = ""
+        self._locks: WeakValueDictionary[tuple[_Kind, str], asyncio.Lock] = WeakValueDictionary()
+
+    async def start(self) -> None:
+        """Listen for other nodes. Raises `OSError` if the source address cannot be used."""
+        for serve in (self._serve_api, self._serve_tcpros):
+            self._servers.append(await self._network.serve(serve))
+        self._uri = node_uri(self._network.source, self._servers[0].port)
+
+    @property
+    def uri(self) -> str:
+        """Return the URI of the node API."""
+        return self._uri
+
+    @property
+    def tcpros(self) -> tuple[str, int]:
+        """Return the address of the topics and services."""
+        return self._network.source, self._servers[1].port
+
+    async def close(self) -> None:
+        """Unregister everything, as far as the master answers soon, and end all connections."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLOSE_SECONDS):
+                await self._unregister_all()
+        for publisher in self.publishers.values():
+            await publisher.close()
+        for subscriber in self.subscribers.values():
+            await subscriber.close()
+        for server in self._servers:
+            server.close()
+        await self._tasks.close()
+
+    async def _unregister_all(self) -> None:
+        for service in [*self.services]:
+            await self.withdraw(service)
+        for topic in [*self.subscribers]:
+            await self.unsubscribe(topic)
+        for topic in [*self.publishers]:
+            await self.unadvertise(topic)
+
+    # --- the master ---
+
+    async def master(self, method: str, *params: Value) -> Value:
+        """Call a method of the Master API, and return its value.
+
+        Raises `MasterDenialError` with the master's reason, or another `RosError`.
+        """
+        answer = await call_xmlrpc(
+            self._network, self._master, method, (self.name, *params), seconds=self._limits.call_seconds
+        )
+        match answer:
+            case [1, str(), value]:
+                return value
+            case [int(), str(text), _]:
+                raise MasterDenialError(text[:4000])
+        raise ProtocolError(f"the master gave no valid answer to {method}")
+
+    # --- topics ---
+
+    async def subscribe(
+        self, topic: str, received: Received, wanted: MessageType = ANY_TYPE
+    ) -> NodeSubscription:
+        """Subscribe to a topic; `received` is called for each message.
+
+        Raises ValueError if the node already has a subscription, and `RosError` if the master denies it.
+        """
+        async with self._lock("subscriber", topic):
+            if topic in self.subscribers:
+                raise ValueError(f"{self.name} already subscribes to {topic}")
+            subscriber = self.subscribers[topic] = NodeSubscription(self._link, topic, wanted, received)
+            try:
+                uris = await self.master("registerSubscriber", topic, wanted.name, self._uri)
+            except BaseException:
+                await self.subscribers.pop(topic).close()
+                raise
+            if not subscriber.updates:  # else an update, which is newer, overtook the answer
+                subscriber.update(
+                    [uri for uri in uris if isinstance(uri, str)] if isinstance(uris, list) else []
+                )
+            return subscriber
+
+    async def unsubscribe(self, topic: str) -> None:
+        """End a subscription, if there is one."""
+        async with self._lock("subscriber", topic):
+            if topic in self.subscribers:
+                await self._forget("unregisterSubscriber", topic, self._uri)
+                await self.subscribers.pop(topic).close()
+
+    async def advertise(self, topic: str, kind: MessageType, *, latched: bool, queue: int) -> NodePublication:
+        """Advertise a topic; `queue` is the number of messages that may wait for each subscriber.
+
+        Raises ValueError if the node already publishes it, and `RosError` if the master denies it.
+        """
+        async with self._lock("publisher", topic):
+            if topic in self.publishers:
+                raise ValueError(f"{self.name} already publishes {topic}")
+            publisher = NodePublication(self._link, topic, kind, latched=latched, queue=queue)
+            self.publishers[topic] = publisher
+            try:
+                await self.master("registerPublisher", topic, kind.name, self._uri)
+            except BaseException:
+                await self.publishers.pop(topic).close()
+                raise
+            return publisher
+
+    async def unadvertise(self, topic: str) -> None:
+        """End a publication, if there is one."""
+        async with self._lock("publisher", topic):
+            if topic in self.publishers:
+                await self._forget("unregisterPublisher", topic, self._uri)
+                await self.publishers.pop(topic).close()
+
+    # --- services ---
+
+    async def offer(
+        self, service: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
+    ) -> ServiceServer:
+        """Offer a service. Raises ValueError if the node already offers it, and `RosError` if the master denies it."""
+        async with self._lock("service", service):
+            if service in self.services:
+                raise ValueError(f"{self.name} already offers {service}")
+            server = self.services[service] = ServiceServer(self._link, service, kind, answer)
+            try:
+                await self.master("registerService", service, service_uri(*self.tcpros), self._uri)
+            except BaseException:
+                del self.services[service]
+                raise
+            return server
+
+    async def withdraw(self, service: str) -> None:
+        """Offer a service no longer, if it is offered."""
+        async with self._lock("service", service):
+            if service in self.services:
+                await self._forget("unregisterService", service, service_uri(*self.tcpros))
+                del self.services[service]
+
+    async def probe_service(self, service: str) -> dict[str, str]:
+        """Return the header of a service, with its `type` and `md5sum`. Raises `RosError`."""
+        return await probe_service(self._link, service, await self._service_uri(service))
+
+    async def call_service(self, service: str, md5sum: str, request: bytes, seconds: float) -> bytes:
+        """Call a service, and return the serialised response.
+
+        Raises `ServiceFailedError` with the service's reason, or another `RosError`.
+        """
+        uri = await self._service_uri(service)
+        return await call_service(self._link, service, uri, md5sum=md5sum, request=request, seconds=seconds)
+
+    async def _service_uri(self, service: str) -> NodeUri:
+        uri = await self.master("lookupService", service)
+        if not isinstance(uri, str):
+            raise InvalidUriError(f"the master gave no URI of {service}")
+        return parse_service_uri(uri)
+
+    # --- connections of other nodes ---
+
+    async def _serve_api(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        if self._accept(writer):
+            await serve_xmlrpc(reader, writer, self._api.answer)
+
+    async def _serve_tcpros(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        if self._accept(writer):
+            with contextlib.suppress(RosError, OSError):  # the peer broke the protocol or the connection
+                await self._serve_header(reader, writer)
+
+    def _accept(self, writer: ByteWriter) -> bool:
+        """Return whether the node serves a new connection, whose task it then owns."""
+        if len(self._tasks) >= self._limits.connections:
+            writer.close()
+            return False
+        self._tasks.own_current()
+        return True
+
+    async def _serve_header(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        try:
+            header, rest = await read_header(reader, self._limits.header_seconds)
+            if "service" in header:
+                service = self.services.get(header["service"])
+                if service is None:
+                    refuse(writer, f"{self.name} does not offer the service {header['service'][:200]}")
+                else:
+                    await service.serve(reader, writer, header, rest)
+            else:
+                publisher = self.publishers.get(header.get("topic", ""))
+                if publisher is None:
+                    refuse(writer, f"{self.name} does not publish {header.get('topic', '')[:200]}")
+                else:
+                    await publisher.serve(reader, writer, header)
+        finally:
+            writer.close()
+
+    # --- small helpers ---
+
+    def _lock(self, kind: _Kind, name: str) -> asyncio.Lock:
+        lock = self._locks.get((kind, name)) or asyncio.Lock()
+        self._locks[kind, name] = lock
+        return lock
+
+    async def _forget(self, method: str, *params: Value) -> None:
+        """Unregister; a master that is gone has forgotten the registration, or will notice the end of the node."""
+        with contextlib.suppress(RosError):
+            await self.master(method, *params)

@@ -1,0 +1,142 @@
+"""The services of a node: calls of other nodes' services, and services that it offers."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+
+from roswire.definitions import Definitions
+from roswire.errors import PeerError
+from roswire.node.network import ByteWriter, PeerUnreachableError, ServiceFailedError
+from roswire.node.tcpros_streams import ANY, READ_BYTES, exchange_headers, refuse
+from roswire.node.topics import NodeLink
+from roswire.tcpros import (
+    FrameParser,
+    ServiceReplyParser,
+    encode_frame,
+    encode_header,
+    encode_service_error,
+    encode_service_reply,
+)
+from roswire.uris import NodeUri
+
+_MOST_WAITING = 64  # requests of one connection that wait for their answers
+_IDLE_SECONDS = 3600.0  # a persistent connection without a request
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceType:
+    """A service type as connection headers describe it."""
+
+    name: str
+    md5sum: str
+    request: str
+    response: str
+
+    @classmethod
+    def defined(cls, definitions: Definitions, name: str) -> "ServiceType":
+        """Return the type of this name; raises `DefinitionError`."""
+        service = definitions.service(name)
+        return cls(name, definitions.service_md5sum(name), service.request.name, service.response.name)
+
+
+async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
+    """Return the header of a service, which names its type. Raises `RosError`."""
+    fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
+    header, _ = await _connected(link, service, uri, fields, request=b"", seconds=link.limits.call_seconds)
+    return header
+
+
+async def call_service(
+    link: NodeLink, service: str, uri: NodeUri, *, md5sum: str, request: bytes, seconds: float
+) -> bytes:
+    """Call a service with a serialised request, and return the serialised response.
+
+    Raises `ServiceFailedError` with the service's reason, or another `RosError`.
+    """
+    fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
+    _, reply = await _connected(link, service, uri, fields, request=encode_frame(request), seconds=seconds)
+    return reply
+
+
+async def _connected(
+    link: NodeLink, service: str, uri: NodeUri, fields: Mapping[str, str], *, request: bytes, seconds: float
+) -> tuple[dict[str, str], bytes]:
+    """Open a connection to a service; if there is a request, send it and wait for the reply."""
+    try:
+        async with asyncio.timeout(seconds):
+            reader, writer = await link.network.connect(uri.host, uri.port)
+            try:
+                header, rest = await exchange_headers(reader, writer, fields, link.limits.header_seconds)
+                if not request:
+                    return header, b""
+                writer.write(request)
+                await writer.drain()
+                return header, await _reply(link, reader, rest)
+            finally:
+                writer.close()
+    except TimeoutError:
+        raise PeerUnreachableError(f"{service} did not answer within {seconds:g} s") from None
+    except OSError as error:
+        raise PeerUnreachableError(f"{service} cannot be called: {error.strerror or error}") from error
+
+
+async def _reply(link: NodeLink, reader: asyncio.StreamReader, data: bytes) -> bytes:
+    parser = ServiceReplyParser(link.limits.message_bytes)
+    while True:
+        for reply in parser.feed(data):
+            if not reply.ok:
+                raise ServiceFailedError(reply.body[:4000].decode("utf-8", "replace"))
+            return reply.body
+        data = await reader.read(READ_BYTES)
+        if not data:
+            raise ConnectionResetError("the connection ended before the reply")
+
+
+class ServiceServer:
+    """A service that a node offers. `answer` returns the serialised response, or raises `ServiceFailedError`."""
+
+    def __init__(
+        self, link: NodeLink, name: str, kind: ServiceType, answer: Callable[[bytes], Awaitable[bytes]]
+    ) -> None:
+        self.name = name
+        self.type = kind
+        self._link = link
+        self._answer = answer
+
+    async def serve(
+        self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], data: bytes
+    ) -> None:
+        """Serve one client, from its header on; `data` are the bytes after the header."""
+        if header.get("md5sum") not in (ANY, self.type.md5sum):
+            refuse(writer, f"{self.name} has the type {self.type.name} with the md5sum {self.type.md5sum}")
+            return
+        fields = {
+            "callerid": self._link.name,
+            "md5sum": self.type.md5sum,
+            "type": self.type.name,
+            "request_type": self.type.request,
+            "response_type": self.type.response,
+        }
+        writer.write(encode_header(fields))
+        if header.get("probe") == "1":
+            return
+        frames = FrameParser(self._link.limits.message_bytes)
+        while True:
+            requests = frames.feed(data)
+            if len(requests) > _MOST_WAITING:
+                return
+            for request in requests:
+                writer.write(await self._reply(request))
+                await writer.drain()
+                if header.get("persistent") != "1":
+                    return
+            async with asyncio.timeout(_IDLE_SECONDS):
+                data = await reader.read(READ_BYTES)
+            if not data:
+                return
+
+    async def _reply(self, request: bytes) -> bytes:
+        try:
+            return encode_service_reply(await self._answer(request))
+        except (ServiceFailedError, PeerError) as error:
+            return encode_service_error(str(error))

@@ -1,0 +1,81 @@
+"""TCPROS on a node's connections: the exchange of headers, with limits of size and time."""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from roswire.definitions import Definitions
+from roswire.errors import ProtocolError
+from roswire.node.network import ByteWriter
+from roswire.tcpros import HeaderParser, encode_header
+
+ANY = "*"
+"""The md5sum, or the name, of any type."""
+
+READ_BYTES = 1 << 18
+
+
+@dataclass(frozen=True, slots=True)
+class NodeLimits:
+    """Upper bounds for one node; times are in seconds."""
+
+    message_bytes: int = 64 << 20
+    connections: int = 256  # from other nodes, to its topics, services and API
+    publishers: int = 256  # of one topic
+    header_seconds: float = 10.0
+    call_seconds: float = 10.0  # a call of the master or of another node
+    queue_bytes: int = 64 << 20  # that wait for one subscriber
+
+
+@dataclass(frozen=True, slots=True)
+class MessageType:
+    """A message type as connection headers describe it: name, md5sum and full text."""
+
+    name: str
+    md5sum: str
+    definition: str
+
+    @classmethod
+    def defined(cls, definitions: Definitions, name: str) -> "MessageType":
+        """Return the type of this name; raises `DefinitionError`."""
+        return cls(name, definitions.md5sum(name), definitions.full_text(name))
+
+
+ANY_TYPE = MessageType(ANY, ANY, "")
+"""The type of a subscriber that accepts every type."""
+
+
+async def read_header(reader: asyncio.StreamReader, seconds: float) -> tuple[dict[str, str], bytes]:
+    """Return the peer's header, and the bytes that followed it.
+
+    Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes.
+    """
+    parser = HeaderParser()
+    async with asyncio.timeout(seconds):
+        while True:
+            data = await reader.read(READ_BYTES)
+            if not data:
+                raise ConnectionResetError("the connection ended before its header was complete")
+            fields = parser.feed(data)
+            if fields is not None:
+                return fields, parser.rest
+
+
+async def exchange_headers(
+    reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
+) -> tuple[dict[str, str], bytes]:
+    """Send a header, and return the answer and the bytes that followed it.
+
+    Raises `ProtocolError` with the peer's reason if it rejects the connection, or `OSError`.
+    """
+    writer.write(encode_header(header))
+    answer, rest = await read_header(reader, seconds)
+    if "error" in answer:
+        raise ProtocolError(f"the peer rejected the connection: {answer['error'][:1000]}")
+    return answer, rest
+
+
+def refuse(writer: ByteWriter, reason: str) -> None:
+    """Reject a connection with a reason, which the peer's node logs."""
+    writer.write(encode_header({"error": reason}))
+    writer.close()

@@ -1,0 +1,251 @@
+"""The topics of a node: subscribers that follow their publishers, and publishers with a queue for each subscriber.
+
+A publisher never waits: if a subscriber is slower than its topic, the oldest waiting messages are dropped and counted.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from roswire.errors import ProtocolError, RosError
+from roswire.node.network import ByteWriter, NodeNetwork, OwnedTasks
+from roswire.node.tcpros_streams import (
+    ANY,
+    READ_BYTES,
+    MessageType,
+    NodeLimits,
+    exchange_headers,
+    refuse,
+)
+from roswire.node.xmlrpc_http import CALL_LIMITS, call_xmlrpc
+from roswire.tcpros import FrameParser, encode_frame, encode_header
+from roswire.uris import parse_node_uri
+
+Received = Callable[[bytes, Mapping[str, str]], None]
+"""Takes the bytes of a message, and the connection header of its publisher."""
+
+_FIRST_PAUSE = (
+    0.1  # seconds between two attempts to reach a publisher; the pause doubles up to the second number
+)
+_LONGEST_PAUSE = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class NodeLink:
+    """The name and network of a node, as its topics and services use them."""
+
+    name: str
+    network: NodeNetwork
+    limits: NodeLimits
+
+
+class NodeSubscription:
+    """A subscription of a node: one connection for each publisher, opened again whenever it ends.
+
+    `problems` has the reason for each publisher that cannot be reached.
+    """
+
+    def __init__(self, link: NodeLink, topic: str, wanted: MessageType, received: Received) -> None:
+        self.topic = topic
+        self.wanted = wanted
+        self.problems: dict[str, str] = {}
+        self.connected: dict[str, Mapping[str, str]] = {}  # the header of each publisher that is connected
+        self.updates = 0  # how many lists of publishers came
+        self._link = link
+        self._received = received
+        self._tasks = OwnedTasks()
+        self._followed: dict[str, asyncio.Task[None]] = {}
+
+    def update(self, uris: Sequence[str]) -> None:
+        """Follow exactly the publishers of this list of node API URIs."""
+        self.updates += 1
+        wanted = dict.fromkeys(uris[: self._link.limits.publishers])
+        for uri in [uri for uri in self._followed if uri not in wanted]:
+            self._followed.pop(uri).cancel()
+            self.problems.pop(uri, None)
+        for uri in wanted:
+            if uri not in self._followed:
+                self._followed[uri] = self._tasks.start(self._follow(uri))
+
+    async def close(self) -> None:
+        """End all connections."""
+        self._followed.clear()
+        await self._tasks.close()
+
+    async def _follow(self, uri: str) -> None:
+        pause = _FIRST_PAUSE
+        while True:
+            before = asyncio.get_running_loop().time()
+            try:
+                await self._receive(uri)
+            except (RosError, OSError) as error:
+                self.problems[uri] = str(error) or f"{uri} did not answer in time"
+            finally:
+                self.connected.pop(uri, None)
+            if asyncio.get_running_loop().time() - before > _LONGEST_PAUSE:  # it was connected for a while
+                pause = _FIRST_PAUSE
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, _LONGEST_PAUSE)
+
+    async def _receive(self, uri: str) -> None:
+        """Receive messages until the connection ends."""
+        host, port = await self._request_topic(uri)
+        limits = self._link.limits
+        async with asyncio.timeout(limits.call_seconds):
+            reader, writer = await self._link.network.connect(host, port)
+        try:
+            fields = {
+                "callerid": self._link.name,
+                "topic": self.topic,
+                "type": self.wanted.name,
+                "md5sum": self.wanted.md5sum,
+                "message_definition": self.wanted.definition,
+                "tcp_nodelay": "1",
+            }
+            header, data = await exchange_headers(reader, writer, fields, limits.header_seconds)
+            self._check(uri, header)
+            self.connected[uri] = header
+            self.problems.pop(uri, None)
+            frames = FrameParser(limits.message_bytes)
+            while True:
+                for body in frames.feed(data):
+                    self._received(body, header)
+                data = await reader.read(READ_BYTES)
+                if not data:
+                    raise ConnectionResetError(f"{uri} ended the connection")
+        finally:
+            writer.close()
+
+    def _check(self, uri: str, header: Mapping[str, str]) -> None:
+        md5sum = header.get("md5sum", "")
+        if self.wanted.md5sum not in (ANY, md5sum):
+            raise ProtocolError(
+                f"{uri} publishes {header.get('type', '')[:200]} with the md5sum {md5sum[:32]}; "
+                f"{self.wanted.name} has {self.wanted.md5sum}"
+            )
+
+    async def _request_topic(self, uri: str) -> tuple[str, int]:
+        link = self._link
+        answer = await call_xmlrpc(
+            link.network,
+            parse_node_uri(uri),
+            "requestTopic",
+            (link.name, self.topic, [["TCPROS"]]),
+            seconds=link.limits.call_seconds,
+            limits=CALL_LIMITS,
+        )
+        match answer:
+            case [1, str(), ["TCPROS", str(host), int(port)]] if 0 < port < 65536:
+                return host, port
+            case [_, str(text), *_]:
+                raise ProtocolError(f"{uri} does not serve {self.topic}: {text[:300]}")
+        raise ProtocolError(f"{uri} gave no valid answer to requestTopic")
+
+
+class NodePublication:
+    """A publication of a node.
+
+    At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, which `dropped` counts. A
+    latched publisher sends its last message to each new subscriber.
+    """
+
+    def __init__(self, link: NodeLink, topic: str, kind: MessageType, *, latched: bool, queue: int) -> None:
+        if queue < 1:
+            raise ValueError(f"a queue of {queue} messages; give at least 1")
+        self.topic = topic
+        self.type = kind
+        self.latched = latched
+        self.dropped = 0
+        self._link = link
+        self._queue = queue
+        self._last: bytes | None = None
+        self._served: set[_SendQueue] = set()
+        self._tasks = OwnedTasks()
+
+    @property
+    def subscribers(self) -> list[str]:
+        """Return the names of the connected subscribers."""
+        return [one.name for one in self._served]
+
+    def publish(self, body: bytes) -> None:
+        """Send a serialised message to all subscribers."""
+        frame = encode_frame(body)
+        if self.latched:
+            self._last = frame
+        for one in self._served:
+            self.dropped += one.put(frame)
+
+    async def serve(
+        self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
+    ) -> None:
+        """Serve one subscriber, from its header on, until the connection ends."""
+        if header.get("md5sum") not in (ANY, self.type.md5sum):
+            refuse(
+                writer,
+                f"{self.topic} has the type {self.type.name} with the md5sum {self.type.md5sum}; the subscriber "
+                f"wants {header.get('type', '')[:200]} with {header.get('md5sum', '')[:32]}",
+            )
+            return
+        fields = {
+            "callerid": self._link.name,
+            "topic": self.topic,
+            "type": self.type.name,
+            "md5sum": self.type.md5sum,
+            "message_definition": self.type.definition,
+            "latching": str(int(self.latched)),
+        }
+        writer.write(encode_header(fields))
+        queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.limits.queue_bytes)
+        if self._last is not None:
+            queue.put(self._last)
+        self._served.add(queue)
+        sending = self._tasks.start(queue.send_to(writer))
+        try:
+            await reader.read(
+                1
+            )  # a subscriber sends nothing after its header: this is the end of the connection
+        finally:
+            self._served.discard(queue)
+            sending.cancel()
+            writer.close()
+
+    async def close(self) -> None:
+        """Send nothing more."""
+        await self._tasks.close()
+
+
+class _SendQueue:
+    """The messages that wait for one subscriber."""
+
+    def __init__(self, name: str, most: int, most_bytes: int) -> None:
+        self.name = name
+        self._most, self._most_bytes = most, most_bytes
+        self._frames: deque[bytes] = deque()
+        self._bytes = 0
+        self._ready = asyncio.Event()
+
+    def put(self, frame: bytes) -> int:
+        """Add a frame; return how many older ones were dropped for it."""
+        dropped = 0
+        self._frames.append(frame)
+        self._bytes += len(frame)
+        while len(self._frames) > 1 and (len(self._frames) > self._most or self._bytes > self._most_bytes):
+            self._bytes -= len(self._frames.popleft())
+            dropped += 1
+        self._ready.set()
+        return dropped
+
+    async def send_to(self, writer: ByteWriter) -> None:
+        """Send what is added, until the connection ends."""
+        try:
+            while True:
+                await self._ready.wait()
+                self._ready.clear()
+                while self._frames:
+                    frame = self._frames.popleft()
+                    self._bytes -= len(frame)
+                    writer.write(frame)
+                    await writer.drain()
+        except OSError:
+            writer.close()

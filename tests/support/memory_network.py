@@ -1,0 +1,134 @@
+"""A network in memory for nodes in virtual time: connections between addresses, in order, with bounded buffers."""
+
+import asyncio
+from dataclasses import dataclass, field
+
+from roswire.node.network import ByteWriter, Serve
+
+_ROOM = 1 << 16  # bytes after which a reader pauses its peer, twice
+
+
+class MemoryNetwork:
+    """The servers by address and port; `connections` counts those that were made to each."""
+
+    def __init__(self) -> None:
+        self.servers: dict[tuple[str, int], Serve] = {}
+        self.connections: list[tuple[str, tuple[str, int]]] = []  # source, target
+        self._port = 40_000
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._open: list[MemoryWriter] = []
+
+    def at(self, source: str) -> "MemoryHost":
+        """Return the network as a host sees it."""
+        return MemoryHost(self, source)
+
+    def listen(self, host: str, serve: Serve, port: int = 0) -> "MemoryServer":
+        """Serve a port of an address."""
+        self._port += 1
+        server = MemoryServer(self, (host, port or self._port))
+        self.servers[server.address] = serve
+        return server
+
+    def connect(self, source: str, address: tuple[str, int]) -> "tuple[asyncio.StreamReader, MemoryWriter]":
+        """Return a connection. Raises `ConnectionRefusedError`."""
+        if address not in self.servers:
+            raise ConnectionRefusedError(111, "Connection refused")
+        self.connections.append((source, address))
+        near, far = MemoryWriter(address), MemoryWriter(address)
+        near.peer, far.peer = far, near
+        self._open += near, far
+        task = asyncio.ensure_future(self._serve(self.servers[address], far))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return near.reader, near
+
+    async def _serve(self, serve: Serve, end: "MemoryWriter") -> None:
+        await serve(end.reader, end)
+
+    def break_off(self, address: tuple[str, int]) -> None:
+        """End all connections to an address, as its machine does when it is switched off."""
+        for end in self._open:
+            if end.address == address:
+                end.close()
+
+
+@dataclass
+class MemoryHost:
+    """The network from one source address; satisfies `NodeNetwork`."""
+
+    network: MemoryNetwork
+    source: str
+
+    async def connect(self, host: str, port: int) -> tuple[asyncio.StreamReader, ByteWriter]:
+        """Return a connection. Raises `ConnectionRefusedError`."""
+        await asyncio.sleep(0)
+        return self.network.connect(self.source, (host, port))
+
+    async def serve(self, serve: Serve) -> "MemoryServer":
+        """Serve a free port."""
+        return self.network.listen(self.source, serve)
+
+
+@dataclass
+class MemoryServer:
+    """A server of the network."""
+
+    network: MemoryNetwork
+    address: tuple[str, int]
+
+    @property
+    def port(self) -> int:
+        """Return the port."""
+        return self.address[1]
+
+    def close(self) -> None:
+        """Accept no further connection."""
+        self.network.servers.pop(self.address, None)
+
+
+@dataclass(eq=False)
+class MemoryWriter:
+    """One end of a connection: its reader, and itself as writer and as the reader's transport."""
+
+    address: tuple[str, int]
+    closed: bool = False
+    reader: asyncio.StreamReader = field(init=False)
+    peer: "MemoryWriter" = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.reader = asyncio.StreamReader(limit=_ROOM)
+        self.reader.set_transport(self)  # type: ignore[arg-type]  # a reader only pauses and resumes it
+        self._has_room = asyncio.Event()
+        self._has_room.set()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        if not self.closed and not self.peer.closed:
+            self.peer.reader.feed_data(data)
+
+    async def drain(self) -> None:
+        """Wait while the peer does not read."""
+        await self.peer._has_room.wait()
+        if self.closed or self.peer.closed:
+            raise ConnectionResetError("the connection ended")
+
+    def close(self) -> None:
+        """End the connection."""
+        if not self.closed:
+            self.closed = True
+            self._has_room.set()
+            for end in (self, self.peer):
+                if not end.reader.at_eof():
+                    end.reader.feed_eof()
+
+    def pause_reading(self) -> None:
+        """Make the peer wait."""
+        self._has_room.clear()
+
+    def resume_reading(self) -> None:
+        """Let the peer go on."""
+        self._has_room.set()
+
+    def is_closing(self) -> bool:
+        """Return whether this end is closed."""
+        return self.closed

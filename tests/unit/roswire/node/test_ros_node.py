@@ -1,0 +1,387 @@
+"""A node in virtual time: two nodes, a scripted master and peers that break the rules, on a network in memory."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+
+from roswire.errors import ProtocolError
+from roswire.node import (
+    MasterDenialError,
+    MessageType,
+    NodeLimits,
+    PeerUnreachableError,
+    RosNode,
+    ServiceFailedError,
+    ServiceType,
+)
+from roswire.node.xmlrpc_http import call_xmlrpc, serve_xmlrpc
+from roswire.tcpros import HeaderParser, encode_frame, encode_header
+from roswire.uris import parse_node_uri
+from roswire.xmlrpc import MethodCall, Value
+from tests.support.memory_network import MemoryNetwork
+
+pytestmark = pytest.mark.anyio
+STRING = MessageType("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
+SET_BOOL = ServiceType(
+    "std_srvs/SetBool",
+    "09fb03525b03e7ea1fd3992bafd87e16",
+    "std_srvs/SetBoolRequest",
+    "std_srvs/SetBoolResponse",
+)
+MASTER = "http://10.0.0.1:11311/"
+
+
+class ScriptedMaster:
+    """A master that keeps registrations, notifies subscribers, and denies what a test names."""
+
+    def __init__(self, network: MemoryNetwork) -> None:
+        self.network = network
+        self.publishers: dict[str, list[str]] = {}
+        self.subscribers: dict[str, list[str]] = {}
+        self.services: dict[str, str] = {}
+        self.denials: dict[str, str] = {}  # the reason, by method
+        self.before_answer: Callable[[MethodCall], Any] | None = None
+        self.calls: list[str] = []
+        self.server = network.listen(
+            "10.0.0.1", lambda reader, writer: serve_xmlrpc(reader, writer, self.answer), 11311
+        )
+
+    async def answer(self, call: MethodCall) -> Value:
+        self.calls.append(call.method)
+        if self.before_answer is not None:
+            await self.before_answer(call)
+        if call.method in self.denials:
+            return [-1, self.denials[call.method], 0]
+        params: list[Any] = list(call.params)
+        match call.method:
+            case "registerSubscriber":
+                self.subscribers.setdefault(params[1], []).append(params[3])
+                return [1, "", [*self.publishers.get(params[1], [])]]
+            case "registerPublisher":
+                self.publishers.setdefault(params[1], []).append(params[3])
+                await self.notify(params[1])
+            case "unregisterPublisher":
+                self.publishers[params[1]].remove(params[2])
+                await self.notify(params[1])
+            case "unregisterSubscriber":
+                self.subscribers[params[1]].remove(params[2])
+            case "registerService":
+                self.services[params[1]] = params[2]
+            case "unregisterService":
+                del self.services[params[1]]
+            case "lookupService":
+                return (
+                    [1, "", self.services[params[1]]]
+                    if params[1] in self.services
+                    else [-1, "no provider", ""]
+                )
+        return [1, "", 1]
+
+    async def notify(self, topic: str) -> None:
+        for uri in self.subscribers.get(topic, []):
+            await self.call(uri, "publisherUpdate", topic, [*self.publishers[topic]])
+
+    async def call(self, uri: str, method: str, *params: Value) -> Value:
+        return await call_xmlrpc(
+            self.network.at("10.0.0.1"), parse_node_uri(uri), method, ("/master", *params), seconds=5.0
+        )
+
+
+class Nodes:
+    """The network, the master and the nodes of a test."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork()
+        self.master = ScriptedMaster(self.network)
+        self.nodes: list[RosNode] = []
+        self.ends: list[str] = []
+
+    async def node(self, address: str, **limits: Any) -> RosNode:
+        node = RosNode(
+            f"/node_{address.rpartition('.')[2]}",
+            MASTER,
+            self.network.at(address),
+            limits=NodeLimits(**limits),
+            shut_down=self.ends.append,
+        )
+        await node.start()
+        self.nodes.append(node)
+        return node
+
+
+@asynccontextmanager
+async def nodes() -> AsyncIterator[Nodes]:
+    """Yield the world of a test; at its end every node is closed, and no task of a node remains."""
+    before = asyncio.all_tasks()
+    made = Nodes()
+    try:
+        yield made
+    finally:
+        for node in made.nodes:
+            await node.close()
+        await asyncio.sleep(1)
+        left = [task for task in asyncio.all_tasks() - before if not task.done()]
+        assert not left, left
+
+
+async def later(seconds: float = 1.0) -> None:
+    await asyncio.sleep(seconds)
+
+
+async def test_messages_arrive_in_order_with_the_publishers_header() -> None:
+    """A subscriber that registers first or last gets every message, and each connection leaves from its address."""
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        heard: list[tuple[bytes, str]] = []
+        await listener.subscribe("/chatter", lambda body, header: heard.append((body, header["type"])))
+        publisher = await talker.advertise("/chatter", STRING, latched=False, queue=10)
+        await later()
+        for number in range(3):
+            publisher.publish(b"%d" % number)
+        await later()
+        assert heard == [(b"0", "std_msgs/String"), (b"1", "std_msgs/String"), (b"2", "std_msgs/String")]
+        for source, (host, _port) in world.network.connections:
+            assert (source, host) in {
+                ("10.0.0.2", "10.0.0.1"),
+                ("10.0.0.3", "10.0.0.1"),
+                ("10.0.0.3", "10.0.0.2"),
+                ("10.0.0.1", "10.0.0.3"),
+            }
+
+
+async def test_a_latched_message_reaches_a_late_subscriber() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        publisher = await talker.advertise("/map", STRING, latched=True, queue=1)
+        publisher.publish(b"old")
+        publisher.publish(b"new")
+        heard: list[bytes] = []
+        await listener.subscribe("/map", lambda body, _header: heard.append(body))
+        await later()
+        assert heard == [b"new"]
+
+
+async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:
+    """The publisher keeps at most its queue for a subscriber that does not read, and serves others without delay."""
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        heard: list[bytes] = []
+        await listener.subscribe("/image", lambda body, _header: heard.append(body))
+        publisher = await talker.advertise("/image", STRING, latched=False, queue=4)
+        await later()
+        _reader, stuck = world.network.connect("10.0.0.4", talker.tcpros)
+        stuck.write(encode_header({"topic": "/image", "md5sum": "*", "type": "*", "callerid": "/stuck"}))
+        await later()
+        assert sorted(publisher.subscribers) == ["/node_3", "/stuck"]
+        for number in range(20):
+            publisher.publish(bytes([number]) * 50_000)
+            await later(0.1)
+        assert [body[0] for body in heard] == [*range(20)]
+        assert publisher.dropped == 20 - 4 - 3  # three went to the buffer of the connection
+        stuck.close()
+        await later()
+        assert publisher.subscribers == ["/node_3"]
+
+
+async def test_a_subscriber_connects_again_after_the_publisher_breaks_off() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        heard: list[bytes] = []
+        subscriber = await listener.subscribe("/chatter", lambda body, _header: heard.append(body))
+        publisher = await talker.advertise("/chatter", STRING, latched=True, queue=1)
+        publisher.publish(b"once")
+        await later()
+        world.network.break_off(talker.tcpros)
+        await later()
+        assert heard == [b"once", b"once"]
+        assert subscriber.problems == {}
+
+
+async def test_an_unreachable_publisher_is_a_problem_in_words_and_is_tried_ever_less_often() -> None:
+    async with nodes() as world:
+        listener = await world.node("10.0.0.3")
+        world.master.publishers["/chatter"] = ["http://10.0.0.9:1/", "nonsense"]
+        subscriber = await listener.subscribe("/chatter", lambda _body, _header: None)
+        await later(60)
+        assert subscriber.problems["http://10.0.0.9:1/"] == (
+            "http://10.0.0.9:1/ cannot be called: Connection refused"
+        )
+        assert "has no scheme" in subscriber.problems["nonsense"]
+        await world.master.call(listener.uri, "publisherUpdate", "/chatter", [])
+        assert subscriber.problems == {}
+
+
+async def test_an_update_that_overtakes_the_answer_of_the_master_is_kept() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        publisher = await talker.advertise("/chatter", STRING, latched=True, queue=1)
+        publisher.publish(b"heard")
+
+        async def overtake(call: MethodCall) -> None:
+            if call.method == "registerSubscriber":
+                await world.master.call(listener.uri, "publisherUpdate", "/chatter", [talker.uri])
+                world.master.publishers["/chatter"].remove(talker.uri)  # the answer is older than the update
+
+        world.master.before_answer = overtake
+        heard: list[bytes] = []
+        await listener.subscribe("/chatter", lambda body, _header: heard.append(body))
+        await later()
+        assert heard == [b"heard"]
+        world.master.publishers["/chatter"].append(talker.uri)
+
+
+@pytest.mark.parametrize("method", ["registerSubscriber", "registerPublisher", "registerService"])
+async def test_a_denied_registration_has_the_words_of_the_master_and_leaves_nothing(method: str) -> None:
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        world.master.denials[method] = "denied by [Publishers] /chatter (site.ini:14)"
+        with pytest.raises(MasterDenialError, match=r"denied by \[Publishers\] /chatter \(site.ini:14\)"):
+            if method == "registerSubscriber":
+                await node.subscribe("/chatter", lambda _body, _header: None)
+            elif method == "registerPublisher":
+                await node.advertise("/chatter", STRING, latched=False, queue=1)
+            else:
+                await node.offer("/chatter", SET_BOOL, negated)
+        assert not (node.subscribers or node.publishers or node.services)
+
+
+async def negated(request: bytes) -> bytes:
+    if request == b"\x07":
+        raise ServiceFailedError("the arm is blocked")
+    return bytes([1 - request[0]]) + b"\x00\x00\x00\x00"
+
+
+async def test_a_service_answers_or_fails_in_words() -> None:
+    async with nodes() as world:
+        server, client = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        await server.offer("/brake", SET_BOOL, negated)
+        assert (await client.probe_service("/brake"))["type"] == "std_srvs/SetBool"
+        for md5sum in ("*", SET_BOOL.md5sum):
+            assert await client.call_service("/brake", md5sum, b"\x01", 5) == b"\x00\x00\x00\x00\x00"
+        with pytest.raises(ServiceFailedError, match="the arm is blocked"):
+            await client.call_service("/brake", "*", b"\x07", 5)
+        with pytest.raises(ProtocolError, match="has the type std_srvs/SetBool"):
+            await client.call_service("/brake", "0" * 32, b"\x01", 5)
+        await server.withdraw("/brake")
+        with pytest.raises(MasterDenialError, match="no provider"):
+            await client.call_service("/brake", "*", b"\x01", 5)
+
+
+async def test_a_service_that_hangs_ends_after_the_time_limit() -> None:
+    async with nodes() as world:
+        server, client = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        never = asyncio.get_running_loop().create_future()
+
+        async def hang(_request: bytes) -> bytes:
+            return bytes(await never)
+
+        await server.offer("/brake", SET_BOOL, hang)
+        with pytest.raises(PeerUnreachableError, match="/brake did not answer within 3 s"):
+            await client.call_service("/brake", "*", b"\x01", 3)
+
+
+async def test_a_master_that_is_gone_or_silent_is_an_error_in_words_and_close_still_ends() -> None:
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        await node.advertise("/chatter", STRING, latched=False, queue=1)
+        never = asyncio.get_running_loop().create_future()
+
+        async def hang(_call: MethodCall) -> None:
+            await never
+
+        world.master.before_answer = hang
+        with pytest.raises(PeerUnreachableError, match="did not answer registerPublisher within 10 s"):
+            await node.advertise("/other", STRING, latched=False, queue=1)
+        before = asyncio.get_running_loop().time()
+        await node.close()
+        assert asyncio.get_running_loop().time() - before < 3
+        never.cancel()
+        world.master.server.close()
+        with pytest.raises(PeerUnreachableError, match="cannot be called: Connection refused"):
+            await node.master("getPid")
+        await later(200)
+
+
+async def test_the_node_api_answers_the_master_and_other_nodes() -> None:
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        await talker.advertise("/chatter", STRING, latched=False, queue=1)
+        await listener.subscribe("/chatter", lambda _body, _header: None)
+        await later()
+
+        async def ask(node: RosNode, method: str, *params: Value) -> Any:
+            return await world.master.call(node.uri, method, *params)
+
+        assert (await ask(talker, "getPublications"))[2] == [["/chatter", "std_msgs/String"]]
+        assert (await ask(listener, "getSubscriptions"))[2] == [["/chatter", "*"]]
+        assert (await ask(talker, "getBusInfo"))[2] == [[1, "/node_3", "o", "TCPROS", "/chatter", True]]
+        assert (await ask(listener, "getBusInfo"))[2] == [[1, talker.uri, "i", "TCPROS", "/chatter", True]]
+        assert (await ask(talker, "getMasterUri"))[2] == MASTER
+        assert (await ask(talker, "requestTopic", "/chatter", [["UDPROS"]]))[0] == 0
+        assert (await ask(talker, "requestTopic", "/none", [["TCPROS"]]))[0] == 0
+        assert (await ask(talker, "publisherUpdate", "/chatter", []))[0] == 0
+        assert (await ask(talker, "requestTopic", 7))[0] == -1
+        assert (await ask(talker, "shutdown", "another node has this name"))[0] == 1
+        assert world.ends == ["another node has this name"]
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\xff\xff\xff\xff",  # a header of 4 GB
+        b"\x04\x00\x00\x00\x00\x00\x00\x00",  # a field without a name
+        encode_header({"callerid": "/x"}),  # neither topic nor service
+        encode_header({"topic": "/chatter", "md5sum": "0" * 32, "type": "a/B"}),
+        encode_header({"service": "/none", "md5sum": "*"}),
+        encode_header({"service": "/brake", "md5sum": "*", "persistent": "1"}) + b"\xff\xff\xff\xff",
+        encode_header({"service": "/brake", "md5sum": "*", "persistent": "1"}) + encode_frame(b"\x01") * 100,
+        b"",  # silent
+    ],
+)
+async def test_a_peer_that_breaks_the_protocol_is_disconnected(sent: bytes) -> None:
+    """The connection ends within the time limit, with the reason if a header was read, and the node serves on."""
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        await node.advertise("/chatter", STRING, latched=False, queue=1)
+        await node.offer("/brake", SET_BOOL, negated)
+        reader, writer = world.network.connect("10.0.0.9", node.tcpros)
+        writer.write(sent)
+        async with asyncio.timeout(30):
+            answer = await reader.read()
+        if sent.startswith(encode_header({"service": "/none"})[:8]) and b"/none" in sent:
+            assert "does not offer" in (HeaderParser().feed(answer) or {})["error"]
+        assert (await node.probe_service("/brake"))["type"] == "std_srvs/SetBool"
+
+
+async def test_connections_are_bounded() -> None:
+    async with nodes() as world:
+        node = await world.node("10.0.0.2", connections=8)
+        ends = [world.network.connect("10.0.0.9", node.tcpros) for _ in range(20)]
+        await later()
+        assert sum(not reader.at_eof() for reader, _writer in ends) == 8
+        await later(60)  # the silent ones reach the time limit of the header
+        assert all(reader.at_eof() for reader, _writer in ends)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"POST / HTTP/1.1\r\nContent-Length: 99999999\r\n\r\n" + b"x" * 2_000_000,
+        b"\x16\x03\x01",
+        b"POST / HTTP/1.1\r\nContent-Length: 3\r\n\r\nabc",
+        b"",
+    ],
+)
+async def test_a_client_of_the_node_api_that_sends_nonsense_gets_an_end(sent: bytes) -> None:
+    async with nodes() as world:
+        node = await world.node("10.0.0.2")
+        address = parse_node_uri(node.uri)
+        reader, writer = world.network.connect("10.0.0.9", (address.host, address.port))
+        writer.write(sent)
+        async with asyncio.timeout(300):
+            answer = await reader.read()
+        assert answer == b"" or b"<fault>" in answer
