@@ -1,0 +1,112 @@
+"""Decode CBOR frames of clients, within bounds.
+
+cbor2 knows many tags, among them big numbers, dates, regular expressions and references to earlier values. A door needs
+none of them. So a scan of the heads comes first, and accepts only the kinds that JSON also has, byte strings, and the
+typed arrays of RFC 8746. It bounds depth and number of values, which a frame of few bytes could make large.
+"""
+
+import struct
+from typing import Any
+
+import cbor2
+
+from appliance.features.doors.message_reader import MessageValueError
+
+MOST_DEPTH = 70
+"""Nested arrays and objects; messages nest at most 64 levels deep."""
+
+MOST_ITEMS = 50_000
+"""Values of one frame; a typed array is one value."""
+
+_CODES = {
+    64: "B", 65: ">H", 66: ">I", 67: ">Q", 68: "B", 69: "<H", 70: "<I", 71: "<Q", 72: "b", 73: ">h", 74: ">i",
+    75: ">q", 77: "<h", 78: "<i", 79: "<q", 81: ">f", 82: ">d", 85: "<f", 86: "<d",
+}  # fmt: skip
+_BYTE_TAGS = frozenset({64, 68})
+_INTEGERS, _NEGATIVES, _BYTES, _TEXT, _ARRAY, _MAP, _TAG, _OTHER = range(8)
+_OTHERS = frozenset(
+    {20, 21, 22, 23, 25, 26, 27}
+)  # false, true, null, undefined, floats of 16, 32 and 64 bits
+
+
+def decode_cbor(frame: bytes) -> Any:
+    """Return the value of a frame; raises `MessageValueError`.
+
+    Typed arrays become lists, or bytes if their elements are `uint8`.
+    """
+    try:
+        _scan(frame)
+        return cbor2.loads(frame, tag_hook=_typed_array)
+    except (ValueError, cbor2.CBORError) as error:
+        raise MessageValueError(f"not CBOR: {error}") from None
+
+
+def _scan(frame: bytes) -> None:
+    position = items = 0
+    left, is_map = [1], [False]  # of each open array or object: the values that it still has
+    while left:
+        if not left[-1]:
+            left.pop()
+            is_map.pop()
+            continue
+        is_key = is_map[-1] and left[-1] % 2 == 0
+        left[-1] -= 1
+        items += 1
+        start = position
+        major, argument, position = _head(frame, position)
+        if is_key and major != _TEXT:
+            raise MessageValueError(f"a key that is not a text at byte {start}")
+        if major in (_BYTES, _TEXT):
+            position += argument
+        elif major in (_ARRAY, _MAP):
+            left.append(argument * (2 if major == _MAP else 1))
+            is_map.append(major == _MAP)
+        elif major == _TAG:
+            position = _scan_typed_array(frame, position, argument)
+        if position + left[-1] > len(frame):
+            raise MessageValueError(f"not CBOR: the frame ends inside the value at byte {start}")
+        if len(left) > MOST_DEPTH:
+            raise MessageValueError(f"a frame nested deeper than {MOST_DEPTH} levels")
+        if items > MOST_ITEMS:
+            raise MessageValueError(
+                f"a frame of more than {MOST_ITEMS} values; send numbers as a typed array (RFC 8746)"
+            )
+    if position != len(frame):
+        raise MessageValueError(f"{len(frame) - position} bytes after the end of the CBOR value")
+
+
+def _head(frame: bytes, position: int) -> tuple[int, int, int]:
+    """Return the major type and argument of a value, and the position after them."""
+    if position >= len(frame):
+        raise MessageValueError(f"not CBOR: the frame ends at byte {position}")
+    major, short = frame[position] >> 5, frame[position] & 31
+    if short == 31:
+        raise MessageValueError(f"a value of indefinite length at byte {position}; give the length")
+    if 27 < short < 31 or (major == _OTHER and short not in _OTHERS):
+        raise MessageValueError(f"an unknown kind of value at byte {position}")
+    position += 1
+    if short < 24:
+        return major, short, position
+    size = 1 << (short - 24)
+    return major, int.from_bytes(frame[position : position + size], "big"), position + size
+
+
+def _scan_typed_array(frame: bytes, position: int, tag: int) -> int:
+    if tag not in _CODES:
+        raise MessageValueError(f"the CBOR tag {tag}; only typed arrays (RFC 8746) may have tags")
+    major, size, position = _head(frame, position)
+    if major != _BYTES:
+        raise MessageValueError(f"the CBOR tag {tag} of a value that is not a byte string")
+    element = struct.calcsize(_CODES[tag])
+    if size % element:
+        raise MessageValueError(f"a typed array of {size} bytes, with elements of {element} bytes")
+    return position + size
+
+
+def _typed_array(tag: cbor2.CBORTag, _immutable: bool) -> Any:
+    data: bytes = tag.value
+    if tag.tag in _BYTE_TAGS:
+        return data
+    code = _CODES[tag.tag]
+    order = code[0] if code[0] in "<>" else "="
+    return [*struct.unpack(f"{order}{len(data) // struct.calcsize(code)}{code[-1]}", data)]

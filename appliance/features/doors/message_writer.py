@@ -1,0 +1,236 @@
+"""Write plain values as serialised messages.
+
+For each message type, a schema of msgspec is made once. It checks types, ranges and names of fields before anything is
+written, and names the path of the first error. Missing fields are zero. As in rosbridge, a header without a stamp gets
+the present time, and the text `now` stands for the present time.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal, Self
+
+import msgspec
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from appliance.features.doors.message_reader import BYTE_TYPES, TIME_TYPES, MessageValueError
+from roswire.definitions import Definitions
+from roswire.message_text import PRIMITIVES, Field, MessageDefinition
+
+Now = tuple[int, int]
+"""The present time: seconds and nanoseconds since the epoch."""
+
+_Write = Callable[[Any, bytearray, Now], None]
+_LENGTH = struct.Struct("<I")
+_HEADER = "std_msgs/Header"
+
+
+_Int8 = Annotated[int, Meta(ge=-(1 << 7), le=(1 << 7) - 1)]
+_Uint8 = Annotated[int, Meta(ge=0, le=(1 << 8) - 1)]
+_Int32 = Annotated[int, Meta(ge=-(1 << 31), le=(1 << 31) - 1)]
+_Uint32 = Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]
+_SCALARS: dict[str, Any] = {
+    "bool": bool,
+    "string": str,
+    "float32": float,
+    "float64": float,
+    "byte": _Int8,
+    "char": _Uint8,
+    "int8": _Int8,
+    "uint8": _Uint8,
+    "int16": Annotated[int, Meta(ge=-(1 << 15), le=(1 << 15) - 1)],
+    "uint16": Annotated[int, Meta(ge=0, le=(1 << 16) - 1)],
+    "int32": _Int32,
+    "uint32": _Uint32,
+    "int64": Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)],
+    "uint64": Annotated[
+        int, Meta(ge=0)
+    ],  # msgspec has no larger bounds than int64; `struct` checks the other one
+}
+
+
+class _Time(Struct, forbid_unknown_fields=True):
+    secs: _Uint32 | UnsetType = UNSET
+    nsecs: _Uint32 | UnsetType = UNSET
+    sec: _Uint32 | UnsetType = UNSET
+    nanosec: _Uint32 | UnsetType = UNSET
+
+
+class _Duration(Struct, forbid_unknown_fields=True):
+    secs: _Int32 | UnsetType = UNSET
+    nsecs: _Int32 | UnsetType = UNSET
+    sec: _Int32 | UnsetType = UNSET
+    nanosec: _Int32 | UnsetType = UNSET
+
+
+class MessageWriter:
+    """A writer of the messages of one type, each of at most `most_bytes`."""
+
+    def __init__(self, definitions: Definitions, name: str, *, most_bytes: int) -> None:
+        definitions.layout(name)  # raises if a type is missing, contains itself, or is too large
+        self._name = name
+        writers = _Writers(definitions, most_bytes)
+        self._schema, self._write = writers.message(name)
+        self._decoder = msgspec.json.Decoder(self._schema)
+        self.fields = [field.name for field in definitions.message(name).fields]
+
+    def from_json(self, text: bytes | msgspec.Raw, now: Now) -> bytes:
+        """Return the message of a JSON object; raises `MessageValueError` with the path."""
+        return self._written(lambda: self._decoder.decode(text), now)
+
+    def from_values(self, values: object, now: Now) -> bytes:
+        """Return the message of decoded values; raises `MessageValueError` with the path."""
+        return self._written(lambda: msgspec.convert(values, self._schema), now)
+
+    def _written(self, decode: Callable[[], object], now: Now) -> bytes:
+        out = bytearray()
+        try:
+            self._write(decode(), out, now)
+        except (ValueError, RecursionError) as error:  # of msgspec
+            raise MessageValueError(f"{self._name}: {error}") from None
+        except _FieldError as error:
+            raise MessageValueError(f"{self._name}: {error.text} - at `${error.path}`") from None
+        return bytes(out)
+
+
+class _FieldError(Exception):
+    """A value that its schema accepts but that cannot be written; `path` leads to it, as in msgspec's errors."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.text = text
+        self.path = ""
+
+    def inside(self, step: str) -> Self:
+        """Return the error with the path extended by a field or an element around it."""
+        self.path = step + self.path
+        return self
+
+
+class _Writers:
+    """The schema and the writer of each message type, made once."""
+
+    def __init__(self, definitions: Definitions, most_bytes: int) -> None:
+        self._definitions = definitions
+        self._most_bytes = most_bytes
+        self._made: dict[str, tuple[type[Struct], _Write]] = {}
+
+    def message(self, name: str) -> tuple[type[Struct], _Write]:
+        if name not in self._made:
+            self._made[name] = self._message(self._definitions.message(name))
+        return self._made[name]
+
+    def _message(self, message: MessageDefinition) -> tuple[type[Struct], _Write]:
+        parts: list[tuple[str, _Write, int]] = []
+        schema: list[tuple[str, Any, Any]] = []
+        for number, field in enumerate(message.fields):
+            kind, write_field = self._field(field)
+            # Python's keywords may be names of fields, so the schema has names of its own.
+            schema.append((f"f{number}", kind | UnsetType, UNSET))
+            parts.append((field.name, write_field, self._zeros(field)))
+        encoded = {f"f{number}": field.name for number, field in enumerate(message.fields)}
+        struct_type = msgspec.defstruct(
+            message.name.replace("/", "_"), schema, rename=encoded, forbid_unknown_fields=True
+        )
+        stamped = message.name == _HEADER
+
+        def write(value: Any, out: bytearray, now: Now) -> None:
+            for (name, write_part, zeros), given in zip(parts, msgspec.structs.astuple(value), strict=True):
+                try:
+                    if given is UNSET and stamped and name == "stamp":
+                        write_part("now", out, now)
+                    elif given is UNSET:
+                        self._check_room(out, zeros)
+                        out += bytes(zeros)
+                    else:
+                        write_part(given, out, now)
+                except (struct.error, OverflowError):
+                    raise _FieldError("Number out of range").inside(f".{name}") from None
+                except _FieldError as error:
+                    raise error.inside(f".{name}") from None
+
+        return struct_type, write
+
+    def _field(self, field: Field) -> tuple[Any, _Write]:
+        if not field.is_array:
+            return self._element(field.type)
+        if field.type in BYTE_TYPES:
+            return bytes | list[_Uint8], self._counted(field, bytes, 1)
+        kind, write = self._element(field.type)
+        if field.type in PRIMITIVES and field.type not in TIME_TYPES:
+            code, size = PRIMITIVES[field.type]
+            return list[kind], self._counted(  # type: ignore[valid-type]  # a schema that was made
+                field, lambda values: struct.pack(f"<{len(values)}{code}", *values), size
+            )
+        return list[kind], self._elements(field, write)  # type: ignore[valid-type]  # a schema that was made
+
+    def _element(self, kind: str) -> tuple[Any, _Write]:
+        if kind == "string":
+            return str, self._string
+        if kind in TIME_TYPES:
+            return _time(kind)
+        if kind in PRIMITIVES:
+            whole = struct.Struct("<" + PRIMITIVES[kind][0])
+            return _SCALARS[kind], lambda value, out, _now: out.extend(whole.pack(value))
+        return self.message(kind)
+
+    def _string(self, value: str, out: bytearray, _now: Now) -> None:
+        data = value.encode()
+        self._check_room(out, len(data))
+        out += _LENGTH.pack(len(data)) + data
+
+    def _counted(self, field: Field, pack: Callable[[Any], bytes], size: int) -> _Write:
+        def write(values: Sequence[Any], out: bytearray, _now: Now) -> None:
+            self._check_room(out, len(values) * size)
+            _write_count(field, len(values), out)
+            out += pack(values)
+
+        return write
+
+    def _elements(self, field: Field, write_element: _Write) -> _Write:
+        def write(values: Sequence[Any], out: bytearray, now: Now) -> None:
+            _write_count(field, len(values), out)
+            for number, value in enumerate(values):
+                self._check_room(out, 0)
+                try:
+                    write_element(value, out, now)
+                except _FieldError as error:
+                    raise error.inside(f"[{number}]") from None
+
+        return write
+
+    def _check_room(self, out: bytearray, size: int) -> None:
+        if len(out) + size > self._most_bytes:
+            raise _FieldError(f"The message has more than {self._most_bytes} bytes")
+
+    def _zeros(self, field: Field) -> int:
+        """Return the number of bytes of a field that is zero."""
+        if field.is_array and field.length is None:
+            return 4
+        if field.type == "string":
+            size = 4
+        elif field.type in PRIMITIVES:
+            size = PRIMITIVES[field.type][1]
+        else:
+            size = self._definitions.layout(field.type).minimum
+        return size * (1 if field.length is None else field.length)
+
+
+def _time(kind: str) -> tuple[Any, _Write]:
+    whole = struct.Struct("<" + PRIMITIVES[kind][0])
+
+    def write(value: Any, out: bytearray, now: Now) -> None:
+        if value == "now":
+            out += whole.pack(*now)
+            return
+        secs = value.sec if value.secs is UNSET else value.secs
+        nsecs = value.nanosec if value.nsecs is UNSET else value.nsecs
+        out += whole.pack(0 if secs is UNSET else secs, 0 if nsecs is UNSET else nsecs)
+
+    return (_Time | Literal["now"] if kind == "time" else _Duration), write
+
+
+def _write_count(field: Field, count: int, out: bytearray) -> None:
+    if field.length is None:
+        out += _LENGTH.pack(count)
+    elif count != field.length:
+        raise _FieldError(f"Expected {field.notation}, got {count} elements")
