@@ -22,9 +22,9 @@ from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
-from appliance.forwarding.log_forwarder import LogForwarder
-from appliance.forwarding.receiver import StreamReceiver
-from appliance.forwarding.syslog import Formatter
+from appliance.features.syslog.log_forwarder import LogForwarder
+from appliance.features.syslog.receiver import StreamReceiver
+from appliance.features.syslog.syslog import Formatter
 from benchmarks.syslog_sink import Sink
 
 _ROWS: list[tuple[str, str]] = []

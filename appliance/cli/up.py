@@ -110,8 +110,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     run_appliance(
         settings,
         roles_of(
+            sections=settings.sections,
             api=settings.api_address is not None,
-            syslog=settings.audit.syslog.to is not None,
             fleet=settings.fleet.receipt_key is not None,
             bundles=settings.fleet.bundles.root is not None,
             recorder=settings.recorder.enabled,

@@ -28,7 +28,7 @@ from appliance.base.input_files import read_given_text
 from appliance.base.user_errors import UserError
 from appliance.base.validation_messages import must_be, not_yaml
 from appliance.configuration.fleet_membership import FOLDER, SETTINGS, joined_settings
-from appliance.configuration.settings import Settings
+from appliance.configuration.settings import SECTIONS, Settings
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -42,7 +42,12 @@ _SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*+)|PORT|PORT_\d++_.*+|NA
 _PATH_KEYS = (
     ("policy",), ("monitors",), ("state",), ("hosts",),
     ("ipsec", "ca_passphrase_file"),
-    ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
+    *(
+        (*kind.place.split("."), name)
+        for kind in SECTIONS
+        for name, annotation in typing.get_type_hints(kind).items()
+        if Path in (annotation, *typing.get_args(annotation))
+    ),
     ("fleet", "ca"), ("fleet", "certificate"), ("fleet", "key"), ("fleet", "receipt_key"),
     ("fleet", "bundles", "root"),
 )  # fmt: skip

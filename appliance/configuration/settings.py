@@ -4,13 +4,13 @@
 writes the result to `run/config.json` in the state directory for the other processes.
 """
 
-import dataclasses
 import ipaddress
 import os
 import re
+from collections.abc import Callable
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
+from typing import Annotated, Any, Literal
 
 import msgspec
 from pydantic import (
@@ -23,31 +23,38 @@ from pydantic import (
     IPvAnyNetwork,
 )
 
+from appliance.configuration.sections import (
+    HOST_NAME,
+    S,
+    Sections,
+    T,
+    is_loopback,
+    key,
+    section,
+    split_address,
+    split_receiver,
+)
+from appliance.features.table import FEATURES
 from appliance.signing.site_keys import checked_key
 
 _NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}+){1,5}")
 _FLEET_WORD = re.compile(r"[a-z0-9][a-z0-9-]{0,62}")
-_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
 
-T = TypeVar("T")
-
-
-def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
-    """Define a key with a default (or `default_factory`), a description, and rules for pydantic's `Field`."""
-    metadata = {"description": description or None, **rules}
-    if isinstance(default, list):
-        metadata["json_schema_extra"] = {"default": default}
-        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
-    if "default_factory" in metadata:
-        return dataclasses.field(default_factory=metadata.pop("default_factory"), metadata=metadata)
-    return dataclasses.field(default=default, metadata=metadata)
+SECTIONS = tuple(feature.settings for feature in FEATURES if feature.settings is not None)
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
-def _section(cls: type[T]) -> type[T]:
-    """Define a table of keys; unknown keys are rejected."""
-    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads this attribute
-    return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+def with_features(place: str) -> Callable[[type[T]], type[T]]:
+    """Add the sections of features that are below this key; empty: at the top."""
+
+    def extended(cls: type[T]) -> type[T]:
+        for kind in SECTIONS:
+            above, _, name = kind.place.rpartition(".")
+            if above == place:
+                cls.__annotations__[name] = kind
+                setattr(cls, name, kind())
+        return cls
+
+    return extended
 
 
 # pydantic reads the metadata of these types; msgspec and the users of a setting see only the plain type.
@@ -84,38 +91,6 @@ class Unasked(str):
     __slots__ = ()
 
 
-def split_address(text: str) -> tuple[str, int]:
-    """Parse `HOST:PORT` or `[IPv6]:PORT`. Raises `ValueError`."""
-    host, colon, port = text.rpartition(":")
-    if not colon or not port.isascii() or not port.isdigit() or int(port) > 65_535:
-        raise ValueError(
-            f"{text!r} is not HOST:PORT, for example 0.0.0.0:11311 or [::]:11311 (port 0: any free one)"
-        )
-    if host.startswith("[") and host.endswith("]"):
-        return str(ipaddress.IPv6Address(host[1:-1])), int(port)
-    if ":" in host:
-        raise ValueError(f"{text!r}: an IPv6 address is written in brackets, for example [::1]:11311")
-    if not _HOST_NAME.fullmatch(host):
-        raise ValueError(f"{host!r} is not an address of this machine")
-    return host, int(port)
-
-
-def split_receiver(text: str) -> tuple[str, str, int]:
-    """Parse `udp|tcp|tls://ADDRESS:PORT`. Raises `ValueError`."""
-    protocol, slashes, place = text.partition("://")
-    example = "for example tls://10.0.0.9:6514 or udp://[fd00::9]:514"
-    if not slashes or protocol not in ("udp", "tcp", "tls"):
-        raise ValueError(f"{text!r} is not udp://, tcp:// or tls:// with ADDRESS:PORT, {example}")
-    host, port = split_address(place)
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        raise ValueError(f"{host!r} is not an address; names are not looked up, {example}") from None
-    if not port:
-        raise ValueError(f"{text!r}: a receiver cannot have port 0, {example}")
-    return protocol, host, port
-
-
 def split_collector(text: str) -> tuple[str, int]:
     """Parse `https://ADDRESS:PORT`. Raises `ValueError`."""
     protocol, _slashes, place = text.partition("://")
@@ -127,11 +102,6 @@ def split_collector(text: str) -> tuple[str, int]:
 
 def _checked_collector(text: str) -> str:
     split_collector(text)
-    return text
-
-
-def _checked_receiver(text: str) -> str:
-    split_receiver(text)
     return text
 
 
@@ -147,7 +117,7 @@ def _checked_endpoint(text: str | None) -> str | None:
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
-        if _HOST_NAME.fullmatch(text) is None or text.replace(".", "").isdecimal():
+        if HOST_NAME.fullmatch(text) is None or text.replace(".", "").isdecimal():
             raise ValueError(
                 f"{text!r} is neither an address nor a name (no port, no brackets), {example}"
             ) from None
@@ -179,17 +149,7 @@ def _checked_api(text: str) -> str:
     return text if text == "off" else _checked_address(text)
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a configured host is a loopback address, which only this machine reaches."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-@_section
+@section
 class Advertisement:
     """The appliance's address for nodes of one network."""
 
@@ -197,7 +157,7 @@ class Advertisement:
     address: Annotated[str, _ADDRESS, AfterValidator(str)]
 
 
-@_section
+@section
 class LimitsSection:
     """Limits of RVMaster and the proxy endpoints; the defaults exceed the needs of a large robot."""
 
@@ -225,48 +185,8 @@ class LimitsSection:
     )
 
 
-@_section
-class Syslog:
-    """Where the audit log is forwarded to (RFC 5424), in a process of its own; off unless `to` is given."""
-
-    to: Annotated[str, AfterValidator(_checked_receiver)] | None = key(
-        default=None,
-        description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that no name server is needed",
-    )
-    send: Literal["all", "denials"] = key(
-        default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
-    )
-    facility: int = key(default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`")
-    host_name: str | None = key(
-        default=None, description="sender name in messages; default: `name`, or the machine's name"
-    )
-    ca: Path | None = key(
-        default=None,
-        description="authority of the receiver's certificate (PEM); default: those the system trusts",
-    )
-    name: str | None = key(
-        default=None, description="name in the receiver's certificate; default: its address"
-    )
-    certificate: Path | None = key(
-        default=None, description="client certificate, for a receiver that requires one (PEM)"
-    )
-    key: Path | None = key(default=None, description="key of `certificate`; readable by user rosrv-syslog")
-
-    def __post_init__(self) -> None:
-        keys = {"ca": self.ca, "name": self.name, "certificate": self.certificate, "key": self.key}
-        given = [name for name, value in keys.items() if value is not None]
-        if given and (self.to is None or not self.to.startswith("tls://")):
-            raise ValueError(f"{', '.join(given)} would have no effect: only tls:// uses certificates")
-        if (self.certificate is None) != (self.key is None):
-            raise ValueError("certificate and key must be given together")
-
-    @property
-    def destination(self) -> tuple[str, str, int]:
-        """`to` as protocol, address and port; only where it is given."""
-        return split_receiver(self.to or "")
-
-
-@_section
+@section
+@with_features("audit")
 class Audit:
     """The audit log."""
 
@@ -289,10 +209,9 @@ class Audit:
         description="of free disk space: below it, hosts that cause many records are slowed more, so that others"
         " are recorded",
     )
-    syslog: Syslog = Syslog()
 
 
-@_section
+@section
 class LivenessSection:
     """When a node counts as gone; all in seconds."""
 
@@ -303,7 +222,7 @@ class LivenessSection:
     )
 
 
-@_section
+@section
 class Relay:
     """The limits of the relay; each key is a field of `appliance.relay.relay_limits.Limits`."""
 
@@ -324,7 +243,7 @@ class Relay:
     )
 
 
-@_section
+@section
 class RecorderRules:
     """The flight recorder: messages from before and after an incident. Off by default, because it stores contents."""
 
@@ -366,7 +285,7 @@ class RecorderRules:
             raise ValueError(f"longest is {self.longest:g}, but before and after together are longer")
 
 
-@_section
+@section
 class FirewallSection:
     """The firewall around the ROS master (isolation netns and container)."""
 
@@ -389,7 +308,7 @@ def _has_room_for_hosts(pool: IPv4Network) -> IPv4Network:
     return pool
 
 
-@_section
+@section
 class Ipsec:
     """The tunnels of trusted hosts; they are opened when the first host is enrolled."""
 
@@ -431,7 +350,7 @@ def _checked_fleet_word(text: str) -> str:
     return text
 
 
-@_section
+@section
 class Bundles:
     """Policy, specifications and hosts from the fleet's signed bundles; off unless `root` is given."""
 
@@ -458,7 +377,7 @@ class Bundles:
             raise ValueError("root needs site and group: the bundles are signed for one group of one site")
 
 
-@_section
+@section
 class Fleet:
     """A collector of many appliances: it gets the audit log's segments, and gives bundles; off by default.
 
@@ -533,7 +452,7 @@ class Fleet:
         return self.collector, self.ca, self.certificate, self.key, self.name
 
 
-@_section
+@section
 class Availability:
     """Two appliances, of which one takes over from the other; `rosrv standby join` makes them a pair."""
 
@@ -544,7 +463,7 @@ class Availability:
     )
 
 
-@_section
+@section
 class ApiLimits:
     """Limits of the REST interface; beyond them a client gets 429 or 503 with the time to repeat."""
 
@@ -578,7 +497,8 @@ def _mediation_fits(mediation: str, info: Any) -> str:
     return mediation
 
 
-@_section
+@section
+@with_features("")
 class Settings:
     """All settings."""
 
@@ -707,11 +627,13 @@ class Settings:
         return [*self.api_names, *filter(None, [self.name])]
 
     def __post_init__(self) -> None:
-        to, collector = self.audit.syslog.to, self.fleet.collector
-        for name, url, address in (
-            ("audit.syslog.to", to, to and split_receiver(to)[1]),
-            ("fleet.collector", collector, collector and split_collector(collector)[0]),
-        ):
+        collector = self.fleet.collector
+        receivers = [("fleet.collector", collector, collector and split_collector(collector)[0])]
+        for kind in SECTIONS:
+            receivers += [
+                (f"{kind.place}.{name}", *receiver) for name, receiver in self.of(kind).receivers().items()
+            ]
+        for name, url, address in receivers:
             if address and self.isolation == "netns" and is_loopback(address):
                 raise ValueError(
                     f"{name}: {url} is the loopback of the appliance's own namespace (isolation: netns);"
@@ -719,6 +641,19 @@ class Settings:
                 )
         if self.fleet.retention_waits and self.audit.retention_days is None:
             raise ValueError("fleet.retention_waits has no effect without audit.retention_days")
+
+    def of(self, kind: type[S]) -> S:
+        """Return a feature's section."""
+        value: Any = self
+        for name in kind.place.split("."):
+            value = getattr(value, name)
+        assert isinstance(value, kind)  # noqa: S101  `with_features` has added it
+        return value
+
+    @property
+    def sections(self) -> Sections:
+        """Return the sections of all features."""
+        return Sections({kind: self.of(kind) for kind in SECTIONS})
 
     @property
     def listen_address(self) -> tuple[str, int]:

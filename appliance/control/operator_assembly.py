@@ -9,7 +9,7 @@ from appliance.control.assembly.foundation import Current, Foundation
 from appliance.control.bundle_gate import BundleGate
 from appliance.control.bundle_health import RobotHealth
 from appliance.control.evidence_orders import EvidenceOrders
-from appliance.control.forwarder_link import ForwarderLink
+from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
 from appliance.control.operators.block_orders import BlockOrders
@@ -23,6 +23,7 @@ from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
 from appliance.control.standby_orders import StandbyOrders, StandbySource
+from appliance.features.table import FeatureParts
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint
 from appliance.hosts.rest_address import rest_address
@@ -38,7 +39,7 @@ class Operators:
     tokens: TokenOrders
     ends_of_tokens: StoredDeadlines
     clock: ClockCheck
-    forwarded: ForwarderLink
+    features: FeatureParts
     collected: ForwarderLink
     switched_off: SwitchedOffWatch
     blocks: BlockOrders
@@ -74,8 +75,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     rest = Current[RestLink]()
     tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
-    syslog = settings.audit.syslog
-    forwarded = ForwarderLink(syslog.to, syslog.send, trail)
+    features = FeatureParts(settings.sections, trail)
     pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
     collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
@@ -111,7 +111,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         base.policies,
         hosts,
         base.lifeline.surroundings,
-        audit=partial(_audit_state, base, forwarded, collected),
+        audit=partial(_audit_state, base, features, collected),
         clock=clock.state,
         recorder=ends.recordings.state,
         queued_deliveries=lambda: ends.enactor.delivery.waiting,
@@ -161,7 +161,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
         tokens=tokens,
         ends_of_tokens=ends_of_tokens,
         clock=clock,
-        forwarded=forwarded,
+        features=features,
         collected=collected,
         switched_off=switched_off,
         blocks=blocks,
@@ -179,12 +179,12 @@ async def _durable(base: Foundation) -> None:
         await base.replication.stored()
 
 
-def _audit_state(base: Foundation, forwarded: ForwarderLink, collected: ForwarderLink) -> AuditState:
+def _audit_state(base: Foundation, features: FeatureParts, collected: ForwarderLink) -> AuditState:
     return AuditState(
         *base.audit.lag,
         failed=base.audit.failed,
         on_failure=base.settings.audit.on_audit_failure,
         degraded=base.audit.degraded,
-        forwarding=forwarded.status(),
+        forwarding=features.forwarding(),
         collector=collected.status(),
     )

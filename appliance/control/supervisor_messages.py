@@ -83,8 +83,6 @@ class SupervisorMessages:
                 self._operators.rest.attach(self._base.lifeline.api_channel(sock.detach()))
             case "charon":
                 self._base.tunnels.attach(Channel(sock, messages.TunnelLink))
-            case "syslog":
-                self._operators.forwarded.link.attach(Channel(sock, messages.ForwardingLink))
             case "fleet":
                 self._operators.collected.link.attach(Channel(sock, messages.ForwardingLink))
             case "bundles":
@@ -92,8 +90,16 @@ class SupervisorMessages:
             case "recorder":
                 self._parts.endpoints.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:
-                _log.error("a link leads to a process unknown to control", role=role)
-                sock.close()
+                self._feature_link(role, sock)
+
+    def _feature_link(self, role: str, sock: socket.socket) -> None:
+        found = self._operators.features.link(role)
+        if found is None:
+            _log.error("a link leads to a process unknown to control", role=role)
+            sock.close()
+            return
+        link, accepted = found
+        link.attach(Channel(sock, accepted))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
         ends, graph = self._parts.endpoints, self._parts.core.graph

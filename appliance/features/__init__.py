@@ -1,1 +1,1 @@
-"""Features: folders that the core does not know."""
+"""Features: each folder has all that one feature adds, and `table.py` lists them."""

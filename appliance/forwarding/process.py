@@ -1,4 +1,4 @@
-"""Run the forwarder as a process of the appliance: lifeline, link to control, and a thread that forwards.
+"""Run a forwarder of the audit log as a process: lifeline, link to control, and a thread that forwards.
 
 The process runs as a user that may read the audit log and write only the stored position. The firewall lets the process
 reach only the receiver. It outlives control and sends the records that control has committed.
@@ -9,25 +9,14 @@ import contextvars
 import socket
 import threading
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.configuration.settings import Settings, Syslog, load_resolved
-from appliance.forwarding.log_forwarder import LogForwarder
-from appliance.forwarding.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
-from appliance.forwarding.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
 
 _REPORT_SECONDS = 1.0
 _LAST_SECONDS = 1.0
-
-
-def main(lifeline_fd: int, config: Path) -> None:
-    """Forward the log until the supervisor ends the process."""
-    forwarder = make_forwarder(load_resolved(config), Path.cwd() / "position.json")
-    asyncio.run(ForwardingProcess(forwarder, lifeline_fd).run())
 
 
 class Forwarder(Protocol):
@@ -104,34 +93,3 @@ class ProgressReports:
         """Repeat the last report to a new control process, then report the current progress."""
         if self._send(self._told):
             self.tell(progress)
-
-
-def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
-    """Return the forwarder for these settings; they must configure a receiver."""
-    wanted = settings.audit.syslog
-    longest = LONGEST_DATAGRAM if wanted.destination[0] == "udp" else LONGEST_IN_STREAM
-    return LogForwarder(
-        settings.state / "control" / "audit.db",
-        kept,
-        receiver_of(wanted),
-        Formatter(
-            facility=wanted.facility,
-            longest=longest,
-            host_name=wanted.host_name or settings.name or None,
-        ),
-        chosen=wanted.send,
-    )
-
-
-def receiver_of(wanted: Syslog) -> Receiver:
-    """Return the configured receiver."""
-    protocol, host, port = wanted.destination
-    if protocol == "udp":
-        return DatagramReceiver(host, port)
-    context: Callable[[], Any] | None = None
-    if protocol == "tls":
-        # Made for each connection, so that replaced certificate files apply to the next connection.
-        def context() -> Any:
-            return tls_context(wanted.ca, wanted.certificate, wanted.key)
-
-    return StreamReceiver(host, port, context, wanted.name)

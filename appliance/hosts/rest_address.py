@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from appliance.configuration.settings import Settings, is_loopback
+from appliance.configuration.sections import is_loopback
+from appliance.configuration.settings import Settings
 
 NO_TUNNELS = (
     "isolation: none has no tunnels, because without a firewall their addresses can be forged: start the appliance with"

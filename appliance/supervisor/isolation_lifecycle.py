@@ -46,6 +46,7 @@ from appliance.network.namespaces import (
 from appliance.network.probe import probe_port
 from appliance.network.public_address import PublicAddress, only_address
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.role import RemoteReceiver
 from appliance.supervisor.users import account_of
 
 _TUNNELS = "rosrv-ipsec"  # the user of charon
@@ -67,7 +68,7 @@ class AppliancePorts:
     api_networks: tuple[str, ...] = ()  # networks that may connect to REST; this machine always may
     own: int | None = None  # the port of the own node's master
     standby: StandbyAccess | None = None  # on one of two appliances
-    syslog: tuple[str, str, int] | None = None  # protocol, address and port of the audit log's receiver
+    receivers: tuple[tuple[str, RemoteReceiver], ...] = ()  # of features' roles, by user
     collector: tuple[str, int] | None = None  # address and port of the fleet's collector
 
 
@@ -311,8 +312,7 @@ class ContainerIsolation(NoIsolation):
             api_networks=self._api_networks(),
             neighbours=self._neighbours(),
             tunnel_only=(self._tunnels[0],) if self._tunnels else (),
-            forwarder=self._forwarder(),
-            collector_clients=self._collector_clients(),
+            forwarders=(*self._forwarders(), *self._collector_clients()),
             standby=self._ports.standby,
             tunnel_interface=USER_SPACE_INTERFACE
             if self._tunnels and self._tunnels[1] == "user space"
@@ -334,11 +334,17 @@ class ContainerIsolation(NoIsolation):
             for user, name in (("rosrv-fleet", "segments"), ("rosrv-bundles", "bundles"))
         )
 
-    def _forwarder(self) -> ForwarderAccess | None:
-        if self._ports.syslog is None:
-            return None
-        protocol, address, port = self._ports.syslog
-        return ForwarderAccess(account_of("rosrv-syslog").uid, address, port, datagrams=protocol == "udp")
+    def _forwarders(self) -> tuple[ForwarderAccess, ...]:
+        return tuple(
+            ForwarderAccess(
+                account_of(user).uid,
+                receiver.address,
+                receiver.port,
+                datagrams=receiver.protocol == "udp",
+                name=receiver.client,
+            )
+            for user, receiver in self._ports.receivers
+        )
 
 
 class NetnsIsolation(ContainerIsolation):

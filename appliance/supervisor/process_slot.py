@@ -9,7 +9,7 @@ import msgspec
 from appliance.base import clock
 from appliance.supervisor.child_entry import LaunchPlan
 from appliance.supervisor.process_handle import ProcessHandle, program_environment
-from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.sandbox.folders import with_system_files
 from appliance.supervisor.users import account_of
 

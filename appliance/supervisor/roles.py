@@ -5,17 +5,18 @@ lifeline) or an external program (`program`: the command and its environment).
 """
 
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
 from appliance.base.shipped import DPKG
+from appliance.configuration.sections import DEFAULTS, Sections
+from appliance.features.table import FEATURES
 from appliance.standby.membership import LEASE_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
+from appliance.supervisor.role import ExternalProgram, Facts, Role
 from appliance.supervisor.sandbox.folders import executables_of, folders_of
-from appliance.supervisor.sandbox.private_view import PrivateView
 from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, SandboxPlan
 
 ROSMASTER = Path("/usr/bin/rosmaster")
@@ -24,99 +25,6 @@ ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 LEASE_NICE = -10  # as the unit of the witness has
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
-
-
-@dataclass(frozen=True)
-class Facts:
-    """The paths and ports that the rows of the table need; control reports some of them when it is ready."""
-
-    state: Path
-    config: Path
-    rosmaster_port: int
-    rosout_master: str | None = None
-    rosout_ports: range | None = None  # None: the kernel chooses the port
-    ca_passphrase_file: Path | None = None
-    control_reads: tuple[Path, ...] = ()
-    syslog_reads: tuple[Path, ...] = ()
-    syslog_port: int | None = None  # the TCP port of the audit log's receiver
-    fleet_reads: tuple[Path, ...] = ()
-    collector_port: int | None = None
-    view: PrivateView | None = None
-    raised: int = 0  # by which the supervisor has lowered its own niceness; its children inherit this
-
-    def part(self, name: str) -> Path:
-        """Return the part of the state directory with this name."""
-        return self.state / name
-
-    def run(self, name: str) -> Path:
-        """Return a file that the supervisor writes for the other processes."""
-        return self.config.with_name(name)
-
-
-@dataclass(frozen=True)
-class ExternalProgram:
-    """The command of an external program, and its environment besides HOME and PATH."""
-
-    argv: tuple[str, ...]
-    environment: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Role:
-    """One row of the table.
-
-    Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
-    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `stands_by`: a role with
-    `after` also runs while this appliance is passive. `listens`: each process of the role gets the listening socket
-    that the supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
-    exit status 0.
-
-    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
-    `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
-
-    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to. `files` is the
-    limit on open files. `readable_by` is the user whose group may enter `part` and read its group-readable files.
-    `group` is the user whose group replaces the role's own, so the role can read files that are `readable_by` that
-    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that
-    the role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry`
-    is its descriptor or None. `inputs` are files and folders of the operator, which the supervisor opens for the
-    role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
-    besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
-    kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
-    no console delays a stop. A negative one has effect if the supervisor could lower its own.
-    """
-
-    name: str
-    user: str
-    part: str
-    entry: str | None = None
-    program: Callable[[Facts], ExternalProgram] | None = None
-    path: Callable[[Facts], Path] | None = None
-    indexed: bool = False
-    links: tuple[str, ...] = ()
-    network: bool = True
-    asks: bool = False
-    after: str | None = None
-    outlives_control: bool = False
-    outlives_takeover: bool = False
-    stands_by: bool = False
-    files: int = 1024
-    readable_by: str | None = None
-    listens: bool = False
-    dispensable: bool = False
-    on_demand: bool = False
-    capabilities: tuple[str, ...] = ()
-    group: str | None = None
-    secret: Callable[[Facts], Path | None] | None = None
-    inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
-    ended_early: int = 0
-    nice: int = 0
-    sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
-
-    @property
-    def serves_robot(self) -> bool:
-        """Whether the role may run only while this appliance is active; a lapse of the lease stops it."""
-        return not (self.outlives_takeover or self.stands_by)
 
 
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
@@ -141,6 +49,7 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
 
 # Most roles read the configuration and talk to control.
 _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
+_OF_FEATURES = tuple(role for feature in FEATURES for role in feature.roles)
 ROLES = (
     Role(
         "lease", "rosrv-lease", "lease", "appliance.standby.process:main",
@@ -175,7 +84,8 @@ ROLES = (
         "control", "rosrv", "control", "appliance.control.process:main",
         ended_early=100, files=65_536,
         links=(
-            "relay", "signer", "compiler", "api", "charon", "syslog", "fleet", "recorder", "lease", "bundles",
+            "relay", "signer", "compiler", "api", "charon", *(role.name for role in _OF_FEATURES), "fleet", "recorder",
+            "lease", "bundles",
         ),
         readable_by="rosrv-api", inputs=lambda facts: facts.control_reads,
         sandbox=lambda facts: SandboxPlan(
@@ -219,17 +129,7 @@ ROLES = (
             writes=("/dev/net", "/proc/sys/net"),
         ),
     ),
-    _ours(
-        "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
-        ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api",
-        inputs=lambda facts: facts.syslog_reads,
-        sandbox=lambda facts: SandboxPlan(
-            allowlist=True,
-            families=ROUTES,
-            reads=(str(facts.part("control")), *folders_of(*facts.syslog_reads)),
-            connects=None if facts.syslog_port is None else (facts.syslog_port,),
-        ),
-    ),
+    *_OF_FEATURES,
     _ours(
         "fleet", "rosrv-fleet", "fleet", "appliance.forwarding.segment_process:main",
         ended_early=600, nice=10, after="control", dispensable=True, group="rosrv-api", stands_by=True,
@@ -263,8 +163,8 @@ ROLES = (
 
 def roles_of(
     *,
+    sections: Sections = DEFAULTS,
     api: bool = True,
-    syslog: bool = False,
     fleet: bool = False,
     recorder: bool = False,
     lease: bool = False,
@@ -273,9 +173,9 @@ def roles_of(
     """Return the roles of an appliance with these parts. Raises `StartError` if a ROS program is missing."""
     require_programs(ROS_PROGRAMS)
     wanted = {
-        "api": api, "syslog": syslog, "fleet": fleet, "recorder": recorder, "lease": lease, "bundles": bundles,
+        "api": api, "fleet": fleet, "recorder": recorder, "lease": lease, "bundles": bundles,
     }  # fmt: skip
-    return tuple(role for role in ROLES if wanted.get(role.name, True))
+    return tuple(role for role in ROLES if wanted.get(role.name, True) and role.configured(sections))
 
 
 def require_programs(packages: Mapping[Path, str]) -> None:

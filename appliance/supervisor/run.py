@@ -26,7 +26,8 @@ from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.rings import RecorderRings
-from appliance.supervisor.roles import LEASE_NICE, Facts, Role
+from appliance.supervisor.role import Facts, Role
+from appliance.supervisor.roles import LEASE_NICE
 from appliance.supervisor.sandbox.private_view import (
     PrivateView,
     program_folders,
@@ -121,7 +122,11 @@ def _run(
             nodes=node_ports,
             api=settings.api_address[1] if settings.api_address else None,
             api_networks=tuple(str(network) for network in settings.api_networks),
-            syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
+            receivers=tuple(
+                (role.user, receiver)
+                for role in roles
+                if (receiver := role.receiver(settings.sections)) is not None
+            ),
             collector=settings.fleet.destination if settings.fleet.collector is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
             standby=_standby_access(standby.membership) if standby is not None else None,
@@ -169,23 +174,10 @@ def _standby_access(membership: Membership) -> StandbyAccess:
     return StandbyAccess(membership.other_address, membership.port)
 
 
-def _files_of_syslog(settings: Settings) -> tuple[Path, ...]:
-    to = settings.audit.syslog
-    return tuple(filter(None, (to.ca, to.certificate, to.key)))
-
-
 def _files_of_fleet(settings: Settings) -> tuple[Path, ...]:
     fleet = settings.fleet
     files = (fleet.ca, fleet.certificate, fleet.key, fleet.receipt_key, fleet.bundles.root)
     return tuple(filter(None, files))
-
-
-def _port_of_syslog(settings: Settings) -> int | None:
-    """Return the TCP port of the syslog receiver; None if none is configured or it uses UDP."""
-    if settings.audit.syslog.to is None:
-        return None
-    protocol, _address, port = settings.audit.syslog.destination
-    return None if protocol == "udp" else port
 
 
 def _with_ports(settings: Settings) -> Settings:
@@ -270,8 +262,7 @@ def _supervise(
                 rosmaster_port=settings.rosmaster_port,
                 rosout_ports=rosout_ports if settings.isolation != "none" else None,
                 control_reads=tuple(filter(None, (settings.policy, settings.monitors, settings.hosts))),
-                syslog_reads=_files_of_syslog(settings),
-                syslog_port=_port_of_syslog(settings),
+                sections=settings.sections,
                 fleet_reads=_files_of_fleet(settings),
                 collector_port=settings.fleet.destination[1]
                 if settings.fleet.collector is not None

@@ -30,7 +30,7 @@ from appliance.standby.membership import (
     save_membership,
 )
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import Role
+from appliance.supervisor.role import Role
 from appliance.supervisor.users import account_of
 
 ADMIN_SOCKET = "admin.sock"

@@ -51,7 +51,7 @@ from appliance.supervisor.process_handle import (
 )
 from appliance.supervisor.process_slot import ProcessSlot
 from appliance.supervisor.rings import RecorderRings
-from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.shutdown import end_all
 from appliance.supervisor.users import account_of
 

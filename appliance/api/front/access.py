@@ -26,7 +26,7 @@ from appliance.base import clock
 from appliance.base.deadlines import Deadlines
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import ClientRequest, TokenKept
-from appliance.configuration.settings import is_loopback
+from appliance.configuration.sections import is_loopback
 from appliance.quotas.pool import QuotaClass
 from appliance.signing.request_signing import reading_hash, reading_id
 from appliance.store.access_tokens import is_secret, parse_token

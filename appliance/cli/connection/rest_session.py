@@ -21,7 +21,7 @@ import httpx
 
 from appliance.base.input_files import read_given_text
 from appliance.cli.connection.admin_client import SECONDS, UNKNOWN, AccessDeniedError, NotRunningError
-from appliance.configuration.settings import is_loopback
+from appliance.configuration.sections import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from appliance.store.access_tokens import parse_token
 

@@ -217,8 +217,8 @@ class ForwarderAccess:
     uid: int
     address: str
     port: int
+    name: str
     datagrams: bool = False  # True: UDP; False: TCP
-    name: str = "audit log's forwarder"
 
     def __post_init__(self) -> None:
         PortRange.one(self.port)
@@ -285,8 +285,7 @@ class FirewallSettings:
     neighbours: tuple[str, ...] = ()
     tunnel_only: tuple[str, ...] = ()
     tunnel_interface: str | None = None
-    forwarder: ForwarderAccess | None = None
-    collector_clients: tuple[ForwarderAccess, ...] = ()
+    forwarders: tuple[ForwarderAccess, ...] = ()
     standby: StandbyAccess | None = None
     new_connections: RateLimit | None = RateLimit(per_second=1000, burst=2000)
 
@@ -337,8 +336,7 @@ def appliance_rules(settings: FirewallSettings) -> tuple[PacketRule, ...]:
         *inner_port("inner node face", settings.inner_port, "rosmaster", settings.rosmaster_uid),
         *_rosmaster(settings),
         *_own_node(settings),
-        *_forwarding(settings.forwarder),
-        *(rule for client in settings.collector_clients for rule in _forwarding(client)),
+        *(rule for forwarder in settings.forwarders for rule in _forwarding(forwarder)),
         *_standby(settings.standby),
         *_api(settings),
         *_rate_limits(settings),
@@ -432,10 +430,8 @@ def _tunnel_only(network: str, interface: str | None) -> tuple[PacketRule, ...]:
     )
 
 
-def _forwarding(forwarder: ForwarderAccess | None) -> tuple[PacketRule, ...]:
+def _forwarding(forwarder: ForwarderAccess) -> tuple[PacketRule, ...]:
     """Let a forwarder's user send to its receiver only."""
-    if forwarder is None:
-        return ()
     sending = partial(_sending, uid=forwarder.uid)
     ports = PortRange.one(forwarder.port)
     return (

@@ -20,7 +20,8 @@ from appliance.supervisor import run
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.logs import configure_logs
-from appliance.supervisor.roles import Role, roles_of
+from appliance.supervisor.role import Role
+from appliance.supervisor.roles import roles_of
 from appliance.supervisor.supervisor import ControlReady
 
 

@@ -10,7 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from appliance.configuration.config_sources import plain, read
-from appliance.configuration.settings import Settings, load_resolved, split_address
+from appliance.configuration.sections import split_address
+from appliance.configuration.settings import Settings, load_resolved
 
 
 def test_every_key_has_a_default() -> None:
@@ -95,40 +96,6 @@ def test_rest_can_be_disabled() -> None:
     assert read({"api": "off"}).api_address is None
     assert read({"api": False}).api_address is None
     assert Settings().api_address == ("127.0.0.1", 8443)
-
-
-@pytest.mark.parametrize(
-    ("text", "destination"),
-    [
-        ("udp://10.0.0.9:514", ("udp", "10.0.0.9", 514)),
-        ("tcp://[fd00::9]:601", ("tcp", "fd00::9", 601)),
-        ("tls://10.0.0.9:6514", ("tls", "10.0.0.9", 6514)),
-    ],
-)
-def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None:
-    """A receiver of the audit log has a protocol, an address and a port."""
-    settings = read({"audit": {"syslog": {"to": text}}})
-    assert settings.audit.syslog.destination == destination
-
-
-@pytest.mark.parametrize(
-    ("syslog", "why"),
-    [
-        ({"to": "10.0.0.9:514"}, "is not udp://"),
-        ({"to": "http://10.0.0.9:514"}, "is not udp://"),
-        ({"to": "tls://logs.example.com:6514"}, "names are not looked up"),
-        ({"to": "udp://10.0.0.9:0"}, "port 0"),
-        ({"to": "udp://127.0.0.1:514"}, "loopback of the appliance's own namespace"),
-        ({"to": "tcp://10.0.0.9:601", "ca": "x.pem"}, "ca would have no effect"),
-        ({"name": "logs"}, "name would have no effect"),
-        ({"to": "tls://10.0.0.9:6514", "key": "x.pem"}, "must be given together"),
-        ({"to": "udp://10.0.0.9:514", "facility": 24}, "facility"),
-    ],
-)
-def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: str) -> None:
-    """A useless or impossible setting is an error with its key and the reason."""
-    with pytest.raises(ValidationError, match=why):
-        read({"audit": {"syslog": syslog}})
 
 
 _FLEET = {"collector": "https://10.0.0.9:8444", "ca": "a", "certificate": "b", "key": "c", "receipt_key": "d"}

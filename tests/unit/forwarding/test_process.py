@@ -7,7 +7,7 @@ import pytest
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.control.forwarder_link import ForwarderLink
+from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.forwarding.process import ProgressReports
 from appliance.telemetry.audit_trail import AuditTrail
 

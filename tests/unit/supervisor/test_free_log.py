@@ -8,7 +8,8 @@ import pytest
 
 from appliance.channel.messages import LogHeld
 from appliance.supervisor.process_handle import ProcessHandle
-from appliance.supervisor.roles import Facts, roles_of
+from appliance.supervisor.role import Facts
+from appliance.supervisor.roles import roles_of
 from appliance.supervisor.supervisor import Supervisor
 
 pytestmark = pytest.mark.nightly
@@ -30,18 +31,18 @@ class _Life:
     ("holding", "ended"),
     [
         (["api"], {"api"}),
-        (["syslog"], {"syslog"}),
-        (["api", "syslog", "relay", "control", "charon", "signer"], {"api", "syslog"}),
+        (["fleet"], {"fleet"}),
+        (["api", "fleet", "relay", "control", "charon", "signer"], {"api", "fleet"}),
         (["relay"], set()),
-        ([-1], {"api", "syslog"}),
-        ([4_000_000], {"api", "syslog"}),
+        ([-1], {"api", "fleet"}),
+        ([4_000_000], {"api", "fleet"}),
     ],
 )
 def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | int], ended: set[str]) -> None:
     """The named reader is ended, or all readers if the kernel names none; no other process is ended."""
     admin = socket.create_server(("127.0.0.1", 0))
     facts = Facts(state=tmp_path, config=tmp_path / "c", rosmaster_port=1)
-    supervisor = Supervisor(roles_of(syslog=True), facts, admin=admin, ready=lambda _said: None)
+    supervisor = Supervisor(roles_of(fleet=True), facts, admin=admin, ready=lambda _said: None)
     try:
         starts = {}
         for number, slot in enumerate(supervisor.slots):

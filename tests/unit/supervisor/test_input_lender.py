@@ -30,14 +30,12 @@ import os, sys
 from pathlib import Path
 from appliance.base.owner_access import FileLender
 from appliance.collector.connection import robot_context
-from appliance.forwarding.receiver import tls_context
 files = [Path(name) for name in sys.argv[1:]]
-lent = [{path: os.open(path, os.O_RDONLY) for path in files} for _time in range(2)]
+lent = {path: os.open(path, os.O_RDONLY) for path in files}
 os.setresgid(61099, 61099, 61099)
 os.setresuid(61099, 61099, 61099)
-for context, given in zip((robot_context, tls_context), lent):
-    FileLender.install(given.get)
-    assert context(*files).get_ca_certs()
+FileLender.install(lent.get)
+assert robot_context(*files).get_ca_certs()
 """
 
 

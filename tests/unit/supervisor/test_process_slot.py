@@ -8,7 +8,7 @@ import pytest
 
 from appliance.base.clock import now
 from appliance.supervisor.process_slot import FAILING_AFTER, ProcessSlot
-from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.role import Facts, Role
 
 
 def process(*, lived: float) -> Any:

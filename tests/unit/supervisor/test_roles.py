@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import ROLES, SYSTEM_PYTHON, Facts, require_programs, roles_of
+from appliance.supervisor.role import Facts
+from appliance.supervisor.roles import ROLES, SYSTEM_PYTHON, require_programs, roles_of
 from appliance.supervisor.users import NUMERIC_IDS
 
 FACTS = Facts(Path("/s"), Path("/s/run/config.json"), 12311, "http://127.0.0.1:5")
@@ -71,17 +72,6 @@ def test_links_are_between_roles_and_go_both_ways() -> None:
     for role in ROLES:
         for other in role.links:
             assert role.name in BY_NAME[other].links
-
-
-def test_the_forwarder_runs_only_if_configured() -> None:
-    """The forwarder has its own user, in the group that may read the audit log; no other process depends on it."""
-    forwarder = BY_NAME["syslog"]
-    assert forwarder in roles_of(syslog=True)
-    assert forwarder not in roles_of()
-    assert forwarder.user not in {role.user for role in ROLES if role is not forwarder}
-    assert forwarder.group == BY_NAME["control"].readable_by
-    assert forwarder.dispensable
-    assert not forwarder.capabilities
 
 
 def test_the_recorder_runs_only_if_configured() -> None:

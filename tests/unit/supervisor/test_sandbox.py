@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.supervisor.roles import ROLES, Facts
+from appliance.supervisor.role import Facts
+from appliance.supervisor.roles import ROLES
 from appliance.supervisor.sandbox import landlock, seccomp
 from appliance.supervisor.sandbox.folders import executables_of, folders_of, with_system_files
 from appliance.supervisor.sandbox.sandbox_plan import UNIX, SandboxPlan

@@ -9,7 +9,7 @@ import pytest
 from appliance.supervisor import shutdown
 from appliance.supervisor.process_handle import ProcessHandle
 from appliance.supervisor.process_slot import ProcessSlot
-from appliance.supervisor.roles import Role
+from appliance.supervisor.role import Role
 from tests.support import autojump
 
 pytestmark = pytest.mark.anyio

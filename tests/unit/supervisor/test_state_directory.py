@@ -9,7 +9,7 @@ import pytest
 
 from appliance.base.atomic_files import name_to_make
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import Role
+from appliance.supervisor.role import Role
 from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.users import account_of
 

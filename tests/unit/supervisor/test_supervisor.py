@@ -16,7 +16,7 @@ from appliance.channel.messages import CompilerWanted, LeaseEnded, LeaseHeld, Ro
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.process_handle import ProcessHandle
-from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
 pytestmark = [pytest.mark.anyio, pytest.mark.nightly]

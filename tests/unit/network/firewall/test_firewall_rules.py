@@ -270,8 +270,8 @@ def test_a_rule_is_for_tcp_or_for_udp() -> None:
 def test_the_forwarder_reaches_its_receiver_only() -> None:
     """The forwarder's user may send to one address and port only; other users are not affected."""
     for datagrams in (False, True):
-        to = ForwarderAccess(61017, "10.0.0.9", 6514, datagrams=datagrams)
-        settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarder=to, new_connections=None)
+        to = ForwarderAccess(61017, "10.0.0.9", 6514, "log", datagrams=datagrams)
+        settings = FirewallSettings(control_uid=1, rosmaster_uid=2, forwarders=(to,), new_connections=None)
         receiver, others = appliance_rules(settings)
         assert (receiver.chain, receiver.uid, receiver.destination) == (Chain.OUT, 61017, "10.0.0.9")
         assert receiver.verdict is PacketVerdict.RETURN
@@ -286,7 +286,7 @@ def test_the_forwarder_reaches_its_receiver_only() -> None:
 def test_an_invalid_forwarder_is_an_error(wrong: tuple[int, str, int]) -> None:
     """An invalid user, address or port is an error."""
     with pytest.raises(ValueError, match=r"is not a|port"):
-        ForwarderAccess(*wrong)
+        ForwarderAccess(*wrong, "log")
 
 
 OUT = PacketRule(chain=Chain.OUT, purpose="p", verdict=PacketVerdict.DROP)

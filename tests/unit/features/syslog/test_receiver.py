@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.forwarding.receiver import DatagramReceiver, StreamReceiver, tls_context
+from appliance.features.syslog.receiver import DatagramReceiver, StreamReceiver, tls_context
 from tests.support.certificates import Certificates, make_certificates
 from tests.support.processes import LIMIT
 from tests.support.syslog import DatagramCollector, StreamCollector
@@ -78,7 +78,7 @@ def test_a_closed_connection_is_an_error() -> None:
 @pytest.mark.nightly
 def test_a_receiver_that_reads_nothing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Unacknowledged data does not count as sent: the error is raised within the timeout."""
-    monkeypatch.setattr("appliance.forwarding.receiver._SEND_SECONDS", 0.3)
+    monkeypatch.setattr("appliance.features.syslog.receiver._SEND_SECONDS", 0.3)
     with socket.socket() as listener:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         listener.bind((HOST, 0))
@@ -119,7 +119,7 @@ def test_a_wrong_certificate_gets_nothing(certificates: Certificates, tmp_path: 
 @pytest.mark.nightly
 def test_tls_with_client_certificates(certificates: Certificates, monkeypatch: pytest.MonkeyPatch) -> None:
     """The receiver accepts our certificate; without one, its refusal is an error although TLS 1.3 reports it late."""
-    monkeypatch.setattr("appliance.forwarding.receiver._OBJECTION_SECONDS", LIMIT)
+    monkeypatch.setattr("appliance.features.syslog.receiver._OBJECTION_SECONDS", LIMIT)
     with StreamCollector(context=server_context(certificates, clients=True)) as collector:
         receiver = StreamReceiver(
             HOST,

@@ -21,7 +21,7 @@ from appliance.signing.receipts import SegmentReceipt
 from appliance.signing.signed_statements import checkpoint_hash
 from tests.support.audit import decision
 from tests.support.virtual_clock import VirtualClock
-from tests.unit.forwarding.conftest import MakeLog
+from tests.unit.features.conftest import MakeLog
 
 
 class Collector(CollectorConnection):

@@ -15,18 +15,18 @@ from appliance.audit.proof.copies import SYSLOG_ELEMENT, read_copies, signed_che
 from appliance.audit.proof.verification import verify
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import SearchPage, search
-from appliance.forwarding.log_forwarder import (
+from appliance.features.syslog.log_forwarder import (
     Chosen,
     ForwardingPosition,
     LogForwarder,
     load_position,
     save_position,
 )
-from appliance.forwarding.syslog import Formatter
+from appliance.features.syslog.syslog import Formatter
 from tests.support.audit import decision, settle
 from tests.support.engines import let_pass
 from tests.support.syslog import Message, parse
-from tests.unit.forwarding.conftest import MakeLog, Notary
+from tests.unit.features.conftest import MakeLog, Notary
 
 _DAY = 86_400_000_000_000
 
@@ -359,7 +359,7 @@ def test_records_removed_while_reading_are_counted(
         page = search(*arguments, **named)
         return SearchPage(page.entries[5:], page.cursor)
 
-    monkeypatch.setattr("appliance.forwarding.log_forwarder.search", removing)
+    monkeypatch.setattr("appliance.features.syslog.log_forwarder.search", removing)
     one.step()
     assert kept.sequences()[-1] > before
     assert one.progress.missed == 5

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.log.record_format import LogEntry
 from appliance.audit.proof.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.forwarding.syslog import ELEMENT, Formatter
+from appliance.features.syslog.syslog import ELEMENT, Formatter
 from tests.support.syslog import parse
 
 _TIME = 1_700_000_000_123_456_789

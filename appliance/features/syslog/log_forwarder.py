@@ -27,8 +27,8 @@ from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import ForwardingReported
-from appliance.forwarding.receiver import Receiver
-from appliance.forwarding.syslog import Formatter
+from appliance.features.syslog.receiver import Receiver
+from appliance.features.syslog.syslog import Formatter
 
 Chosen = Literal["all", "denials"]
 _BATCH = 256

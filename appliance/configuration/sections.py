@@ -1,0 +1,105 @@
+"""Define how a section of `appliance.yaml` is written, for the settings of the core and of features."""
+
+import dataclasses
+import ipaddress
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar, dataclass_transform
+
+HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
+T = TypeVar("T")
+S = TypeVar("S", bound="FeatureSection")
+
+
+def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
+    """Define a key with a default (or `default_factory`), a description, and rules for pydantic's `Field`."""
+    metadata = {"description": description or None, **rules}
+    if isinstance(default, list):
+        metadata["json_schema_extra"] = {"default": default}
+        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
+    if "default_factory" in metadata:
+        return dataclasses.field(default_factory=metadata.pop("default_factory"), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
+def section(cls: type[T]) -> type[T]:
+    """Define a table of keys; unknown keys are rejected."""
+    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # pydantic reads this attribute
+    return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
+def split_address(text: str) -> tuple[str, int]:
+    """Parse `HOST:PORT` or `[IPv6]:PORT`. Raises `ValueError`."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isascii() or not port.isdigit() or int(port) > 65_535:
+        raise ValueError(
+            f"{text!r} is not HOST:PORT, for example 0.0.0.0:11311 or [::]:11311 (port 0: any free one)"
+        )
+    if host.startswith("[") and host.endswith("]"):
+        return str(ipaddress.IPv6Address(host[1:-1])), int(port)
+    if ":" in host:
+        raise ValueError(f"{text!r}: an IPv6 address is written in brackets, for example [::1]:11311")
+    if not HOST_NAME.fullmatch(host):
+        raise ValueError(f"{host!r} is not an address of this machine")
+    return host, int(port)
+
+
+def split_receiver(text: str) -> tuple[str, str, int]:
+    """Parse `udp|tcp|tls://ADDRESS:PORT`. Raises `ValueError`."""
+    protocol, slashes, place = text.partition("://")
+    example = "for example tls://10.0.0.9:6514 or udp://[fd00::9]:514"
+    if not slashes or protocol not in ("udp", "tcp", "tls"):
+        raise ValueError(f"{text!r} is not udp://, tcp:// or tls:// with ADDRESS:PORT, {example}")
+    host, port = split_address(place)
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        raise ValueError(f"{host!r} is not an address; names are not looked up, {example}") from None
+    if not port:
+        raise ValueError(f"{text!r}: a receiver cannot have port 0, {example}")
+    return protocol, host, port
+
+
+def checked_receiver(text: str) -> str:
+    """Return the receiver, checked. Raises `ValueError`."""
+    split_receiver(text)
+    return text
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a configured host is a loopback address, which only this machine reaches."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class FeatureSection:
+    """The base of a feature's section; `place` is its key in `appliance.yaml`, such as `audit.syslog`."""
+
+    place: ClassVar[str]
+
+    def receivers(self) -> dict[str, tuple[str | None, str | None]]:
+        """Return the URL and the address of each receiver on another machine, by key."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Sections:
+    """The sections of features. A section that is not given has its defaults."""
+
+    values: Mapping[type[FeatureSection], FeatureSection] = dataclasses.field(default_factory=dict)
+
+    def of(self, kind: type[S]) -> S:
+        """Return the section of this type."""
+        value = self.values.get(kind, None) or kind()
+        assert isinstance(value, kind)  # noqa: S101  the key is the value's type
+        return value
+
+
+DEFAULTS = Sections()
+"""Every feature with its defaults."""

@@ -1,0 +1,1 @@
+"""Forward the audit log to a syslog receiver, in a process of its own."""

@@ -1,0 +1,50 @@
+"""Run the forwarder of the audit log to a syslog receiver, as a process of the appliance."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.syslog.log_forwarder import LogForwarder
+from appliance.features.syslog.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
+from appliance.features.syslog.settings import Syslog
+from appliance.features.syslog.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
+from appliance.forwarding.process import ForwardingProcess
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    """Forward the log until the supervisor ends the process."""
+    forwarder = make_forwarder(load_resolved(config), Path.cwd() / "position.json")
+    asyncio.run(ForwardingProcess(forwarder, lifeline_fd).run())
+
+
+def make_forwarder(settings: Settings, kept: Path) -> LogForwarder:
+    """Return the forwarder for these settings; they must configure a receiver."""
+    wanted = settings.of(Syslog)
+    longest = LONGEST_DATAGRAM if wanted.destination[0] == "udp" else LONGEST_IN_STREAM
+    return LogForwarder(
+        settings.state / "control" / "audit.db",
+        kept,
+        receiver_of(wanted),
+        Formatter(
+            facility=wanted.facility,
+            longest=longest,
+            host_name=wanted.host_name or settings.name or None,
+        ),
+        chosen=wanted.send,
+    )
+
+
+def receiver_of(wanted: Syslog) -> Receiver:
+    """Return the configured receiver."""
+    protocol, host, port = wanted.destination
+    if protocol == "udp":
+        return DatagramReceiver(host, port)
+    context: Callable[[], Any] | None = None
+    if protocol == "tls":
+        # Made for each connection, so that replaced certificate files apply to the next connection.
+        def context() -> Any:
+            return tls_context(wanted.ca, wanted.certificate, wanted.key)
+
+    return StreamReceiver(host, port, context, wanted.name)

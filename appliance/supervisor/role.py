@@ -1,0 +1,118 @@
+"""Define a row of the table of processes (`roles.py`), with the facts that rows need."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from appliance.configuration.sections import DEFAULTS, Sections
+from appliance.supervisor.sandbox.sandbox_plan import SandboxPlan
+
+if TYPE_CHECKING:
+    from appliance.supervisor.sandbox.private_view import PrivateView
+
+
+@dataclass(frozen=True)
+class Facts:
+    """The paths and ports that the rows of the table need; control reports some of them when it is ready."""
+
+    state: Path
+    config: Path
+    rosmaster_port: int
+    rosout_master: str | None = None
+    rosout_ports: range | None = None  # None: the kernel chooses the port
+    ca_passphrase_file: Path | None = None
+    control_reads: tuple[Path, ...] = ()
+    sections: Sections = DEFAULTS  # of features
+    fleet_reads: tuple[Path, ...] = ()
+    collector_port: int | None = None
+    view: "PrivateView | None" = None
+    raised: int = 0  # by which the supervisor has lowered its own niceness; its children inherit this
+
+    def part(self, name: str) -> Path:
+        """Return the part of the state directory with this name."""
+        return self.state / name
+
+    def run(self, name: str) -> Path:
+        """Return a file that the supervisor writes for the other processes."""
+        return self.config.with_name(name)
+
+
+class RemoteReceiver(NamedTuple):
+    """A receiver on another machine, and the name of its client in the firewall's rules."""
+
+    client: str
+    protocol: str  # udp, or a protocol over TCP
+    address: str
+    port: int
+
+
+@dataclass(frozen=True)
+class ExternalProgram:
+    """The command of an external program, and its environment besides HOME and PATH."""
+
+    argv: tuple[str, ...]
+    environment: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Role:
+    """One row of the table.
+
+    Start: `path` returns the last argument of `entry`. `indexed` roles get their number. `after` is the role that must
+    be ready first. `outlives_takeover`: the role goes on when this appliance becomes passive. `stands_by`: a role with
+    `after` also runs while this appliance is passive. `listens`: each process of the role gets the listening socket
+    that the supervisor keeps for it. `on_demand`: the role starts when control requests it, and does not restart after
+    exit status 0.
+
+    Watching: `asks`: the supervisor checks over HTTP whether the role is alive (for a program without a lifeline).
+    `dispensable`: the other roles continue when this role cannot serve. `outlives_control` roles are stopped last.
+
+    Permissions: `part` is the role's folder in the state directory. `links` are the roles it talks to. `files` is the
+    limit on open files. `readable_by` is the user whose group may enter `part` and read its group-readable files.
+    `group` is the user whose group replaces the role's own, so the role can read files that are `readable_by` that
+    user. `capabilities` lists the `privileges.SUPERVISOR_CAPABILITIES` that the role keeps. `secret` is a file that
+    the role's user may not read; it is opened before the privileges are dropped, and the last argument of `entry`
+    is its descriptor or None. `inputs` are files and folders of the operator, which the supervisor opens for the
+    role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
+    besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
+    kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
+    no console delays a stop. A negative one has effect if the supervisor could lower its own. `receiver` is the
+    only other machine that the firewall lets the user reach.
+
+    A feature's role runs if the settings of features let it (`configured`).
+    """
+
+    name: str
+    user: str
+    part: str
+    entry: str | None = None
+    program: Callable[[Facts], ExternalProgram] | None = None
+    path: Callable[[Facts], Path] | None = None
+    indexed: bool = False
+    links: tuple[str, ...] = ()
+    network: bool = True
+    asks: bool = False
+    after: str | None = None
+    outlives_control: bool = False
+    outlives_takeover: bool = False
+    stands_by: bool = False
+    files: int = 1024
+    readable_by: str | None = None
+    listens: bool = False
+    dispensable: bool = False
+    on_demand: bool = False
+    capabilities: tuple[str, ...] = ()
+    group: str | None = None
+    secret: Callable[[Facts], Path | None] | None = None
+    inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
+    ended_early: int = 0
+    nice: int = 0
+    sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
+    configured: Callable[[Sections], bool] = lambda _sections: True
+    receiver: Callable[[Sections], RemoteReceiver | None] = lambda _sections: None
+
+    @property
+    def serves_robot(self) -> bool:
+        """Whether the role may run only while this appliance is active; a lapse of the lease stops it."""
+        return not (self.outlives_takeover or self.stands_by)

@@ -1,0 +1,57 @@
+"""Tests of `appliance.features.syslog`: its settings, its process and its part of control."""
+
+import pytest
+from pydantic import ValidationError
+
+from appliance.configuration.config_sources import read
+from appliance.configuration.sections import Sections
+from appliance.features.syslog.feature import SYSLOG
+from appliance.features.syslog.settings import Syslog
+from appliance.supervisor.roles import ROLES, roles_of
+
+
+@pytest.mark.parametrize(
+    ("text", "destination"),
+    [
+        ("udp://10.0.0.9:514", ("udp", "10.0.0.9", 514)),
+        ("tcp://[fd00::9]:601", ("tcp", "fd00::9", 601)),
+        ("tls://10.0.0.9:6514", ("tls", "10.0.0.9", 6514)),
+    ],
+)
+def test_a_syslog_receiver(text: str, destination: tuple[str, str, int]) -> None:
+    """A receiver of the audit log has a protocol, an address and a port."""
+    settings = read({"audit": {"syslog": {"to": text}}})
+    assert settings.of(Syslog).destination == destination
+
+
+@pytest.mark.parametrize(
+    ("syslog", "why"),
+    [
+        ({"to": "10.0.0.9:514"}, "is not udp://"),
+        ({"to": "http://10.0.0.9:514"}, "is not udp://"),
+        ({"to": "tls://logs.example.com:6514"}, "names are not looked up"),
+        ({"to": "udp://10.0.0.9:0"}, "port 0"),
+        ({"to": "udp://127.0.0.1:514"}, "loopback of the appliance's own namespace"),
+        ({"to": "tcp://10.0.0.9:601", "ca": "x.pem"}, "ca would have no effect"),
+        ({"name": "logs"}, "name would have no effect"),
+        ({"to": "tls://10.0.0.9:6514", "key": "x.pem"}, "must be given together"),
+        ({"to": "udp://10.0.0.9:514", "facility": 24}, "facility"),
+    ],
+)
+def test_an_invalid_syslog_receiver_is_rejected(syslog: dict[str, object], why: str) -> None:
+    """A useless or impossible setting is an error with its key and the reason."""
+    with pytest.raises(ValidationError, match=why):
+        read({"audit": {"syslog": syslog}})
+
+
+def test_the_forwarder_runs_only_if_configured() -> None:
+    """The forwarder has its own user, in the group that may read the audit log; no other process depends on it."""
+    (forwarder,) = SYSLOG.roles
+    wanted = Sections({Syslog: Syslog(to="tls://10.0.0.9:6514")})
+    assert forwarder in roles_of(sections=wanted)
+    assert forwarder not in roles_of()
+    assert forwarder.user not in {role.user for role in ROLES if role is not forwarder}
+    assert forwarder.group == "rosrv-api"
+    assert forwarder.dispensable
+    assert not forwarder.capabilities
+    assert forwarder.receiver(wanted) == ("audit log's forwarder", "tls", "10.0.0.9", 6514)

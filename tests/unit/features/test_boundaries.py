@@ -1,0 +1,78 @@
+"""Features can be removed: neither the core nor its tests know one, and the rest works without it."""
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from appliance.features.table import FEATURES
+
+ROOT = Path(__file__).parents[3]
+FOLDERS = sorted(path.parent.name for path in (ROOT / "appliance/features").glob("*/feature.py"))
+_TESTED = (
+    "configuration",
+    "supervisor",
+    "control",
+    "channel",
+    "backup",
+    "test_imports.py",
+    "test_source_rules.py",
+)
+_EVERYTHING = """
+import importlib, pkgutil, appliance
+for module in pkgutil.walk_packages(appliance.__path__, "appliance."):
+    importlib.import_module(module.name)
+"""
+
+
+def test_each_folder_is_a_row() -> None:
+    """The table lists each folder once, under its name."""
+    assert sorted(feature.name for feature in FEATURES) == FOLDERS
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_no_other_test_imports_a_feature(name: str) -> None:
+    """Only the tests of a feature import it, so they go with it."""
+    imported = re.compile(rf"\bappliance\.features\.{name}\b")
+    knowing = [
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "tests").rglob("*.py")
+        if f"features/{name}/" not in str(path) and imported.search(path.read_text(encoding="utf-8"))
+    ]
+    assert knowing == []
+
+
+def without(name: str, copy: Path) -> None:
+    """Copy the files of the repository, without a feature's folders and its lines in the table."""
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    for file in filter(None, files.decode().split("\0")):
+        if f"/features/{name}/" not in file and (ROOT / file).is_file():
+            (copy / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / file, copy / file)
+    for built in (ROOT / "appliance").rglob("*.so"):
+        shutil.copy2(built, copy / built.relative_to(ROOT))
+    table = copy / "appliance/features/table.py"
+    text = table.read_text(encoding="utf-8")
+    text = re.sub(rf"from appliance\.features\.{name}\..*\n", "", text)
+    table.write_text(re.sub(rf"\b{name.upper()}\b(, |,)?", "", text), encoding="utf-8")
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", FOLDERS)
+def test_the_rest_works_without_a_feature(name: str, tmp_path: Path) -> None:
+    """Without the folder and the row, everything can be imported, and contracts and unit tests of the core hold."""
+    without(name, tmp_path)
+    bin_folder = Path(sys.executable).parent
+    tests = [f"tests/unit/{one}" for one in _TESTED]
+    for command in (
+        [sys.executable, "-c", _EVERYTHING],
+        [str(bin_folder / "lint-imports"), "--no-cache"],
+        [sys.executable, "-m", "pytest", "--collect-only", "-q", "tests/unit"],
+        [sys.executable, "-m", "pytest", "-q", "-m", "not nightly and not real", *tests],
+    ):
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{command}: {done.stdout[-3000:]}{done.stderr[-2000:]}"
