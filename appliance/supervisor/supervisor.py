@@ -38,7 +38,7 @@ from appliance.supervisor.inherited_listeners import InheritedListeners, Listene
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
-from appliance.supervisor.lapse_answers import PAUSED, answer_paused
+from appliance.supervisor.lapse_answers import BECOMES_STANDBY, PAUSED, answer_for_control
 from appliance.supervisor.lease_watch import LeaseWatch, RoleChanges
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
@@ -140,7 +140,7 @@ class Supervisor:
             member=stands_by is not None,
         )
         self._suspended_at = 0.0
-        self._pause: asyncio.Task[None] | None = None  # answers operators during a lapse
+        self._answers: asyncio.Task[None] | None = None  # to operators, instead of control
         self._watchdog = IsolationWatchdog(isolation or NoIsolation(), self._tell_control)
         self.reports = ProcessCallbacks(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
@@ -417,12 +417,14 @@ class Supervisor:
             self._violated(process, f"reported ready without an address: {error}")
             return
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
+        self._leave_answers()
         self._spawn(self.control_ready(process, said))
 
     # --- one of two appliances ----------------------------------------------------------------------------
 
     def _note_parked(self) -> None:
         """Start what a standby has, and announce once that this appliance could take over."""
+        self._leave_answers()
         for slot in self.slots:
             if slot.role.stands_by and slot.is_free:
                 self.start(slot)
@@ -437,7 +439,8 @@ class Supervisor:
     def _passivate(self) -> None:
         """End everything that serves the robot; each process starts again, passive."""
         log.warning("this appliance is not active any more; its processes start again as a standby")
-        self._end_pause()
+        self._tell("api", messages.ServicePaused(""))
+        self._answer_for_control(BECOMES_STANDBY)
         for name, _descriptor in self.kept:
             if name != ADMIN:
                 self.kept.drop(name)
@@ -458,7 +461,7 @@ class Supervisor:
             if slot.process is not None:
                 slot.process.kill(signal.SIGSTOP)
         self._suspended_at = clock.now()
-        self._pause = self._spawn(answer_paused(partial(self.kept.copy_of, ADMIN)))
+        self._answer_for_control(PAUSED)
         self._tell("api", messages.ServicePaused(PAUSED))
         log.warning("the lease has lapsed; nothing is answered or relayed until it is renewed")
         return True
@@ -466,19 +469,23 @@ class Supervisor:
     def _resume(self) -> None:
         """Let everything go on that `_suspend` stopped."""
         seconds = clock.now() - self._suspended_at
-        self._end_pause()
+        self._tell("api", messages.ServicePaused(""))
+        self._leave_answers()
         for slot in self.slots:
             if slot.process is not None and slot.role.serves_robot:
                 slot.process.kill(signal.SIGCONT)
                 slot.process.discount_pause(seconds)
         log.warning("the lease is renewed in the same epoch; the service goes on", seconds=round(seconds, 3))
 
-    def _end_pause(self) -> None:
+    def _answer_for_control(self, reason: str) -> None:
+        self._leave_answers()
+        self._answers = self._spawn(answer_for_control(partial(self.kept.copy_of, ADMIN), reason))
+
+    def _leave_answers(self) -> None:
         """Leave the answers to control again."""
-        if self._pause is not None:
-            self._pause.cancel()
-            self._pause = None
-            self._tell("api", messages.ServicePaused(""))
+        if self._answers is not None:
+            self._answers.cancel()
+            self._answers = None
 
     # --- readiness ----------------------------------------------------------------------------------------
 
