@@ -24,6 +24,7 @@ NAME = "/registrar"
 _KEYS, _TOPICS = 97, 23
 _SECONDS = 2.0  # until a call counts as lost
 _PAUSE = 0.02
+_FULL = "the audit log cannot be written"  # refused: the disk of the active appliance is full
 
 
 class Transport(xmlrpc.client.Transport):
@@ -55,6 +56,9 @@ class Registrar:
                 status, text, value = getattr(self._proxy, method)(NAME, *arguments)
             except (OSError, http.client.HTTPException, ExpatError):
                 self._proxy = xmlrpc.client.ServerProxy(self.master, Transport())
+                select.select([], [], [], _PAUSE)
+                continue
+            if status != 1 and _FULL in text:
                 select.select([], [], [], _PAUSE)
                 continue
             if status != 1:

@@ -6,6 +6,7 @@ Each line `true` or `false` on standard input is one call; with --trigger any li
 import argparse
 import sys
 
+import rosgraph
 import rospy
 from report import init_node, report
 from std_srvs.srv import SetBool, Trigger
@@ -26,7 +27,7 @@ def main():
         try:
             answer = call() if options.trigger else call(line.strip() == "true")
             report("answered", success=answer.success, message=answer.message)
-        except (rospy.ServiceException, rospy.ROSException) as error:
+        except (rospy.ServiceException, rospy.ROSException, rosgraph.MasterException) as error:
             report("failed", reason=str(error))
     report("ended")
 

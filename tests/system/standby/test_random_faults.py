@@ -1,0 +1,28 @@
+"""Some random faults of the pair, others each night: each edge, process, disk and order has its turn."""
+
+import datetime
+
+from benchmarks.pair_fault_kinds import drawn
+from benchmarks.pair_faults import QUIET_SECONDS, run
+from tests.support.nodes import has_ros
+from tests.support.requirements import need_program, need_root, needs
+from tests.support.waiting import allowed
+
+_FAULTS = 20
+
+
+def test_random_faults_break_no_promise() -> None:
+    """The robot is soon served again, by one appliance; no subscription ends, and operators learn the state at once.
+
+    The seed of a failure is the number in its message: `python -m benchmarks.pair_faults --faults 20 --seed NUMBER`.
+    """
+    need_root()
+    need_program("nft", "nftables")
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    seed = datetime.datetime.now(tz=datetime.UTC).toordinal()
+    broken = [
+        (seed, row.number, row.fault, row.broken, row.story)
+        for row in run(drawn(_FAULTS, seed), done=0, load=0, limit=allowed(QUIET_SECONDS))
+        if row.broken
+    ]
+    assert not broken
