@@ -30,6 +30,7 @@ class Fault:
     """A fault of a site with `active` and `passive`, which `make(site, active, passive, said)` holds for its block.
 
     It lasts `least` to `most` seconds. `cut_off`: meanwhile no appliance could serve, so times count from its end.
+    `goes_on`: the active appliance goes on without the standby, so a call waits once for up to 0.8 s.
     `interrupts`: the network loses packets, and TCP repeats them at intervals that grow with the interruption.
     """
 
@@ -38,6 +39,7 @@ class Fault:
     least: float = 0.3
     most: float = 3.0
     cut_off: bool = False
+    goes_on: bool = False
     interrupts: bool = False
 
 
@@ -164,23 +166,26 @@ def _promote(site: StandbySite, name: str, said: Said) -> None:
 
 def _kinds() -> Iterator[Fault]:
     for edges in ("active", "standby", "link", "active link", "standby link"):
-        yield Fault(f"cut {edges}", partial(_cut, edges=edges), 0.3, 8, interrupts=True)
+        cut = partial(_cut, edges=edges)
+        yield Fault(f"cut {edges}", cut, 0.3, 8, goes_on="active" not in edges, interrupts="active" in edges)
     yield Fault(
         "cut active standby", partial(_cut, edges="active standby"), 0.3, 8, cut_off=True, interrupts=True
     )
     yield Fault("power of active", partial(_power, of="active"), 3, 6)
-    yield Fault("power of standby", partial(_power, of="standby"), 1, 4)
+    yield Fault("power of standby", partial(_power, of="standby"), 1, 4, goes_on=True)
     yield Fault("power of both", partial(_power, of="both"), 1, 2, cut_off=True)
     for of, roles in (("active", _ROLES), ("standby", _STANDBY_ROLES)):
         for role in roles:
-            yield Fault(f"kill {role} of {of}", partial(_killed, role=role, of=of), 3, 5)
+            killed = partial(_killed, role=role, of=of)
+            yield Fault(f"kill {role} of {of}", killed, 3, 5, goes_on=of == "standby")
         for role in (*roles, "all"):
-            yield Fault(f"stall {role} of {of}", partial(_stalled, role=role, of=of))
-    yield Fault("kill witness", _witness_killed)
-    yield Fault("stall witness", _witness_stalled)
+            stalled = partial(_stalled, role=role, of=of)
+            yield Fault(f"stall {role} of {of}", stalled, goes_on=of == "standby")
+    yield Fault("kill witness", _witness_killed, goes_on=True)
+    yield Fault("stall witness", _witness_stalled, goes_on=True)
     yield Fault("robot shuts out both", _shut, 0.3, 3, cut_off=True)
     for of in ("active", "standby", "robot"):
-        yield Fault(f"full disk of {of}", partial(_full, of=of), 4, 8)
+        yield Fault(f"full disk of {of}", partial(_full, of=of), 4, 8, goes_on=of != "active")
     yield Fault("full disk of robot, power of active", _full_robot_and_power, 1, 2)
     for on in ("active", "standby", "both"):
         yield Fault(f"promote on {on}", partial(_promoted, on=on))

@@ -81,6 +81,14 @@ def test_modules_that_are_named_are_there(page: str) -> None:
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
 
 
+def test_tests_that_the_assurance_names_are_there() -> None:
+    """Each `file.py::test` is a test of that file, so that no promise loses its proof."""
+    named = re.findall(r"([\w/]+\.py)::(test_\w+)", (ROOT / "docs/dev/assurance.md").read_text())
+    texts = {file: [one.read_text() for one in (ROOT / "tests").rglob(Path(file).name)] for file, _ in named}
+    assert named
+    assert [name for file, name in named if not any(f"def {name}(" in text for text in texts[file])] == []
+
+
 def test_every_operation_of_rest_is_on_its_page() -> None:
     """Covers each path that the command line calls, with a name for each parameter."""
     text = (ROOT / "docs" / "reference" / "rest.md").read_text()
