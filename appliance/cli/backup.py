@@ -11,6 +11,7 @@ from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
+from appliance.cli.state_confirmation import Confirm, confirm_state
 from rosmop.tool.terminal import printable, refused, say
 
 _NewState = Annotated[
@@ -65,10 +66,7 @@ def restore(
 
 def purge(
     state: State = DEFAULT_STATE,
-    confirm: Annotated[
-        str | None,
-        typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
-    ] = None,
+    confirm: Confirm = None,
     as_json: Json = False,
 ) -> None:
     """Erase a state directory: audit log, policies, keys of the appliance and its hosts. Stop the appliance first.
@@ -77,13 +75,7 @@ def purge(
 
     Example: rosrv purge --state /var/lib/rosrv
     """
-    if confirm is None:
-        text = (
-            f"This erases everything in {printable(str(state))} permanently. Type the path again to erase it"
-        )
-        confirm = str(typer.prompt(text, err=True))
-    if Path(confirm).absolute() != state.absolute():
-        raise _failed(f"{confirm} is not {state}: nothing was removed")
+    confirm_state(state, confirm, f"This erases everything in {printable(str(state))} permanently")
     try:
         files, written = remove(state)
     except BackupError as error:

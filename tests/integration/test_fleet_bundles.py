@@ -1,4 +1,4 @@
-"""A real appliance takes bundles from a collector: end to end, all or nothing, with a trial."""
+"""A real appliance takes bundles from a collector: end to end, all or nothing, with commit-confirm."""
 
 import json
 import shutil
@@ -184,8 +184,8 @@ def test_a_bundle_that_would_hold_a_moving_topic_waits(site: tuple[BundleSite, s
         assert appliance.status()["monitors"]["held"] == ["latch"]
 
 
-def test_a_kill_during_the_trial_goes_back_and_tries_again(site: tuple[BundleSite, str]) -> None:
-    """If control dies during a trial, the robot goes back to what it had, and then tries the bundle again."""
+def test_a_kill_while_unconfirmed_goes_back_and_tries_again(site: tuple[BundleSite, str]) -> None:
+    """If control dies before the confirmation, the robot goes back to what it had, and then tries the bundle again."""
     served, url = site
     with robot(served, url, confirm_seconds=10) as appliance:
         path = served.add(bundle_files(OPEN_POLICY + "# tried\n", monitors__quiet_dot_rv=MONITOR))

@@ -1,23 +1,16 @@
 """`rosrv host authority rotate`: another key for the authority of hosts."""
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
 from appliance.backup.contents import BackupError
 from appliance.backup.rotate_authority import rotate_authority
 from appliance.cli.connection.target import DEFAULT_STATE, State
 from appliance.cli.output import Json, say_json
-from rosmop.tool.terminal import printable, refused, say
+from appliance.cli.state_confirmation import Confirm, confirm_state
+from rosmop.tool.terminal import refused, say
 
 
 def rotate(
     state: State = DEFAULT_STATE,
-    confirm: Annotated[
-        str | None,
-        typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
-    ] = None,
+    confirm: Confirm = None,
     as_json: Json = False,
 ) -> None:
     """Erase the key of the hosts' authority: the next start makes another. Stop the appliance first.
@@ -26,11 +19,9 @@ def rotate(
 
     Example: rosrv host authority rotate --state /var/lib/rosrv
     """
-    if confirm is None:
-        text = f"All hosts need new kits afterwards. Type {printable(str(state))} to erase the key of their authority"
-        confirm = str(typer.prompt(text, err=True))
-    if Path(confirm).absolute() != state.absolute():
-        raise refused([f"rosrv: {confirm} is not {state}: nothing was changed"])
+    confirm_state(
+        state, confirm, "This erases the key of the hosts' authority; all hosts need new kits afterwards"
+    )
     try:
         rotate_authority(state)
     except BackupError as error:

@@ -40,13 +40,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StandbySite]:
             yield made
 
 
-@pytest.fixture(scope="module")
-def robot(site: StandbySite) -> Iterator[StandbyRobot]:
-    """The robot with its nodes."""
-    with StandbyRobot(site) as robot:
-        yield robot
-
-
 def until_able(site: StandbySite) -> None:
     """Wait until both appliances report that the standby could take over."""
     for one in site.appliances.values():

@@ -72,7 +72,7 @@ def test_the_command_asks_for_the_path_again(state: Path) -> None:
     """A script confirms the path with --confirm, a person types it; a different path removes nothing."""
     run = CliRunner().invoke
     refused = run(app, ["purge", "--state", str(state), "--confirm", "/var/lib/rosrv"])
-    assert (refused.exit_code, "nothing was removed" in refused.output) == (1, True)
+    assert (refused.exit_code, "nothing was changed" in refused.output) == (1, True)
     done = run(app, ["purge", "--state", str(state)], input=f"{state}\n")
     assert (done.exit_code, "is erased: 5 files" in done.output) == (0, True)
     assert not state.exists()

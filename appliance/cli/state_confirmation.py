@@ -1,0 +1,24 @@
+"""Ask for the state directory again before an order that cannot be undone."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rosmop.tool.terminal import printable, refused
+
+Confirm = Annotated[
+    str | None,
+    typer.Option(metavar="DIR", help="The state directory again, for scripts (default: ask for it)"),
+]
+
+
+def confirm_state(state: Path, given: str | None, consequence: str) -> None:
+    """Return if the operator types the state directory, or has given it. Exit with status 1 otherwise.
+
+    `consequence` is what the order does, as a sentence.
+    """
+    if given is None:
+        given = str(typer.prompt(f"{consequence}. Type {printable(str(state))} to continue", err=True))
+    if Path(given).absolute() != state.absolute():
+        raise refused([f"rosrv: {printable(given)} is not {printable(str(state))}: nothing was changed"])
