@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import structs
 
-from appliance.base import clock
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
 from appliance.channel.standby_summary import PATIENCE_SECONDS, standby_troubles
@@ -194,7 +193,7 @@ def _failing(process: ProcessInfo) -> str:
 
 
 def _rolls_back(what: str, deadline: float, noun: str) -> str:
-    return f"{what} back in {max(0, round(deadline - clock.wall()))} s unless confirmed: rosrv {noun} confirm"
+    return f"{what} back at {_moment(deadline)} unless confirmed: rosrv {noun} confirm"
 
 
 def _moment(seconds: float) -> str:

@@ -260,7 +260,9 @@ def _ports(known: dict[str, PortsSeen]) -> str:
     if not known:
         return "no other machine runs nodes"
     words = [f"{state}: {', '.join(names[:_MOST_NAMED])}" for state, names in by_state.items() if names]
-    return "; ".join(words) + (" (rosrv protect --check)" if by_state["unknown"] else "")
+    return "; ".join(words) + (
+        " (on another machine: rosrv protect --check ADDRESS)" if by_state["unknown"] else ""
+    )
 
 
 def _others_rules(firewall: FirewallState) -> Iterator[tuple[str, str]]:

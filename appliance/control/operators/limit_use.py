@@ -89,7 +89,8 @@ def _by_host(
     used = sum(held.values())
     if host is None:
         return LimitUse(resource, used, whole, setting)
-    return LimitUse(resource, used, whole, setting, str(host), held[host], allowed)
+    name = str(host).removesuffix("/32").removesuffix("/128")  # a pool may name a host as a network
+    return LimitUse(resource, used, whole, setting, name, held[host], allowed)
 
 
 def _of_pool(resource: str, setting: str, pool: Pool[Any]) -> LimitUse:

@@ -124,7 +124,7 @@ def test_an_alarm_is_open_until_its_cause_is_gone(
         "/v1/policy?confirm_within=600", current.json["text"] + "\n# later\n", match=current.etag
     )
     assert loaded.status == 200, loaded.body
-    expect(alarms).to_contain_text(" s unless confirmed")
+    expect(alarms).to_contain_text(" unless confirmed")
     assert rest.post("/v1/policy/confirm", match=loaded.etag).status == 200
     expect(alarms).not_to_contain_text("unless confirmed")
 

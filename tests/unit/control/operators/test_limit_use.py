@@ -42,9 +42,7 @@ def test_each_resource_has_its_use_and_the_host_with_most(tmp_path: Path) -> Non
     (tmp_path / "control" / "audit.db-wal").write_bytes(bytes(24))
     rows = used(tmp_path, {0: {"frames": 5}, 1: {"frames": 9, "queues": 1}})
     assert rows["nodes"] == LimitUse("nodes", 3, None, "limits.nodes_per_host", "10.0.0.9", 2, 500)
-    assert rows["ports of nodes"] == LimitUse(
-        "ports of nodes", 42, 100, "[Ports] range", "10.0.0.9/32", 40, 75
-    )
+    assert rows["ports of nodes"] == LimitUse("ports of nodes", 42, 100, "[Ports] range", "10.0.0.9", 40, 75)
     assert (rows["registrations"].used, rows["registrations"].host_used) == (7, 7)
     assert rows["connections to the relays"].allowed == 2 * 16_384
     fullest = rows["bytes of unfinished messages, one relay"]
