@@ -69,7 +69,10 @@ def now(
     request = admin.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
     body = appliance.answer_or_exit(request)
     say(body.id)
-    typer.echo(f"rosrv: ready at {_moment(body.ends)}: rosrv record fetch {body.id}", err=True)
+    typer.echo(
+        f"rosrv: ready at {_moment(body.ends)}, or later if monitors act until then: rosrv record fetch {body.id}",
+        err=True,
+    )
 
 
 @speaks

@@ -23,8 +23,10 @@ _EQUALITY = {
         "reach": {"type": "integer", "description": "how many of the last rows the record can join"},
         "times": {"type": "integer", "description": "how often the event happened"},
         "value": {"type": "string", "description": "the reason, without the words about repetitions"},
+        "began": {"type": "string", "format": "date-time", "description": "time of the first event"},
+        "ended": {"type": "string", "format": "date-time", "description": "time of the last event"},
     },
-    "required": ["key", "reason", "reach", "times", "value"],
+    "required": ["key", "reason", "reach", "times", "value", "began", "ended"],
     "additionalProperties": False,
 }
 PAGE = {

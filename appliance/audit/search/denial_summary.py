@@ -23,7 +23,7 @@ import msgspec
 from appliance.audit.log.record import AuditRecord
 from appliance.audit.log.record_format import LogEntry, rfc3339, rule_text, without_contents
 from appliance.audit.log.repetition import OTHERS
-from appliance.audit.search.equality import FOLDED, plain_reason, times
+from appliance.audit.search.equality import FOLDED, plain_reason, time_span, times
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base.varying_numbers import without_numbers
@@ -164,7 +164,7 @@ def _hosts_of(record: AuditRecord) -> Iterator[tuple[str, int]]:
 def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditRecord) -> None:
     if host not in hosts and len(hosts) >= _MOST_HOSTS:
         host = OTHERS
-    first, last = _times(record)
+    first, last = time_span(record)
     counts = hosts.get(host)
     if counts is None:
         counts = hosts[host] = _HostCounts(first, last)
@@ -178,12 +178,6 @@ def _count(hosts: dict[str, _HostCounts], host: str, number: int, record: AuditR
             counts.texts.setdefault(key, reason)
     for caller, count in _callers(record, number):
         _tally(counts.callers, caller, count)
-
-
-def _times(record: AuditRecord) -> tuple[int, int]:
-    detail = record.detail
-    first, last = detail.get("first_time"), detail.get("last_time")
-    return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)
 
 
 def _reasons(record: AuditRecord, number: int) -> Iterable[tuple[str, int]]:

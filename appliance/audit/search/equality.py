@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from appliance.audit.log.record import AuditRecord
-from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.record_format import LogEntry, rfc3339
 from appliance.audit.log.repetition import ABOUT, KIND, repetitions
 from appliance.base.varying_numbers import without_numbers
 
@@ -77,6 +77,12 @@ def plain_reason(record: AuditRecord) -> str:
     return (found[1] or "") + text if text else ""
 
 
+def time_span(record: AuditRecord) -> tuple[int, int]:
+    """Return the times of the first and the last event of a record: a count is recorded some time after its events."""
+    first, last = record.detail.get("first_time"), record.detail.get("last_time")
+    return (first, last) if type(first) is int and type(last) is int else (record.time, record.time)
+
+
 def times(record: AuditRecord) -> int:
     """Return how often the event of a record happened."""
     return times_of(record.event, record.detail)
@@ -111,16 +117,20 @@ def equality_of(record: AuditRecord) -> dict[str, Any]:
     """Return all that a client needs to make the rows of `grouped` itself, from pages and streams.
 
     Two records are equal if their `key` is equal, and their `reason` too unless one is empty. A record joins one of the
-    last `reach` rows, and `times` and `value` are its part of the row's count and value.
+    last `reach` rows, and `times` and `value` are its part of the row's count and value, `began` and `ended`
+    the times of its first and last event.
     """
     key = equal_key(record)
     value = plain_reason(record)
+    began, ended = map(rfc3339, time_span(record))
     return {
         "key": _hash(repr(key.fields)),
         "reason": key.reason and _hash(key.reason),
         "reach": _reach(record),
         "times": times(record),
         "value": value,
+        "began": began,
+        "ended": ended,
     }
 
 

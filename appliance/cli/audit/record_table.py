@@ -15,7 +15,7 @@ from rich.text import Text
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.record_format import LogEntry, fields_of, printable, requested, rfc3339, rule_text
 from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verification
-from appliance.audit.search.equality import FOLDED, EqualRecords, grouped
+from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
 from appliance.evidence.export_verification import ExportVerification
@@ -204,7 +204,8 @@ def _cells(row: EqualRecords, host_in_words: HostInWords) -> tuple[Text, ...]:
 
 
 def _times(row: EqualRecords) -> str:
-    first, last = (rfc3339(entry.record.time).replace("T", " ") for entry in (row.first, row.last))
+    spans = time_span(row.first.record), time_span(row.last.record)
+    first, last = (rfc3339(time).replace("T", " ") for time in (spans[0][0], spans[1][1]))
     if row.records == 1:
         return first[:_MILLISECONDS]
     same_day = first[:_DATE] == last[:_DATE]

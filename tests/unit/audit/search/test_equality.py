@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
-from appliance.audit.log.record_format import LogEntry
+from appliance.audit.log.record_format import LogEntry, rfc3339
 from appliance.audit.log.repetition import KIND, new_state, summary
-from appliance.audit.search.equality import equal_key, grouped, times
+from appliance.audit.search.equality import equal_key, equality_of, grouped, times
 
 
 def _drop(reason: str = "limit.drive dropped it: speed 0.4", **fields: Any) -> AuditRecord:
@@ -98,6 +98,8 @@ def test_a_summary_of_repetitions_continues_its_record() -> None:
         state.count_in(_deny())
     [row] = grouped(_log(_deny(), summary(state, "1" * 20, 1)))
     assert (row.count, row.first.record.event, row.value) == (5, "decision", "no rule")
+    ended = equality_of(row.last.record)["ended"]
+    assert ended == rfc3339(_deny().time) != rfc3339(row.last.record.time), "the count was recorded later"
     many = summary(new_state(_deny(), "host"), "1" * 20, 1)
     assert len(grouped(_log(_deny(), many))) == 2
 

@@ -100,7 +100,9 @@ export function Count({ row, open, toggle }) {
   return html`<button class="count-badge" aria-expanded=${String(open)} title=${open ? "Show one row" : "Show each record"} onClick=${press}>${counted(row.count, "time")}<${Icon} name=${open ? "minus" : "plus"} size=${12} /></button>`;
 }
 
-/** The time of the last record, and of the first if it was in another second. @param {{row: Row}} given */
-export function Range({ row: { first, last } }) {
-  return last.time.slice(0, SECOND) === first.time.slice(0, SECOND) ? html`<${Moment} at=${last.time} />` : html`<${Moment} at=${last.time} /> <span class="muted small nowrap">since <${Moment} at=${first.time} /></span>`;
+/** The time of the last event, and of the first if it was in another second. @param {{row: Row}} given */
+export function Range({ row }) {
+  const { began } = row.first.equality;
+  const { ended } = row.last.equality;
+  return ended.slice(0, SECOND) === began.slice(0, SECOND) ? html`<${Moment} at=${ended} />` : html`<${Moment} at=${ended} /> <span class="muted small nowrap">since <${Moment} at=${began} /></span>`;
 }
