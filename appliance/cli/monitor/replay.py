@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from appliance.audit.log.record_format import rfc3339
 from appliance.channel import admin
+from appliance.channel.answers.recording_answers import OpenRecording
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.monitor.recorder_input import Piece, Span, gaps, pieces_of, require_recorded, span_of
@@ -100,21 +102,30 @@ def replay_monitor(
         recorded = appliance.ask_or_exit(admin.RecordingsWanted())
         require_recorded(recorded, _topics(specifications.texts, specifications.chosen, patterns))
         with pieces_of(appliance, recorded, span) as pieces, MONITOR.reports():
-            _cover(pieces, span, as_json=appliance.as_json)
+            _cover(pieces, span, recorded.in_progress, as_json=appliance.as_json)
             spans = [(piece.name, piece.bag, piece.span) for piece in pieces]
             run_spans(specifications, spans, report, patterns, margins=margins)
     except SpecificationError as error:
         raise refused(error.findings) from None
 
 
-def _cover(pieces: Sequence[Piece], span: Span, *, as_json: bool) -> None:
+def _cover(
+    pieces: Sequence[Piece], span: Span, in_progress: Sequence[OpenRecording], *, as_json: bool
+) -> None:
+    """Print the gaps; messages of a recording that is still being made are not readable yet."""
     # Without --since, the time before the first piece is not a gap.
     began = span.since or pieces[0].span.since
     for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
         if as_json:
             say_json({"kind": "gap", "since": gap.since / BILLION, "until": gap.until / BILLION})
         else:
-            say(f"not recorded: {gap}", "yellow")
+            making = next((one for one in in_progress if one.began <= gap.until), None)
+            until = (
+                ""
+                if making is None
+                else f"; {making.id} is being recorded until {rfc3339(making.ends)} or later"
+            )
+            say(f"{'not recorded' if making is None else 'not readable yet'}: {gap}{until}", "yellow")
     for name, why_not in dict.fromkeys((piece.name, piece.why_not) for piece in pieces if piece.why_not):
         if as_json:
             say_json({"kind": "incomplete", "bag": name, "text": why_not})

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.recording_answers import Recording, Recordings
+from appliance.channel.answers.recording_answers import OpenRecording, Recording, Recordings, Trigger
 from appliance.network.scan import ScanResult
 from rosmop.tests.acting import message
 from tests.support.answers import example
@@ -68,7 +68,7 @@ def write_pair(*, below: list[str]) -> None:
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
     """`recordings SECONDS [fleeting]`: recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and the memory's contents.
 
-    The id is the letter 20 times; `m` is the memory, with SECONDS of messages. A recording has one number a second, the
+    The id is the letter 20 times; `m` is the memory, with SECONDS of messages; `o` is still being made. A recording has one number a second, the
     last digit of that second. A fleeting recording is removed when the next one is fetched.
     """
     known, fetched = dict[str, Recording](), list[str]()
@@ -89,8 +89,10 @@ def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: l
         fetched.append(request["id"])
         return AdminAnswer(True, known[request["id"]])
 
-    kept = [row for row in known.values() if row is not memory]
-    listed = Recordings(kept, ["/*"], ["/secret*", "std_msgs/Char"], float(before))
+    making = known.get("o" * 20)
+    kept = [row for row in known.values() if row not in (memory, making)]
+    progress = [OpenRecording(making.id, making.began, making.ended, example(Trigger))] if making else []
+    listed = Recordings(kept, ["/*"], ["/secret*", "std_msgs/Char"], float(before), progress)
     fake.decide("recordings", lambda _request: AdminAnswer(True, listed))
     fake.decide("recording fetch", fetch)
     if memory is not None:
