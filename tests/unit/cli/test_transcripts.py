@@ -68,8 +68,8 @@ def write_pair(*, below: list[str]) -> None:
 def keep_recordings(fake: FakeAppliance, before: str, how: str = "", *, below: list[str]) -> None:
     """`recordings SECONDS [fleeting]`: recordings, each `LETTER BEGAN ENDED {FIELD: VALUE}`, and the memory's contents.
 
-    The id is the letter 20 times; `m` is the memory, with SECONDS of messages; `o` is still being made. A recording has one number a second, the
-    last digit of that second. A fleeting recording is removed when the next one is fetched.
+    The id is the letter 20 times; `m` is the memory, with SECONDS of messages, and `o` is still being made. A recording
+    has one number a second, the last digit of that second. A fleeting one is removed when the next one is fetched.
     """
     known, fetched = dict[str, Recording](), list[str]()
     for line in below:
