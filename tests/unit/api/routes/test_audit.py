@@ -55,7 +55,7 @@ def test_equality_is_of_the_parts_that_the_client_may_read(make_log: MakeLog) ->
     for reader in (bearer("v"), bearer("o", "operator")):
         page = page_of(log.path, wanted, None, 9, reader, newest_first=True, equality=True)
         first, second = page["equality"]
-        assert first == second
+        assert first | {"began": second["began"], "ended": second["ended"]} == second
         assert (first["times"], first["value"]) == (1, "dropped")
     assert page_of(log.path, wanted, None, 1, bearer("v"), newest_first=True, equality=True)["equality"] == [
         first
