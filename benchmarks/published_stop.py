@@ -1,29 +1,43 @@
-"""Time until a relay sends a stop that a monitor publishes: python -m benchmarks.published_stop [--stops 400]
+"""Time until a stop that a monitor publishes is sent: python -m benchmarks.published_stop [--deployed] [--stops 400]
 
-A scan with a near obstacle arrives alone, some milliseconds after the one before it. The monitor prints a warning and
-publishes a zero velocity. The measured time is from the arrival of the scan at the monitors until the relay has the
-zero velocity to send, without sockets.
+A scan with a near obstacle arrives alone, some milliseconds after the one before it, and the monitor publishes a zero
+velocity. The time is from the arrival of the scan at the monitors until the relay has the zero velocity to send,
+without sockets. With `--deployed`, the time is from one rospy node's call of `publish` to another's callback, at an
+appliance that `rosrv up` has started; commands that a monitor changes take turns with the stops. The nodes have
+real-time priority if that is permitted, so that the delay is that of the appliance. With `--busy` as well, two programs
+for each core keep it busy all the time.
 """
 
 import argparse
+import contextlib
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from pathlib import Path
 
+from benchmarks.cold import realtime
+from benchmarks.relay_throughput import HERE
 from rosmop.tests.acting import message
+from tests.support.appliance import Appliance
+from tests.support.nodes import PYTHON, RosSession
 from tests.unit.relay.monitors.quiet import QuietMonitors
 
 STOP = """stop() { geometry_msgs::Twist zero; bool near;
     event scan(std::vector<float> ranges) /scan sensor_msgs/LaserScan '{ranges:ranges}' {
         near = ranges.size() > 0 && ranges[0] < 0.5;
         if (near) { ROS_WARN("obstacle at %f", ranges[0]); PUBLISH(/cmd_vel, geometry_msgs/Twist, zero); } } }"""
+SILENT_STOP = STOP.replace('ROS_WARN("obstacle at %f", ranges[0]);', "")
+CAP = """cap() {
+    event drive(double x) /drive geometry_msgs/Twist '{linear:{x:x}}' { if (x > 1.0) { x = 1.0; } } }"""
 NEAR = message("sensor_msgs/LaserScan", ranges=[0.1] * 40)
 
 
-def main() -> None:
-    """Print the median and the 99th percentile."""
-    arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    arguments.add_argument("--stops", type=int, default=400)
-    stops = arguments.parse_args().stops
+def alone(stops: int) -> dict[str, list[float]]:
+    """Return the milliseconds of stops without sockets."""
     sent: list[int] = []
     monitors = QuietMonitors(lambda _topic, _data: sent.append(time.perf_counter_ns()))
     monitors.load(STOP)
@@ -34,9 +48,48 @@ def main() -> None:
         time.sleep(0.007)  # noqa: TID251  lets caches become cold, as between two scans
         began = time.perf_counter_ns()
         monitors.process("/scan", NEAR, number * 10_000_000 + 1)
-        took.append((sent[-1] - began) / 1e3)
-    cuts = statistics.quantiles(took, n=100)
-    print(f"published stop: {cuts[49]:.0f} µs, 99 %: {cuts[98]:.0f} µs")
+        took.append((sent[-1] - began) / 1e6)
+    return {"published stop": took}
+
+
+def deployed(stops: int) -> dict[str, list[float]]:
+    """Return the milliseconds of changed commands and of stops at a running appliance."""
+    monitors = {"stop": SILENT_STOP, "cap": CAP}
+    with (
+        Appliance(monitors=monitors, options=("--api", "127.0.0.1:0")) as appliance,
+        tempfile.TemporaryDirectory() as home,
+        RosSession(appliance.master_uri, Path(home)) as session,
+    ):
+        node = session.start([*realtime(), PYTHON, str(HERE / "nodes" / "stopped_node.py"), str(stops)])
+        measured = node.wait_for(event="measured", timeout=120 + stops)
+    return {"changed command": measured["changed"], "published stop": measured["stopped"]}
+
+
+@contextlib.contextmanager
+def busy_programs(number: int) -> Iterator[None]:
+    """Run this number of programs that always want a core."""
+    command = [sys.executable, "-c", "while True: pass"]
+    programs = [subprocess.Popen(command, start_new_session=True) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+def main() -> None:
+    """Print the quantiles."""
+    arguments = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    arguments.add_argument("--stops", type=int, default=400)
+    arguments.add_argument("--deployed", action="store_true")
+    arguments.add_argument("--busy", action="store_true")
+    given = arguments.parse_args()
+    with busy_programs(2 * (os.cpu_count() or 1) if given.busy else 0):
+        rows = (deployed if given.deployed else alone)(given.stops)
+    for name, took in rows.items():
+        cuts = statistics.quantiles(took, n=100)
+        print(f"{name}: 50 % {cuts[49]:.2f} ms, 90 % {cuts[89]:.2f} ms, 99 % {cuts[98]:.2f} ms")
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ class LaunchPlan(msgspec.Struct, frozen=True):
     environment: dict[str, str] = {}
     ended_early: int = 0
     nice: int = 0
+    slice_ns: int = 0
 
 
 def title_of(role: str, index: int | None) -> str:
@@ -89,6 +90,8 @@ def _prepare(plan: LaunchPlan) -> None:
     privileges.raise_file_limit(plan.files)
     privileges.raise_oom_score(plan.ended_early)
     os.nice(plan.nice)
+    if plan.slice_ns:
+        privileges.shorten_slice(plan.slice_ns)
     if plan.view is not None:
         private_view.enter(plan.view, plan.account)
     if not plan.network:

@@ -30,6 +30,7 @@ _PR_SET_KEEPCAPS = 8
 _CLONE_NEWNET = 0x40000000
 _LAST_CAPABILITY_FILE = "/proc/sys/kernel/cap_last_cap"
 _CAPABILITY_VERSION_3 = 0x20080522
+_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 
 
 def die_with_parent(parent: int) -> None:
@@ -74,6 +75,22 @@ def raise_priority(by: int) -> int:
     except PermissionError:
         return 0
     return by
+
+
+def shorten_slice(nanoseconds: int) -> None:
+    """Ask the scheduler for short turns, so that this process runs soon after it wakes; its share stays the same.
+
+    Linux before 6.12 ignores the request. A container may forbid it; then nothing changes.
+    """
+    call = _SCHED_SETATTR.get(os.uname().machine)
+    if call is None:
+        return
+    attributes = (ctypes.c_uint32 * 12)()  # struct sched_attr; the slice is a 64-bit number at byte 24
+    ctypes.c_int32.from_buffer(attributes, 16).value = os.getpriority(os.PRIO_PROCESS, 0)
+    attributes[0] = ctypes.sizeof(attributes)
+    ctypes.c_uint64.from_buffer(attributes, 24).value = nanoseconds
+    with contextlib.suppress(OSError):
+        libc_call("syscall(sched_setattr)", call, 0, attributes, 0)
 
 
 def leave_network() -> None:

@@ -77,7 +77,8 @@ class Role:
     role if the role's user may not reach them. `sandbox` has the permitted system calls, and the files and ports
     besides the role's part and the system. `ended_early` is the role's `oom_score_adj` (0 to 1000): the kernel
     kills a higher one earlier if memory is short. `nice` is its niceness: a higher one yields the processor, so that
-    no console delays a stop. A negative one has effect if the supervisor could lower its own. `receiver` is the
+    no console delays a stop. A negative one has effect if the supervisor could lower its own. `slice_ns` is the length
+    of its turns at the processor (0: the kernel's): a process with short turns waits less for each. `receiver` is the
     only other machine that the firewall lets the user reach.
 
     A feature's role runs if the settings of features let it (`configured`).
@@ -108,6 +109,7 @@ class Role:
     inputs: Callable[[Facts], tuple[Path, ...]] = lambda _facts: ()
     ended_early: int = 0
     nice: int = 0
+    slice_ns: int = 0
     sandbox: Callable[[Facts], SandboxPlan] = lambda _facts: SandboxPlan(allowlist=True)
     configured: Callable[[Sections], bool] = lambda _sections: True
     receiver: Callable[[Sections], RemoteReceiver | None] = lambda _sections: None

@@ -24,6 +24,7 @@ _ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 LEASE_NICE = -10  # as the unit of the witness has
+_SHORTEST_SLICE = 100_000  # nanoseconds, the kernel's minimum
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
@@ -77,7 +78,7 @@ ROLES = (
     ),
     _ours(
         "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
-        ended_early=300, indexed=True, files=65_536,
+        ended_early=300, indexed=True, files=65_536, slice_ns=_SHORTEST_SLICE,
         sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, connects=None),
     ),
     _ours(
