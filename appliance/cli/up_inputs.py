@@ -97,7 +97,7 @@ def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: boo
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException), open(writer, "w", encoding="utf-8") as answer:  # noqa: PTH123  a pipe
-            answer.write(_errors_in(folder, site_keys) or _VALID)
+            answer.write(_errors_in(folder, site_keys, kept=kept) or _VALID)
         os._exit(0)
     os.close(writer)
     with open(reader, encoding="utf-8") as answer:  # noqa: PTH123  as above
@@ -109,7 +109,7 @@ def _require_specifications(folder: Path, site_keys: Sequence[str], *, kept: boo
         raise StartError(result or f"{folder}: the process that read the specifications exited early")
 
 
-def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
+def _errors_in(folder: Path, site_keys: Sequence[str], *, kept: bool) -> str:
     from appliance.specifications.checking import (  # noqa: PLC0415  the compiler: only in this child
         check,
         contents_at_start,
@@ -117,19 +117,26 @@ def _errors_in(folder: Path, site_keys: Sequence[str]) -> str:
     from appliance.specifications.specification_files import (  # noqa: PLC0415  as above
         SpecificationsRefusedError,
         read_folder,
+        read_usable,
     )
 
     try:
-        sources = read_folder(folder)
-        try:
-            check(sources, site_keys)
-        except SpecificationsRefusedError as error:
-            started = check(sources, site_keys, compiler=contents_at_start)
-            without = ", ".join([*started.unbuilt, *started.left_out])
-            unguarded = "; nothing guards the topics of files that cannot be read" if started.left_out else ""
-            refused([*error.findings, f"started without {without}{unguarded}: rosrv status"])
+        check(read_folder(folder), site_keys)
+        return ""
     except SpecificationsRefusedError as error:
-        return "\n".join(error.findings)
+        findings = error.findings
+    try:
+        sources, unusable = read_usable(folder, site_keys)
+        started = check(sources, site_keys, compiler=contents_at_start)
+    except SpecificationsRefusedError:
+        return "\n".join(findings)
+    if kept and unusable:
+        return "\n".join(findings)
+    left_out = [*started.left_out, *unusable]
+    unguarded = "; nothing guards the topics of files that cannot be read" if left_out else ""
+    refused(
+        [*findings, f"started without {', '.join([*started.unbuilt, *left_out])}{unguarded}: rosrv status"]
+    )
     return ""
 
 

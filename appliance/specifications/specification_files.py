@@ -64,17 +64,30 @@ class Sources(msgspec.Struct, frozen=True):
 
         Raises `SpecificationsRefusedError` with every file and definition that no site key signed.
         """
+        found, unsigned = self._signed(site_keys)
+        if unsigned:
+            raise SpecificationsRefusedError([*unsigned.values()])
+        return sorted(found)
+
+    def signed(self, site_keys: Sequence[str]) -> tuple["Sources", dict[str, str]]:
+        """Return the sources that site keys signed, and the errors of the others by their names below the folder."""
+        _, errors = self._signed(site_keys)
+        files, definitions = (
+            {name: text for name, text in texts.items() if folder + name not in errors}
+            for folder, texts in (("", self.files), ("msg/", self.definitions))
+        )
+        return Sources(files, definitions, self.signatures), errors
+
+    def _signed(self, site_keys: Sequence[str]) -> tuple[set[str], dict[str, str]]:
         found: set[str] = set()
-        findings = []
+        unsigned = {}
         for name, text in (self.files | self.definitions).items() if site_keys else ():
             try:
                 found.add(signer(site_keys, text, self.signatures.get(name, "")))
             except UnsignedError as error:
                 place = name if name in self.files else f"msg/{name}"
-                findings.append(f"{place}:1:1: error: {error}")
-        if findings:
-            raise SpecificationsRefusedError(findings)
-        return sorted(found)
+                unsigned[place] = f"{place}:1:1: error: {error}"
+        return found, unsigned
 
     def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
         """Return the names of added, changed and removed files; the name of a definition is `msg/package/Type.msg`."""
@@ -141,7 +154,11 @@ def require_bounded(sources: Sources) -> None:
         )
     for name, text in sources.files.items():
         if len(text) > _LONGEST_FILE:
-            raise SpecificationsRefusedError([f"{name}: longer than {_LONGEST_FILE} characters"])
+            raise SpecificationsRefusedError([_too_long(name)])
+
+
+def _too_long(name: str) -> str:
+    return f"{name}: longer than {_LONGEST_FILE} characters"
 
 
 def read_folder(folder: Path) -> Sources:
@@ -149,32 +166,70 @@ def read_folder(folder: Path) -> Sources:
 
     Raises `SpecificationsRefusedError`.
     """
+    sources, errors = _read_folder(folder)
+    if errors:
+        raise SpecificationsRefusedError([*errors.values()])
+    return sources
+
+
+def read_usable(folder: Path, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
+    """Read the files of a folder that may come into force; return the errors of the others, by name.
+
+    The others cannot be opened, are not UTF-8 text, are too long, or have no signature of a site key. Raises
+    `SpecificationsRefusedError` if the folder cannot be read.
+    """
+    found, errors = _read_folder(folder)
+    sources, unsigned = found.signed(site_keys)
+    longer = {name: _too_long(name) for name, text in sources.files.items() if len(text) > _LONGEST_FILE}
+    return sources.without({*longer}), errors | unsigned | longer
+
+
+def _read_folder(folder: Path) -> tuple[Sources, dict[str, str]]:
+    """Return the readable files of a folder, and the errors of the others by their names below the folder."""
     try:
-        return _read_folder(folder)
+        if not _is(stat.S_ISDIR, folder):
+            raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
+        paths = {path.name: path for path, _is_folder in entries_of(folder) if path.match("*.rv")}
     except OSError as error:
-        place = error.filename or folder
-        text = f"{place}: the specifications cannot be read: {error.strerror}"
-        raise SpecificationsRefusedError([text]) from error
+        raise _unreadable(folder, error) from error
+    definitions: dict[str, Path] = {}
+    texts: dict[str, str] = {}
+    errors: dict[str, str] = {}
+    try:
+        definitions = _definitions_in(folder / "msg")
+    except SpecificationsRefusedError as error:
+        errors["msg"] = str(error)
+    for name, path in (paths | {f"msg/{name}": path for name, path in definitions.items()}).items():
+        try:
+            texts[name] = _read(path)
+        except SpecificationsRefusedError as error:
+            errors[name] = str(error)
+    return Sources(
+        {name: texts[name] for name in paths if name in texts},
+        {name: texts[f"msg/{name}"] for name in definitions if f"msg/{name}" in texts},
+        signatures_of(paths | definitions),
+    ), errors
 
 
-def _read_folder(folder: Path) -> Sources:
-    if not _is(stat.S_ISDIR, folder):
-        raise SpecificationsRefusedError([f"{folder}: the folder of specifications does not exist"])
-    paths = {path.name: path for path, _is_folder in entries_of(folder) if path.match("*.rv")}
-    files = {name: _read(path) for name, path in paths.items()}
-    definitions: dict[str, str] = {}
-    own = folder / "msg"
-    for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
-        if path.suffix in {".msg", ".srv"} and _is(stat.S_ISREG, path):
-            package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
-            if package in {folder, own}:
-                place = f"{folder}/msg/package/{path.name}"
-                raise SpecificationsRefusedError(
-                    [f"{path}: a definition belongs in the folder of its package: {place}"]
-                )
-            name = f"{package.name}/{path.name}"
-            definitions[name], paths[name] = _read(path), path
-    return Sources(files, definitions, signatures_of(paths))
+def _definitions_in(own: Path) -> dict[str, Path]:
+    """Return the files of definitions by `package/Type.msg`. Raises `SpecificationsRefusedError`."""
+    found = {}
+    try:
+        for path in files_below(own) if _is(stat.S_ISDIR, own) else ():
+            if path.suffix in {".msg", ".srv"} and _is(stat.S_ISREG, path):
+                package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
+                if package in {own.parent, own}:
+                    text = f"a definition belongs in the folder of its package: {own}/package/{path.name}"
+                    raise SpecificationsRefusedError([f"{path}: {text}"])
+                found[f"{package.name}/{path.name}"] = path
+    except OSError as error:
+        raise _unreadable(own, error) from error
+    return found
+
+
+def _unreadable(path: Path, error: OSError) -> SpecificationsRefusedError:
+    text = f"{error.filename or path}: the specifications cannot be read: {error.strerror}"
+    return SpecificationsRefusedError([text])
 
 
 def _is(kind: Callable[[int], bool], path: Path) -> bool:
@@ -194,6 +249,8 @@ def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
 def _read(path: Path) -> str:
     try:
         return read_given_text(path, "utf-8-sig")
+    except OSError as error:
+        raise _unreadable(path, error) from error
     except UnicodeDecodeError as error:
         raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error
 
@@ -216,6 +273,10 @@ class SpecificationFolder:
     def read(self) -> Sources:
         """Read all files. Raises `SpecificationsRefusedError`."""
         return read_folder(self.path) if self.path is not None else Sources()
+
+    def read_usable(self, site_keys: Sequence[str]) -> tuple[Sources, dict[str, str]]:
+        """Read the files that may come into force, like the function. Raises `SpecificationsRefusedError`."""
+        return read_usable(self.path, site_keys) if self.path is not None else (Sources(), {})
 
     def looked_at(self) -> Sources | None:
         """Return the present content; None if it is not valid. Do not read unchanged files again."""

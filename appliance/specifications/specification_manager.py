@@ -195,6 +195,8 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             self._end_limit()
             if sources.files or self.revision:
                 self._keep(sources, checked, who=DISK, note="read at start")
+            else:
+                self._enforce(sources, checked)
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         if refused:

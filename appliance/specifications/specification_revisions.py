@@ -76,6 +76,8 @@ async def specifications_at_start(
         sources, checked, refused = await _folder_or_kept(folder, kept, check, site_keys)
     else:
         sources, checked = sources_of(last), await _check_kept(check, last, site_keys)
+    if last is None or last.who == DISK:
+        checked = _without_unusable(checked, sources, folder, site_keys)
     unknown = sorted(set(named) - checked.monitors.keys())
     if unknown and not checked.left_out and (last is None or last.who == DISK):
         raise SpecificationsRefusedError([f"--enable: {unknown_monitors(unknown, checked)}"])
@@ -91,17 +93,32 @@ async def _folder_or_kept(
         checked = await check(sources, site_keys)
         findings = [*checked.unbuilt.values(), *checked.left_out.values()]
     except SpecificationsRefusedError as error:
-        if kept is None:
-            raise
-        findings = error.findings
+        findings, checked = error.findings, None
     if findings and kept is not None and sources_of(kept) != sources:
         with contextlib.suppress(SpecificationsRefusedError):
             before = await check(sources_of(kept), site_keys)
             if not (before.unbuilt or before.left_out):
                 return StartingSpecifications(sources_of(kept), before, findings)
     if sources is None or checked is None:
-        raise SpecificationsRefusedError(findings)
+        try:
+            sources, _ = folder.read_usable(site_keys)
+            checked = await check(sources, site_keys)
+        except SpecificationsRefusedError:
+            raise SpecificationsRefusedError(findings) from None
     return StartingSpecifications(sources, checked, [])
+
+
+def _without_unusable(
+    checked: CheckedSpecifications, sources: Sources, folder: SpecificationFolder, site_keys: Sequence[str]
+) -> CheckedSpecifications:
+    """Add to the files that are left out those of the folder of which no usable text is in force."""
+    try:
+        _, errors = folder.read_usable(site_keys)
+    except SpecificationsRefusedError:
+        return checked
+    present = sources.named()
+    unusable = {name: error for name, error in errors.items() if name not in present}
+    return msgspec.structs.replace(checked, left_out={**unusable, **checked.left_out})
 
 
 def unknown_monitors(names: Sequence[str], checked: CheckedSpecifications) -> str:

@@ -1,5 +1,6 @@
 """Tests of `appliance.cli.up_inputs`: what `rosrv up` reads before it starts anything."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from appliance.store.state_file import RevisionRow, StateStore
 from appliance.supervisor.errors import StartError
 from tests.support.control_parts import OPEN
 from tests.support.engines import InlineDatabase
+from tests.support.site_key import LINE
 
 KEPT = OPEN + "[Ports]\nrange = 19001-20000\n"
 NEW = OPEN + "[Ports]\nrange = 21001-22000\n"
@@ -49,6 +51,23 @@ def test_the_ports_are_those_of_the_policy_that_comes_into_force(
     if cases:
         settings.policy.with_name("policy.ini.tests.yaml").write_text(cases)
     assert read_node_ports(settings, witness).start == first
+
+
+@pytest.mark.parametrize(("content", "keys"), [(b"\xff\xfe", ()), (None, ()), (NEW.encode(), (LINE,))])
+def test_a_first_start_is_refused_without_a_usable_policy(
+    settings: Settings, content: bytes | None, keys: tuple[str, ...]
+) -> None:
+    """Nothing starts, and the operator reads why. Later the revision that was in force stays, if it is signed."""
+    settings = replace(settings, site_keys=keys)
+    settings.policy.unlink()
+    if content is None:
+        settings.policy.mkdir()
+    else:
+        settings.policy.write_bytes(content)
+    with pytest.raises(StartError, match=r"policy\.ini.*(UTF-8|it is a folder|signature)"):
+        read_node_ports(settings)
+    store_revision(settings, "disk")
+    assert read_node_ports(settings).start == (DEFAULT_PORTS.start if keys else 19001)
 
 
 def test_a_first_start_needs_a_valid_policy(settings: Settings) -> None:

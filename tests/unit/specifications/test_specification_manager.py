@@ -249,8 +249,7 @@ def sources(**texts: str) -> Sources:
 
 async def test_with_site_keys_only_signed_specifications_come_into_force(desk: Desk) -> None:
     unsigned = "a.rv:1:1: error: it has no signature of the site"
-    with pytest.raises(SpecificationsRefusedError, match=unsigned):
-        await desk.monitors(site_keys=[LINE])
+    assert unsigned in (await desk.monitors(site_keys=[LINE])).checked.left_out["a.rv"]
     await desk.monitors()  # revision 1 is unsigned
     await desk.store.settled()
     beside = desk.folder / "a.rv.sig"
@@ -347,3 +346,37 @@ async def test_a_first_start_leaves_out_a_file_that_it_cannot_parse(desk: Desk) 
     (desk.folder / "a.rv").write_text(A)
     await monitors.reload(admin.MonitorReload(), "adam")
     assert (monitors.checked.left_out, monitors.names()) == ({}, ["a"])
+
+
+@pytest.mark.parametrize("others", [{}, {"a.rv": A}])
+@pytest.mark.parametrize("fault", ["text", "unsigned", "long", "folder", "link"])
+async def test_a_first_start_leaves_out_a_file_that_it_cannot_use(
+    desk: Desk, others: dict[str, str], fault: str
+) -> None:
+    """The others come into force, and the file stays an alarm over a crash and a restart until it is whole."""
+    (desk.folder / "a.rv").unlink()
+    for name, text in others.items():
+        (desk.folder / name).write_text(text)
+        (desk.folder / f"{name}.sig").write_text(signed(text))
+    bad = desk.folder / "b.rv"
+    if fault == "folder":
+        bad.mkdir()
+    elif fault == "link":
+        bad.symlink_to("nowhere")
+    else:
+        bad.write_bytes(
+            {"text": b"\xff\xfe", "unsigned": B.encode(), "long": b" " * (1 << 20) + B.encode()}[fault]
+        )
+    if fault == "long":
+        (desk.folder / "b.rv.sig").write_text(signed(bad.read_text()))
+    for restarted in (False, True, False):
+        monitors = await desk.monitors(restarted=restarted, site_keys=[LINE])
+        assert (monitors.sources.files, list(monitors.checked.left_out)) == (others, ["b.rv"])
+        assert monitors.differs_from_folder
+        await desk.store.settled()
+    if fault != "folder":
+        bad.unlink()
+        bad.write_text(B)
+        (desk.folder / "b.rv.sig").write_text(signed(B))
+        monitors = await desk.monitors(site_keys=[LINE])
+        assert (monitors.names(), monitors.checked.left_out) == ([*"ab"][-1 - len(others) :], {})
