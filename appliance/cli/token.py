@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from appliance.base import clock
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke, TokenRotate
 from appliance.channel.answers.token_answers import NewToken, Token, TokenRole
 from appliance.cli import completion
@@ -119,7 +118,6 @@ def list_tokens(appliance: Appliance) -> None:
 
     Example: rosrv token list
     """
-    now = clock.wall()
     body = appliance.ask_or_exit(TokenList())
     for row in body.tokens:
         if appliance.as_json:
@@ -128,7 +126,7 @@ def list_tokens(appliance: Appliance) -> None:
         if row.revoked is not None:
             end = f"revoked {moment(row.revoked)}"
         else:
-            end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
+            end = f"{'until' if row.valid else 'expired'} {moment(row.expires)}"
         used = _use(row, body.uses_since)
         say_row([f"{row.name:<24} {row.role:<12} {row.id}", f"created {moment(row.created)}", end, used])
 

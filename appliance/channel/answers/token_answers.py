@@ -31,6 +31,10 @@ class Token(msgspec.Struct, frozen=True):
     last_used: Annotated[
         Moment | None, doc("when it was last presented, to within a minute; null: not since `uses_since`")
     ] = None
+    valid: Annotated[
+        bool,
+        doc("whether REST accepts it; a step back of the system time does not make an expired token valid"),
+    ] = True
 
 
 class Tokens(msgspec.Struct, frozen=True):

@@ -214,7 +214,7 @@ class TokenOrders:
         self._changed()
 
     def _shown(self, row: TokenRow) -> answers.Token:
-        return answers.Token(*_fields(row), self._uses.get(row.id))
+        return answers.Token(*_fields(row), self._uses.get(row.id), row.usable(self._ends))
 
 
 def _require_lifetime(seconds: float) -> None:

@@ -23,7 +23,7 @@ from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.engines import InlineDatabase, open_log
-from tests.support.virtual_clock import VirtualClock
+from tests.support.virtual_clock import VirtualClock, let_time_pass, set_wall
 
 pytestmark = pytest.mark.anyio
 
@@ -146,6 +146,19 @@ async def test_earlier_tokens_are_valid_for_the_grace_time(lives: Lives) -> None
         with using(VirtualClock(wall=now + seconds)):
             later = lives.next()
             assert {one.id for one in later.usable()} == {one.id for one in valid}
+
+
+async def test_the_list_shows_an_end_as_the_door_judges_it(lives: Lives) -> None:
+    """A step back of the system time, also before a restart, does not show an expired token as valid."""
+    tokens = lives.next()
+    await tokens.add(TokenAdd("alice", "viewer", 3600))
+    await tokens.add(TokenAdd("bob", "viewer", 7200))
+    let_time_pass(3601)
+    set_wall(wall() - 86_400)
+    assert {row.name: row.valid for row in (await tokens.listed(TokenList())).tokens} == {
+        "alice": False,
+        "bob": True,
+    }
 
 
 async def test_revoking_a_name_ends_its_earlier_tokens_too(lives: Lives) -> None:
