@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 import typer
 
 from appliance.base.actors import actor
+from appliance.base.option_group import GroupedVerb
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.connection.target import Appliance, speaks
@@ -44,7 +45,7 @@ def verbs_of(
     confirmation: AdminRequest[_Confirmed],
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
-) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
+) -> tuple[GroupedVerb, GroupedVerb, GroupedVerb]:
     """Return the verbs `revisions`, `rollback` and `confirm` of `rosrv noun`.
 
     `listed`, `confirmation` and `back(revision)` are their requests; `say_done` prints the result of a rollback.

@@ -17,6 +17,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
 
 
@@ -134,5 +135,9 @@ def loaded(verb: Verb, name: str) -> Any:
     module, _colon, attribute = verb.place.partition(":")
     found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(name, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(found)
+    function, kind = (
+        (found.function, found.command) if isinstance(found, GroupedVerb) else (found, TyperCommand)
+    )
+    words = "\n\n".join(filter(None, (verb.first, inspect.getdoc(function))))
+    app.command(name, cls=kind, help=words)(function)  # type: ignore[arg-type]  # typer only calls `cls`
     return typer.main.get_command(app)

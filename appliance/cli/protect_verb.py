@@ -25,27 +25,8 @@ OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # most open ports listed on a terminal
 _MOST_TOLD = 100
 
-HELP = """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
 
-\b
-  rosrv protect --appliance 192.168.1.20                    print the rules
-  rosrv protect --state /var/lib/rosrv                      rules for the appliance on this machine
-  sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
-  rosrv protect --check 192.168.1.10                        on ANOTHER machine: is it closed?
-  rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and report to the appliance (role operator)
-  sudo rosrv protect --remove
-
-\b
-The rules last until the next boot. To keep them, install the file:
-  rosrv protect --appliance 192.168.1.20 | sudo tee /etc/rosrv-protect.nft
-  echo 'include "/etc/rosrv-protect.nft"' | sudo tee -a /etc/nftables.conf
-  sudo systemctl enable --now nftables
-
-The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
-"""
-
-
-@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")])
+@speaks_with("One JSON object on standard output.")
 def protect(
     running: Appliance,
     *,
@@ -83,7 +64,24 @@ def protect(
         float, typer.Option(min=0.05, max=60, help="Check: seconds to wait for each port.")
     ] = 1.0,
 ) -> None:
-    """Print, apply, check or remove the rules; `HELP` replaces this text."""
+    """Nodes listen on ports of the local port range. Without --apply, --check or --remove, print the nftables rules.
+
+    \b
+      rosrv protect --appliance 192.168.1.20                    print the rules
+      rosrv protect --state /var/lib/rosrv                      rules for the appliance on this machine
+      sudo rosrv protect --appliance 192.168.1.20 --open tcp/40022 --apply
+      rosrv protect --check 192.168.1.10                        on ANOTHER machine: is it closed?
+      rosrv protect --check 192.168.1.10 --api https://192.168.1.20:8443      and report to the appliance (role operator)
+      sudo rosrv protect --remove
+
+    \b
+    The rules last until the next boot. To keep them, install the file:
+      rosrv protect --appliance 192.168.1.20 | sudo tee /etc/rosrv-protect.nft
+      echo 'include "/etc/rosrv-protect.nft"' | sudo tee -a /etc/nftables.conf
+      sudo systemctl enable --now nftables
+
+    The check tries TCP. Run it on a machine other than the appliance, which is allowed in.
+    """  # noqa: E501  a line of the help, as the terminal shows it
     if sum((apply, check is not None, remove)) > 1:
         _fail("--apply, --check and --remove exclude one another")
     try:
@@ -97,9 +95,6 @@ def protect(
             _make(appliance or [_own(running)], chosen, services, apply, running.as_json)
     except (ValueError, NetworkError) as error:
         _fail(str(error))
-
-
-protect.__doc__ = HELP
 
 
 def _make(

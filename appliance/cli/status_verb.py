@@ -45,7 +45,7 @@ _COLUMN = 38  # width for one process, in characters
 _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 
-@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object; with --watch one a line")])
+@speaks_with("One JSON object; with --watch one a line")
 def status(
     appliance: Appliance,
     *,

@@ -13,7 +13,8 @@ import psycopg
 import typer
 
 from appliance.audit.log.record_format import printable
-from appliance.audit.search.query import Filter, FilterError
+from appliance.audit.search.filter_options import FILTER, FilteredCommand
+from appliance.audit.search.query import FilterError
 from appliance.base.timestamps import TimestampError
 from rosrv_fleet.bundles.commands import bundle
 from rosrv_fleet.collector import Collector, make_collector
@@ -22,7 +23,6 @@ from rosrv_fleet.database import migrate
 from rosrv_fleet.enrolment import EnrolmentError
 from rosrv_fleet.evidence.commands import evidence
 from rosrv_fleet.evidence.store import EvidenceStore
-from rosrv_fleet.filtering import searched
 from rosrv_fleet.indexer import NOT_INDEXABLE, index
 from rosrv_fleet.options import DEFAULT_CONFIG, Config, Json
 from rosrv_fleet.output import configure_log
@@ -166,10 +166,9 @@ def remove_evidence(
     typer.echo(f"{removed.id} is removed: evidence of {removed.robot}, {removed.bytes} bytes")
 
 
-@app.command()
-@searched
+@app.command(cls=FilteredCommand)
 def search(
-    wanted: Filter,
+    context: typer.Context,
     robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot; a glob")] = None,
     limit: Annotated[
         int, typer.Option("--limit", min=1, max=LARGEST_FLEET_PAGE, help="Largest number of records")
@@ -183,6 +182,7 @@ def search(
 
     Example: rosrv-fleet search --deny --since 1h --topic '/cmd_*' --robot 'arm*'
     """
+    wanted = FILTER.value(context.params)
     collector = make_collector(load_config(config))
     waiting = collector.store.waiting(_MOST_WAITING)
     database = collector.searches.database

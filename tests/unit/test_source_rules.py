@@ -155,7 +155,6 @@ _TEXT = "a word in a text for people"
 _OF_FEATURES = "a section of a feature is added at its key, so that the core does not name the feature"
 LOOKUPS = {
     "appliance/api/front/moments.py _units": "msgspec names the schemas of structs by their classes",
-    "appliance/api/routes/operation_routes.py _add": _LIBRARY,
     "appliance/api/front/routing.py add_api_route": _LIBRARY,
     "appliance/api/front/routing.py components": "the schemas in the contract have the names of their structs",
     "appliance/api/front/routing.py tagged": "monitors have a tag, other answers with an ETag a revision",
@@ -163,7 +162,6 @@ LOOKUPS = {
     "appliance/audit/log/record_format.py as_object": _FIELDS,
     "appliance/audit/search/search.py _neighbours": "the fields of a record have the names of the log's columns",
     "appliance/backup/create.py _is_full": _LIBRARY,
-    "appliance/cli/connection/target.py speaking": _LIBRARY,
     "appliance/cli/demo.py demo": "the demonstration is beside the package, and imports it",
     "appliance/cli/lazy.py loaded": _IMPORTED,
     "appliance/cli/selftest/probe_nodes.py call": _LIBRARY,
@@ -353,6 +351,16 @@ def direct_clocks(source: Source) -> Iterator[tuple[int, str]]:
                 yield node.lineno, source.path
 
 
+# --- signatures ---
+
+
+def forged_signatures(source: Source) -> Iterator[tuple[int, str]]:
+    """Yield each use of a signature or of annotations that are not those of the function as written."""
+    for node in source.nodes:
+        if isinstance(node, ast.Attribute) and node.attr in ("__signature__", "__annotations__"):
+            yield node.lineno, node.attr
+
+
 # --- pages and prose ---
 
 
@@ -432,6 +440,11 @@ RULES = {
     "clocks": Rule(
         ("appliance/", "fleet/rosrv_fleet/"), direct_clocks, exactly(DIRECT, "read it with appliance/base/clock.py"),
         ["time.monotonic_ns()", "datetime.datetime.now()", "from time import time", "date.today()"],
+    ),
+    "signatures": Rule(
+        (*WITH_FLEET, "distribution/"), forged_signatures,
+        forbid("write the parameters: a dependency of FastAPI, or an OptionGroup of typer"),
+        ["f.__signature__ = inspect.Signature(parameters)", "f.__annotations__ = {}"], ["inspect.signature(f)"],
     ),
     "messages": Rule(("appliance/",), printed, quoted),
     "English": Rule(FOLDERS, habits, forbid("plain English")),

@@ -216,7 +216,7 @@ def _of_query(operation: Operation) -> Any:
     model: Any = create_model(operation.name, **fields)
 
     async def of_query(query: Annotated[model, Query()]) -> dict[str, Any]:
-        return {**vars(query)}
+        return dict(query)
 
     return Depends(of_query)
 

@@ -1,12 +1,13 @@
 """Define the words of a search: the options of `rosrv audit search`, and the parameters of the collector's REST."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from appliance.audit.log.record import Severity
 from appliance.audit.search.query import Filter
 from appliance.base import clock
+from appliance.base.option_group import GroupedCommand, OptionGroup
 from appliance.base.timestamps import TimestampError, parse_timestamp
 
 Since = Annotated[str | None, typer.Option("--since", help="From this time: 1h (ago), a date, or RFC 3339")]
@@ -83,3 +84,13 @@ def times_given(since: str | None, until: str | None) -> tuple[int | None, int |
     if begin is not None and end is not None and begin > end:
         raise TimestampError(f"--since {since} is later than --until {until}")
     return begin, end
+
+
+FILTER = OptionGroup(filter_given)
+
+
+class FilteredCommand(GroupedCommand):
+    """A verb with the filter options before its own; `FILTER` makes a filter of the call's parameters."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, before=FILTER.options, **settings)

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import ContextDecorator
 from typing import NoReturn
 
 import typer
@@ -18,8 +19,8 @@ from appliance.evidence.export_verification import ExportUnreadableError
 CANNOT_READ = 2
 
 
-class Errors:
-    """A context manager that prints an error of the audit log and exits with its status."""
+class Errors(ContextDecorator):
+    """A context manager, or a decorator, that prints an error of the audit log and exits with its status."""
 
     def __enter__(self) -> None:
         pass

@@ -20,7 +20,7 @@ from appliance.audit.log.record_format import LogEntry, as_json, as_object
 from appliance.audit.log.signatures import read_public_key
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import read_copies
-from appliance.audit.search.query import Filter
+from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.search import LARGEST_PAGE
 from appliance.audit.takeover_verification import (
     PairVerification,
@@ -29,7 +29,7 @@ from appliance.audit.takeover_verification import (
     verify_takeovers,
 )
 from appliance.cli.audit.audit_errors import Errors, fail, note
-from appliance.cli.audit.filter import filtered
+from appliance.cli.audit.filter import filter_of
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.record_table import (
     line,
@@ -52,15 +52,14 @@ _CHECKPOINT_SECONDS = (
 )
 _PROGRESS_EVERY = 1000  # records
 _R = TypeVar("_R", Verification, PairVerification, ExportVerification)
-_Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
-_AlwaysJson = Annotated[bool, typer.Option("--json", help="Accepted; the output is always NDJSON")]
+_JSON_HELP = "One JSON object a line (NDJSON)"
+_ALWAYS_JSON_HELP = "Accepted; the output is always NDJSON"
 
 
-@speaks_with(_Json)
-@filtered
+@speaks_with(_JSON_HELP, FILTER)
+@Errors()
 def search(
     appliance: Appliance,
-    wanted: Filter,
     *,
     limit: Annotated[
         int, typer.Option("--limit", min=1, max=LARGEST_PAGE, help="Largest number of records")
@@ -78,7 +77,7 @@ def search(
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
-    page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
+    page = appliance.audit().search(filter_of(appliance), cursor, limit, newest_first=not oldest_first)
     if appliance.as_json:
         _print_lines(page.entries, appliance)
     else:
@@ -87,11 +86,10 @@ def search(
         note(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
-@speaks_with(_Json)
-@filtered
+@speaks_with(_JSON_HELP, FILTER)
+@Errors()
 def tail(
     appliance: Appliance,
-    wanted: Filter,
     *,
     lines: Annotated[
         int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="Records to show first")
@@ -102,11 +100,11 @@ def tail(
 
     Example: rosrv audit tail --deny
     """
-    for entries in appliance.audit().follow(wanted, lines, on=follow):
+    for entries in appliance.audit().follow(filter_of(appliance), lines, on=follow):
         _print_lines(entries, appliance)
 
 
-@speaks_with(_Json)
+@speaks_with(_JSON_HELP)
 def show(
     appliance: Appliance,
     record: RecordArgument,
@@ -132,7 +130,7 @@ def show(
             print_shown(shown, appliance.host_in_words)
 
 
-@speaks_with(_Json)
+@speaks_with(_JSON_HELP)
 def verify(
     appliance: Appliance,
     *,
@@ -256,7 +254,7 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, excerpt: bool,
         _print_result(result, print_export_verification, as_json_lines=as_json_lines)
 
 
-@speaks_with(_AlwaysJson)
+@speaks_with(_ALWAYS_JSON_HELP)
 def checkpoints(
     appliance: Appliance,
     after: Annotated[int, typer.Option("--after", min=0, help="Only checkpoints with a greater number")] = 0,
@@ -283,11 +281,10 @@ def checkpoints(
                 pause.wait(_CHECKPOINT_SECONDS)
 
 
-@speaks_with(_AlwaysJson)
-@filtered
+@speaks_with(_ALWAYS_JSON_HELP, FILTER)
+@Errors()
 def export(
     appliance: Appliance,
-    wanted: Filter,
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
 ) -> None:
@@ -297,6 +294,7 @@ def export(
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
+    wanted = filter_of(appliance)
     source = appliance.audit()
     entries = source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as report:

@@ -20,7 +20,7 @@ _SECONDS = 19  # characters of a time
 _LONGEST_REASON = 160
 
 
-@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object")])
+@speaks_with("One JSON object")
 def summarise(
     appliance: Appliance,
     since: Since = None,

@@ -1,21 +1,22 @@
 """Choose the running appliance for a verb: over the socket in its state directory, or over REST.
 
-A verb takes an `Appliance` as its first parameter; the decorator `speaks` adds the options `--state`, `--api`,
-`--api-ca` and `--json`. The socket and REST give the same answers. The command line overrides the environment; within
-the environment, REST overrides the socket.
+A verb takes an `Appliance`, typer's context of the call, as its first parameter; the decorator `speaks` adds the
+options `--state`, `--api`, `--api-ca` and `--json`. The socket and REST give the same answers. The command line
+overrides the environment; within the environment, REST overrides the socket.
 """
 
-import functools
-import inspect
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Concatenate, ParamSpec
 
 import msgspec
 import typer
 
+from appliance.base.option_group import GroupedCommand, GroupedVerb, OptionGroup
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.cli.output import Json, say_json, usage_error
@@ -45,17 +46,42 @@ _P = ParamSpec("_P")
 
 
 @dataclass(frozen=True)
-class Appliance:
-    """The appliance that a verb talks to.
+class _Target:
+    way: "AdminSocket | RestWay"
+    said: bool
+    place: str | None = None
+
+
+class Appliance(typer.Context):
+    """The call of a verb, with the appliance that its options choose.
 
     `said`: whether the command line or the environment names the appliance. `place`: the URL of REST; None over the
     socket. `as_json`: whether to print answers as JSON.
     """
 
-    way: "AdminSocket | RestWay"
-    said: bool = False
-    place: str | None = None
-    as_json: bool = False
+    @cached_property
+    def _target(self) -> _Target:
+        return _CHOICE.value(self.params)
+
+    @property
+    def way(self) -> "AdminSocket | RestWay":
+        """Return the connection. Exits with status 2 for options that exclude each other."""
+        return self._target.way
+
+    @property
+    def said(self) -> bool:
+        """Whether the command line or the environment names the appliance."""
+        return self._target.said
+
+    @property
+    def place(self) -> str | None:
+        """Return the URL of REST; None over the socket."""
+        return self._target.place
+
+    @property
+    def as_json(self) -> bool:
+        """Whether to print answers as JSON."""
+        return bool(self.params["as_json"])
 
     @property
     def rest(self) -> "RestClient":
@@ -106,74 +132,73 @@ class Appliance:
         raise typer.Exit(1)
 
 
-def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-    """Replace a verb's first parameter, an `Appliance`, by --json and the options that choose an appliance."""
-    return speaks_with(Json)(verb)
+class _ApplianceCommand(GroupedCommand):
+    """A verb with --json and the options that choose an appliance."""
+
+    context_class = Appliance
+
+    def __init__(
+        self, *args: Any, json_help: str | None = None, over_rest: bool = True, **settings: Any
+    ) -> None:
+        after = tuple(map(copy, _CHOICE.options))
+        for option in after:
+            if option.name == "as_json":
+                option.help = json_help or option.help
+            elif option.name != "state":
+                option.hidden = not over_rest
+        super().__init__(*args, after=after, **settings)
+
+    def invoke(self, ctx: Any) -> Any:
+        assert ctx.way  # noqa: S101  options that exclude each other end the call before the verb acts
+        return super().invoke(ctx)
 
 
-def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
+def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
+    """Add --json and the options that choose an appliance to a verb."""
+    return GroupedVerb(verb, _ApplianceCommand)
+
+
+def speaks_here(verb: Callable[Concatenate[Appliance, _P], None]) -> GroupedVerb:
     """Like `speaks`, for a verb that REST does not offer: its help has no --api, whose use gets the reason."""
-    return speaks_with(Json, over_rest=False)(verb)
+    return GroupedVerb(verb, partial(_ApplianceCommand, over_rest=False))
 
 
 def speaks_with(
-    json: Any, *, over_rest: bool = True
-) -> Callable[[Callable[Concatenate[Appliance, _P], None]], Callable[_P, None]]:
-    """Like `speaks`, with this annotation of --json."""
-    places = _places(hidden=not over_rest)
+    json_help: str, group: OptionGroup[Any] | None = None
+) -> Callable[[Callable[Concatenate[Appliance, _P], None]], GroupedVerb]:
+    """Like `speaks`, with this help of --json, and the options of `group` before the verb's own."""
 
-    def speaking(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-        own = inspect.signature(verb, eval_str=True)
+    def command(*args: Any, **settings: Any) -> GroupedCommand:
+        before = () if group is None else group.options
+        return _ApplianceCommand(*args, before=before, json_help=json_help, **settings)
 
-        @functools.wraps(verb)
-        def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
-            context, state, api, authority = (kwargs.pop(place.name) for place in places)
-            as_json = kwargs.pop("as_json")
-            appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
-            verb(replace(appliance, as_json=as_json), *args, **kwargs)  # type: ignore[arg-type]  # as above
-
-        # typer reads the options of a verb from its signature and annotations only.
-        its_json = inspect.Parameter(
-            "as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=json
-        )
-        parameters = [*list(own.parameters.values())[1:], its_json, *places]
-        asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
-        asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
-            "return": None
-        }
-        return asked
-
-    return speaking
+    return lambda verb: GroupedVerb(verb, command)
 
 
-def _places(*, hidden: bool) -> list[inspect.Parameter]:
-    """Return the options that choose an appliance; `hidden`: the help leaves those for REST out."""
-    api = typer.Option(
-        "--api",
-        metavar="URL",
-        envvar="ROSRV_API_URL",
-        help=f"Use REST instead; put the access token into {TOKEN}",
-        hidden=hidden,
-    )
-    authority = typer.Option(
-        "--api-ca",
-        metavar="FILE",
-        envvar="ROSRV_API_CA",
-        help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
-        hidden=hidden,
-    )
-    return [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-        for name, default, annotation in (
-            ("context", inspect.Parameter.empty, typer.Context),
-            ("state", DEFAULT_STATE, State),
-            ("api", None, Annotated[str | None, api]),
-            ("api_ca", None, Annotated[Path | None, authority]),
-        )
-    ]
-
-
-def _chosen(context: typer.Context, state: Path, api: str | None, authority: Path | None) -> Appliance:
+def _choose(
+    *,
+    as_json: Json = False,  # noqa: ARG001  `Appliance.as_json` reads it
+    context: typer.Context,
+    state: State = DEFAULT_STATE,
+    api: Annotated[
+        str | None,
+        typer.Option(
+            "--api",
+            metavar="URL",
+            envvar="ROSRV_API_URL",
+            help=f"Use REST instead; put the access token into {TOKEN}",
+        ),
+    ] = None,
+    api_ca: Annotated[
+        Path | None,
+        typer.Option(
+            "--api-ca",
+            metavar="FILE",
+            envvar="ROSRV_API_CA",
+            help="Certificate to trust for REST (STATE/api/certificate.pem of the appliance)",
+        ),
+    ] = None,
+) -> _Target:
     """Return the appliance that the options choose. Exits with status 2 for options that exclude each other."""
     sources = {name: context.get_parameter_source(name) for name in ("state", "api", "api_ca")}
     said = {name: "" if source is None else source.name for name, source in sources.items()}
@@ -183,12 +208,15 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
     if api is None or "state" in typed:
         if "api_ca" in typed:
             raise usage_error("--api-ca needs --api URL")
-        return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
+        return _Target(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
     from appliance.cli.connection.rest_orders import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
-        way = RestWay(api, os.environ.get(TOKEN), authority)
+        way = RestWay(api, os.environ.get(TOKEN), api_ca)
     except ValueError as error:
         raise usage_error(str(error)) from None
     context.call_on_close(way.client.close)
-    return Appliance(way, said=True, place=api)
+    return _Target(way, said=True, place=api)
+
+
+_CHOICE = OptionGroup(_choose)

@@ -27,12 +27,7 @@ from rosmop.tool.terminal import counted, refused
 _OWN_NODE = "the appliance's own node"
 
 
-@speaks_with(
-    Annotated[
-        bool,
-        typer.Option("--json", help="One JSON object: the policy, and the number of requests it is based on"),
-    ]
-)
+@speaks_with("One JSON object: the policy, and the number of requests it is based on")
 def learn_policy(
     appliance: Appliance,
     *,

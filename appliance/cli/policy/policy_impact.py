@@ -8,16 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import typer
 from msgspec.structs import asdict
 
 from appliance.base.owner_access import is_named_there
-from appliance.channel.admin import AdminAnswer, PolicyWanted
+from appliance.channel.admin import PolicyWanted
 from appliance.cli.connection.target import Appliance
 from appliance.cli.policy.policy_input import known_of, live_now, read_text
 from appliance.policy.judgement import PolicyContext, judge
 from appliance.policy.live_rights import Ending, endings
 from appliance.policy.policy_findings import FindingSeverity, PolicyError, PolicyFinding
 from appliance.signing.site_keys import read_signature
+from rosmop.tool.terminal import printable
 
 
 @dataclass(frozen=True)
@@ -59,8 +61,8 @@ def _by_dry_run(appliance: Appliance, file: Path) -> PolicyImpact:
         report = appliance.rest.call("POST", "/v1/policy", params=query, body=text, order=False)
     except RestProblemError as problem:
         if problem.findings is None:
-            replace(appliance, as_json=False).body_or_exit(AdminAnswer(False, error=problem.lines[0]))
-            raise
+            typer.echo(f"rosrv: {printable(problem.lines[0])}", err=True)
+            raise typer.Exit(1) from None
         return PolicyImpact([_finding(finding, file) for finding in problem.findings], [])
     warnings = [_finding(row, file) for row in report["warnings"]]
     return PolicyImpact(warnings, [Ending(**row) for row in report["ends"]])

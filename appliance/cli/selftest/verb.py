@@ -24,7 +24,7 @@ from rosmop.tool.terminal import counted, printable
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 
 
-@speaks_with(Annotated[bool, typer.Option("--json", help="One JSON object for each check")])
+@speaks_with("One JSON object for each check")
 def selftest(
     appliance: Appliance,
     config: Annotated[

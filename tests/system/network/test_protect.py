@@ -17,7 +17,10 @@ from tests.support.requirements import need_program
 from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.system.network.test_isolation import serving, source_seen
 
-COMMAND = "import sys, typer; from appliance.cli.protect_verb import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
+COMMAND = (
+    "import sys; from appliance.cli.lazy import Verb, loaded; sys.argv[0] = 'rosrv'; "
+    "loaded(Verb('protect_verb:protect'), 'protect')()"
+)
 FEW = "40000-40099"  # a small range, for a quick scan
 INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000
 
