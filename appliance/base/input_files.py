@@ -109,12 +109,3 @@ def stat_given(path: Path) -> os.stat_result:
         return os.fstat(descriptor)
     finally:
         os.close(descriptor)
-
-
-def lines_given(path: Path, longest: int) -> Iterator[bytes]:
-    """Yield the lines of a file, each at most `longest` bytes. Raises `OSError`."""
-    with open_given(path) as file:
-        for line in iter(lambda: file.readline(longest + 1), b""):
-            if len(line) > longest:
-                raise OSError(errno.EFBIG, f"has a line of more than {longest} bytes", str(path))
-            yield line

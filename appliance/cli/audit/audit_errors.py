@@ -14,7 +14,6 @@ from appliance.audit.proof.copies import CopiesUnreadableError
 from appliance.audit.search.query import FilterError
 from appliance.base.timestamps import TimestampError
 from appliance.cli.connection.admin_client import NotRunningError
-from appliance.evidence.export_verification import ExportUnreadableError
 
 CANNOT_READ = 2
 
@@ -29,7 +28,7 @@ class Errors(ContextDecorator):
         match error:
             case LogUnreadableError() | KeyUnreadableError() | CopiesUnreadableError() | NotRunningError():
                 fail(str(error), CANNOT_READ)
-            case FilterError() | TimestampError() | ExportUnreadableError():
+            case FilterError() | TimestampError():
                 fail(str(error), CANNOT_READ)
             case BrokenPipeError():
                 # The reader (head, less) has ended: discard the buffered output.

@@ -34,7 +34,6 @@ from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.record_table import (
     line,
     print_entries,
-    print_export_verification,
     print_shown,
     print_verification,
     write,
@@ -43,7 +42,6 @@ from appliance.cli.audit.takeover_table import print_pair
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.evidence.export_verification import ExportVerification, verify_export
 from appliance.standby.membership import MembershipError, load_membership, path_of
 from rosmop.tool.progress_bar import progress
 
@@ -51,7 +49,7 @@ _CHECKPOINT_SECONDS = (
     5.0  # pause between two queries: a checkpoint is made once a minute, and REST queries are recorded
 )
 _PROGRESS_EVERY = 1000  # records
-_R = TypeVar("_R", Verification, PairVerification, ExportVerification)
+_R = TypeVar("_R", Verification, PairVerification)
 _JSON_HELP = "One JSON object a line (NDJSON)"
 _ALWAYS_JSON_HELP = "Accepted; the output is always NDJSON"
 
@@ -141,18 +139,6 @@ def verify(
         Path | None,
         typer.Option("--checkpoints", help="Checkpoints kept on another machine: NDJSON, or a syslog file"),
     ] = None,
-    export_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--export", help="Deprecated: verify this output of `rosrv audit export` instead; needs --key"
-        ),
-    ] = None,
-    excerpt: Annotated[
-        bool,
-        typer.Option(
-            "--excerpt", help="With --export: a filter made it, so records may be missing in between"
-        ),
-    ] = False,
     other: Annotated[
         Path | None,
         typer.Option(
@@ -179,14 +165,6 @@ def verify(
     """
     if other is None and (other_key is not None or other_checkpoints is not None):
         fail("--other-key and --other-checkpoints need --other, the other appliance's state directory", 2)
-    if export_file is not None and other is not None:
-        fail("--export and --other exclude each other: verify the export alone", 2)
-    if export_file is not None:
-        copies = checkpoints is not None
-        _verify_export(export_file, key, copies=copies, excerpt=excerpt, as_json_lines=appliance.as_json)
-        return
-    if excerpt:
-        fail("--excerpt needs --export: a log is verified as a whole", 2)
     with Errors():
         source = appliance.audit()
         partner = None if other is None else _files(source, other)
@@ -237,21 +215,6 @@ def _print_result(result: _R, printed: Callable[[_R], None], *, as_json_lines: b
         printed(result)
     if not result.ok:
         raise typer.Exit(1)
-
-
-def _verify_export(file: Path, key: Path | None, *, copies: bool, excerpt: bool, as_json_lines: bool) -> None:
-    with Errors():
-        if key is None or copies:
-            fail(
-                "--export needs --key, the appliance's public key (control/audit.pub in its state directory), and does"
-                " not take --checkpoints: the export has its own",
-                2,
-            )
-        note(
-            "--export is deprecated: use `rosrv evidence export`, and `rosrv evidence verify` for its bundle"
-        )
-        result = verify_export(file, read_public_key(key), excerpt=excerpt)
-        _print_result(result, print_export_verification, as_json_lines=as_json_lines)
 
 
 @speaks_with(_ALWAYS_JSON_HELP)

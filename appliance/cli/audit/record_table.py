@@ -18,7 +18,6 @@ from appliance.audit.proof.chain_findings import Elsewhere, FindingKind, Verific
 from appliance.audit.search.equality import FOLDED, EqualRecords, grouped, time_span
 from appliance.audit.search.search import RecordInContext
 from appliance.base.actors import actor
-from appliance.evidence.export_verification import ExportVerification
 from appliance.policy.host_names import HostInWords
 
 _STYLES = {"allow": "green", "deny": "bold red", "would deny": "yellow"}
@@ -103,28 +102,6 @@ def print_verification(result: Verification) -> None:
             write(text)
     write(f"key: {result.key or 'none (nothing was signed yet)'}")
     write(_verdict(result))
-
-
-def print_export_verification(result: ExportVerification) -> None:
-    """Print the result of verifying an export, with one line for each finding."""
-    for finding in result.findings:
-        write(f"WRONG: {printable(finding)}")
-    write(
-        f"{result.records} records ({result.first} to {result.last}), log {', '.join(result.logs) or 'unknown'}"
-    )
-    write(f"{result.proven} are proven by a signed checkpoint")
-    if result.unsealed:
-        write(
-            f"{result.unsealed} come after the last signed checkpoint and are not proven yet; export again later"
-        )
-    if result.left_out:
-        write(f"{result.left_out} records between them are not in the export")
-    write(f"key: {result.key}")
-    write(
-        "The records are unchanged."
-        if result.ok
-        else "The export was tampered with, is an excerpt, or belongs to another key."
-    )
 
 
 def _vouched(result: Verification) -> str:

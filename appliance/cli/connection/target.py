@@ -97,7 +97,7 @@ class Appliance(typer.Context):
         """Return the appliance's audit log; with a state directory, the appliance may be stopped."""
         return self.way.audit()
 
-    @functools.cached_property
+    @cached_property
     def host_in_words(self) -> "HostInWords":
         """Return the function that names hosts by the policy in force; it returns addresses if no appliance answers."""
         from appliance.cli.connection.host_labels import named_by  # noqa: PLC0415  only for text with hosts
