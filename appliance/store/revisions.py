@@ -116,7 +116,7 @@ class Revisions(ABC, Generic[R]):
     def _resume(self) -> None:
         kept = self.store.settings().get(self._setting, "")
         if kept:
-            back_to, deadline, length = (*kept.split(), "inf")[:3]  # version 0.1.0 did not store the length
+            back_to, deadline, length = kept.split()
             within = float(length)
             # Wait at most the whole length: the clock may have been set back since.
             self._limit(int(back_to), min(float(deadline), clock.wall() + within), within)

@@ -17,7 +17,6 @@ from appliance.base.atomic_files import name_to_make
 
 APPLICATION_ID = 0x52565541  # "RVUA"
 LAYOUT_VERSION = 2
-_EARLIER = 1  # version 0.1.0: same tables, different hashes
 _BUSY_SECONDS = 5.0
 
 TABLES = (
@@ -100,8 +99,6 @@ def _prepare_writing(connection: sqlite3.Connection) -> None:
     if mode != "wal":
         raise sqlite3.OperationalError(f"the file system has no write-ahead log (journal mode is {mode})")
     connection.execute("PRAGMA synchronous = FULL")
-    if connection.execute("PRAGMA user_version").fetchone()[0] != LAYOUT_VERSION:
-        connection.execute(f"PRAGMA user_version = {LAYOUT_VERSION}")
     connection.execute("PRAGMA journal_size_limit = 67108864")
     connection.execute("PRAGMA temp_store = MEMORY")
     connection.execute("PRAGMA cache_size = -16384")
@@ -152,7 +149,11 @@ def _checked(
             raise LogUnreadableError(
                 f"{path}: not an audit log, or one that was cut; see 'rosrv audit verify'"
             )
-        if version not in (_EARLIER, LAYOUT_VERSION):
+        if version == 1:
+            raise LogUnreadableError(
+                f"{path}: written by version 0.1.0 of rosrv; start version 0.2.0 on it once"
+            )
+        if version != LAYOUT_VERSION:
             raise LogUnreadableError(f"{path}: written by another version of rosrv (layout {version})")
         prepare(connection)
     except sqlite3.DatabaseError as error:

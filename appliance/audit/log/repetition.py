@@ -20,8 +20,6 @@ Key = tuple[str | int | None, ...]
 KIND, UNKNOWN, HOST, ALL_UNKNOWN, ALL = "kind", "unknown host", "host", "unknown hosts", "all"
 """The scopes of kinds; `ALL_UNKNOWN` and `ALL` cover many hosts."""
 
-_SCOPES_OF_0_1 = {"stranger": UNKNOWN, "strangers": ALL_UNKNOWN}
-
 OTHERS = "(others)"  # no ROS name or address has a bracket
 _NAMES = 8
 _LONGEST_NAME = 256
@@ -53,9 +51,6 @@ class FoldState(msgspec.Struct, kw_only=True):
     about: dict[str, str] = {}
     tallies: dict[str, dict[str, int]] = {}
     folds: bool = False
-
-    def __post_init__(self) -> None:
-        self.scope = _SCOPES_OF_0_1.get(self.scope, self.scope)
 
     def count_in(self, record: AuditRecord) -> None:
         """Count a repetition."""

@@ -9,7 +9,7 @@ import pytest
 
 from appliance.audit.log.folding import FoldSettings, RecordFolder
 from appliance.audit.log.record import AuditRecord, RuleReference
-from appliance.audit.log.repetition import ALL_UNKNOWN, HOST, UNKNOWN, new_state, summary
+from appliance.audit.log.repetition import HOST, new_state, summary
 from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
@@ -424,9 +424,3 @@ def test_a_denied_caller_gets_a_recorded_id_or_none() -> None:
         for one, found in told:
             kept = written.get(found, one)
             assert (kept.host, kept.resource, kept.caller_id) == (one.host, one.resource, one.caller_id)
-
-
-@pytest.mark.parametrize(("old", "new"), [("stranger", UNKNOWN), ("strangers", ALL_UNKNOWN), ("host", HOST)])
-def test_stored_scopes_of_0_1_0_get_their_new_names(old: str, new: str) -> None:
-    """Counts that 0.1.0 stored are summarized under the name of this version."""
-    assert new_state(denial("/node", "10.0.0.1"), old).scope == new

@@ -9,6 +9,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
+from appliance.audit.log.log_database import LogUnreadableError, open_for_reading
 from appliance.audit.log.log_writer import ChainWriter, RemovedRange
 from appliance.audit.log.record import AuditRecord, Severity
 from appliance.audit.log.retention import Retention
@@ -140,10 +141,20 @@ def test_the_signer_refuses_removals_beyond_its_settings(
 
 @pytest.fixture
 def old(path: Path) -> Path:
-    """Return a log written by version 0.1.0, with a removal by retention."""
+    """Return a log written by version 0.1.0 and opened by 0.2.0, with a removal by retention."""
     path.write_bytes(lzma.decompress(OLD_LOG.read_bytes()))
     path.with_name("audit.pub").write_bytes(OLD_LOG.with_name("log-0.1.0.pub").read_bytes())
     return path
+
+
+def test_a_log_that_only_0_1_0_opened_names_the_remedy(old: Path) -> None:
+    """The layout of 0.1.0 is upgraded by 0.2.0, not by this version."""
+    with closing(sqlite3.connect(old)) as database:
+        database.execute("PRAGMA user_version = 1")
+    with pytest.raises(
+        LogUnreadableError, match=r"version 0\.1\.0 of rosrv; start version 0\.2\.0 on it once"
+    ):
+        open_for_reading(old)
 
 
 def test_an_old_log_is_valid_with_a_note(old: Path) -> None:
