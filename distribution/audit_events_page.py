@@ -137,7 +137,6 @@ def _severities(node: ast.Call, called: str, event: str) -> frozenset[str]:
 
 
 def markdown() -> str:
-    """Return the page."""
     severities: dict[str, set[str]] = {name: set() for name in EVENTS}
     fields: dict[str, list[str]] = {name: list(ELSEWHERE.get(name, ())) for name in EVENTS}
     for use in uses():

@@ -109,7 +109,6 @@ class LayoutBuilder:
         self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
     def add_string(self, path: str) -> None:
-        """Add a string."""
         self._add_part(StringPart(path))
 
     def add_array(self, path: str, type_name: str, count: int | None, layout: MessageLayout | None) -> None:

@@ -58,7 +58,6 @@ class RobotHealth(NamedTuple):
         processes: Sequence[ProcessInfo],
         deprived: Callable[[Address], bool],
     ) -> Self:
-        """Return the present health."""
         state = monitors_status(monitors)
         return cls(
             counted_denials(meter.denied_hosts.counts(), policy, deprived),

@@ -83,7 +83,6 @@ class RecordingOrders:
         return Recordings(kept, list(rules.topics), list(rules.never), rules.before, in_progress)
 
     async def recording(self, request: admin.RecordingWanted) -> Recording:
-        """Return one recording."""
         self._require()
         return self._find(request.id)
 
@@ -188,7 +187,6 @@ class RecordingOrders:
         return lent.recording
 
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
-        """Remove a recording."""
         self._require()
         removed = await self._ask(
             lambda number: messages.RecordingRemovalWanted(number, request.id, who), messages.RecordingRemoved

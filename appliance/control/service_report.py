@@ -22,7 +22,6 @@ class ServiceReport:
         self._sound = clock.now()  # when nothing was to be repaired
 
     def now(self) -> messages.ControlServes:
-        """Return the present report."""
         failed, monitors = self._base.audit.failed, self._parts.monitors
         obstacle = ""
         if failed is not None and self._base.settings.audit.on_audit_failure == "deny":

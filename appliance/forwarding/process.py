@@ -85,7 +85,6 @@ class ProgressReports:
         self._told = messages.ForwardingReported()
 
     def tell(self, progress: messages.ForwardingReported) -> None:
-        """Report new progress."""
         if progress != self._told and self._send(progress):
             self._told = progress
 

@@ -108,7 +108,6 @@ class HostTable:
         return next((row for row in self.enrolled() if row.address == address), None)
 
     def listed_as_revoked(self) -> list[RevokedCertificateRow]:
-        """Return the list of revoked certificates."""
         return self.revoked.listed(self._enrolled_names())
 
     def missing_as_revoked(self) -> int:

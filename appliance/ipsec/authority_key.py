@@ -29,7 +29,6 @@ _ENCRYPTED = b"-----BEGIN ENCRYPTED PRIVATE KEY-----"
 
 
 def make_key(kind: Kind) -> Key:
-    """Return a new key."""
     return (
         ec.generate_private_key(ec.SECP384R1()) if kind == "ecdsa" else ed25519.Ed25519PrivateKey.generate()
     )

@@ -30,7 +30,6 @@ class LiveRight(NamedTuple):
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> Self:
-        """Make the right from its `fields`."""
         return cls(**{**fields, "host": ipaddress.ip_address(fields["host"])})
 
     def fields(self) -> dict[str, Any]:

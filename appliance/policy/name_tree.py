@@ -51,7 +51,6 @@ class KeyTree(Generic[Value]):
         self._root: _Node[Value] = _Node()
 
     def add(self, key: Key, value: Value) -> None:
-        """Add a key."""
         if key.exact:
             self._exact[key.text] = value
         node = self._root

@@ -124,7 +124,6 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
 
 
 def decide_right(policy: Policy, right: Right) -> Decision:
-    """Return the decision on one right."""
     if right.request.category in PARAMETERS and not right.alone:
         return policy.decide_parameter(right.request, namespace=right.namespace)
     return policy.decide(right.request)

@@ -34,6 +34,5 @@ class RelayContext:
         interceptor: Interceptor,
         table: GrantTable,
     ) -> "RelayContext":
-        """Return the context of a new relay with this table."""
         memory = RelayMemory.of(limits, table.quota_class)
         return cls(loop, limits, reporter, memory, Scratch(loop.pump), interceptor, table.payer)

@@ -68,5 +68,4 @@ class ExcludedStream:
         self._marked.write(_NOTHING, 0, first, judged)
 
     def close(self) -> None:
-        """End the stream."""
         self._marked.close()

@@ -26,7 +26,6 @@ class Checkpoint(NamedTuple):
     removed: int | None = None
 
     def text(self) -> bytes:
-        """Return the text that is signed."""
         version, removed = (1, "") if self.removed is None else (2, f"removed {self.removed}\n")
         return (
             f"rosrv audit checkpoint {version}\nlog {self.log}\nnumber {self.number}\nsequence {self.sequence}\n"
@@ -72,7 +71,6 @@ class Removal(NamedTuple):
     limit: str
 
     def text(self) -> bytes:
-        """Return the text that is signed."""
         return (
             f"rosrv audit removal 1\nlog {self.log}\ncheckpoint {self.checkpoint}\nsequence {self.sequence}\n"
             f"hash {self.hash}\nsealed {self.sealed}\nlimit {self.limit}\n"

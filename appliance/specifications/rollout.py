@@ -197,7 +197,6 @@ class Rollout:
         return self._statement(self._now, relay, self.allocation.of_file, restarted=restarted, ahead=True)
 
     def relay_of(self, monitor: str) -> int:
-        """Return the relay of a monitor."""
         return self.allocation.of_file(self._now.checked.monitors[monitor])
 
     def tell(self, monitor: str, message: messages.Message) -> bool:

@@ -157,7 +157,6 @@ class LeaseProcess:
         self._tell_control()
 
     def send(self, sender: socket.socket, datagram: bytes, to: tuple[str, int]) -> None:
-        """Send a datagram."""
         with contextlib.suppress(OSError):  # no route at present; the lease asks again
             sender.sendto(datagram, to)
 

@@ -160,7 +160,6 @@ class HostTables:
         self._database.put("host_certificate", *row[:-1], *(row.next or (None, None, None)))
 
     def certificates(self) -> list[CertificateRow]:
-        """Return the certificates of all hosts."""
         return [
             CertificateRow(
                 name, made, certificate, NextCertificate(*following) if following[0] is not None else None
@@ -215,7 +214,6 @@ class HostTables:
         self._database.put("host_block", *row)
 
     def forget_block(self, address: str) -> None:
-        """Remove the block of a host."""
         self._database.delete("host_block", address=address)
 
     def blocks(self) -> list[HostBlockRow]:
@@ -236,7 +234,6 @@ class HostTables:
         self._database.put("appliance", *row)
 
     def forget_appliance(self, key: str) -> None:
-        """Remove an appliance."""
         self._database.delete("appliance", key=key)
 
     def appliances(self) -> list[ApplianceRow]:

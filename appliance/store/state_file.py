@@ -356,7 +356,6 @@ class StateStore:
     # --- settings ---
 
     def save_setting(self, name: str, value: str) -> None:
-        """Store a named value."""
         self.database.put("setting", name, value)
 
     def settings(self) -> dict[str, str]:

@@ -143,7 +143,6 @@ class ProcessHandle:
         self.send(Ping(self._asked))
 
     def note_answer(self) -> None:
-        """Note that the process answered."""
         self.answered = clock.now()
 
     def discount_pause(self, seconds: float) -> None:
@@ -154,7 +153,6 @@ class ProcessHandle:
 
     @property
     def is_hanging(self) -> bool:
-        """Whether the process hangs."""
         now = clock.now()
         # A role of the appliance may answer once, and then take long to load policy and specifications.
         starting = self.answered is None or not (self.ready or self.is_program)

@@ -205,7 +205,6 @@ class CountedSocket(socket.socket):
     due: asyncio.TimerHandle | None = None
 
     def close(self) -> None:
-        """Close the connection."""
         if self.fileno() >= 0:
             self.table.closed(self.fileno())
         super().close()

@@ -133,7 +133,6 @@ class SegmentStore:
         return tempfile.NamedTemporaryFile(dir=self._folder / "incoming", delete=False)
 
     def path(self, place: SegmentPlace) -> Path:
-        """Return the path of a segment."""
         bucket = f"{place.number // _BUCKET:0{_DIGITS}}"
         name = f"{place.number:0{_DIGITS}}-{place.name}.ndjson.gz"
         return self._folder / "segments" / place.robot / place.log / bucket / name

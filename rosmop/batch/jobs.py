@@ -92,7 +92,6 @@ class _Envelope(msgspec.Struct, frozen=True):
 
 
 def packed(job: Job) -> bytes:
-    """Return a job as bytes."""
     return msgspec.msgpack.encode(_Envelope(_version(), job))
 
 

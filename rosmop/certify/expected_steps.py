@@ -82,7 +82,6 @@ class PropertyStep:
 
     @property
     def states(self) -> int:
-        """Return the number of states."""
         tables = self.compiled
         assert isinstance(tables, FiniteProperty | ClockedProperty)  # noqa: S101  a property with a number has tables
         return len(tables.automaton) if isinstance(tables, FiniteProperty) else len(tables.verdicts)

@@ -85,7 +85,6 @@ def condition(value: Value) -> nodes.Expression:
 
 
 def constant_value(position: Position, kind: Type, constant: bool | int | float | bytes) -> Value:
-    """Return a value that is a constant."""
     return Value(nodes.Literal(kind, constant), position, constant=constant)
 
 

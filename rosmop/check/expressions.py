@@ -150,7 +150,6 @@ def _name(scope: FunctionScope, node: tree.Name) -> Value:
 
 
 def read(variable: Variable, node: tree.SyntaxNode) -> Value:
-    """Return the value of a variable."""
     variable.used = True
     if variable.alias is not None:
         alias = variable.alias

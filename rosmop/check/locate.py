@@ -64,7 +64,6 @@ class MessageCursor:
         return self._starts[part]
 
     def end(self) -> Spot:
-        """Return the end of the message."""
         return self.start_of(len(self._layout.parts))
 
     def find(self, path: tuple[tree.PathStep, ...]) -> Spot | None:

@@ -226,7 +226,6 @@ class FunctionScope:
             self.shared.types[variable.code] = variable.type
 
     def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
-        """Return a new local variable."""
         variable = Variable(name, kind, self.symbols.fresh("v"), position, constant=constant)
         self.declare(variable)
         return variable
@@ -254,7 +253,6 @@ class FunctionScope:
         return self.changes or any(self.names.changed_by(called) for called in self.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
-        """Return the error for an unknown name."""
         wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
         if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())

@@ -27,7 +27,6 @@ LARGE = 4096
 
 
 def write(scope: FunctionScope, node: tree.Statement) -> None:
-    """Write a statement."""
     around = len(scope.loops)
     try:
         with scope.at(node):

@@ -58,7 +58,6 @@ class ValueSeries(msgspec.Struct):
     """The last window with each value, until the recording ends."""
 
     def add(self, value: Any, window: int) -> None:
-        """Add a value."""
         if self.many or self.last.get(value) == window:
             return
         self.last[value] = window

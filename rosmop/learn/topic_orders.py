@@ -81,7 +81,6 @@ class TopicOrders:
         self.pairs = {(a, b): TopicPair() for a in self.names for b in self.names if a != b}
 
     def add_recordings(self, pairs: Mapping[tuple[str, str], TopicPair]) -> None:
-        """Add the pairs of recordings."""
         self.pairs = merged_rows(self.pairs, pairs, TopicPair.merged)
 
     def by_chance(self, bound: float, rate: float, count: int) -> bool:

@@ -38,7 +38,6 @@ class Automaton:
         return len(self.table)
 
     def name(self, state: int) -> str:
-        """Return the name of a state."""
         return self.names[state] if self.names else f"q{state}"
 
 

@@ -178,7 +178,6 @@ class EarleyRecogniser:
     # ---- tables
 
     def shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> EarleyShape:
-        """Return the shape of these items."""
         return self._shape(items, done, width)
 
     def _shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> EarleyShape:

@@ -127,7 +127,6 @@ class BoundedMcap:
         return Connection(channel.id, channel.topic, kind, definition, digest, 0, sender, self)
 
     def _records(self, place: _ChunkPlace) -> list[McapRecord]:
-        """Return the records in a chunk."""
         self._file.seek(place.offset)
         chunk = next(self._stream(self._file), None)
         if not isinstance(chunk, Chunk):

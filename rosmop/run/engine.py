@@ -135,7 +135,6 @@ class KeptGroup:
         return data
 
     def parts(self) -> list[bytes]:
-        """Return all parts."""
         return [data for parts in self._slices for data in parts.all()]
 
     def changed_parts(self) -> dict[int, bytes]:

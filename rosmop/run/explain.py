@@ -96,7 +96,6 @@ class Exits:
         self.owner: object = None
 
     def step(self, run: Any, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Step the run with the event."""
         self._at = state = run.state
         self._last = event, time_ns, sender
         categories: Categories = run.step(event, time_ns)
@@ -234,7 +233,6 @@ class Steps:
         self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
     def add(self, happened: EventOccurrence) -> None:
-        """Add an event."""
         self._steps.append(happened)
 
     def expire(self, run: Run) -> Categories:
@@ -311,7 +309,6 @@ class ClockedSteps(Steps):
         self._started, self.room[:] = mark
 
     def step(self, run: Run, event: int, time_ns: int, sender: MessageSender) -> Categories:
-        """Step the run with the event."""
         self._note(run, event, time_ns, sender)
         return run.step(event, time_ns)
 

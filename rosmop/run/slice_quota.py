@@ -54,7 +54,6 @@ class Quota(Generic[Thing]):
             del self._of[holder]
 
     def oldest(self, holder: Holder) -> Thing:
-        """Return the oldest thing of the holder."""
         return next(iter(self._of[holder]))
 
     def all(self) -> Iterator[tuple[Holder, Thing]]:

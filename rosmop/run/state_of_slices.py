@@ -69,7 +69,6 @@ class SliceParts:
         return {number: self._encoded(number) for number in dirty}
 
     def all(self) -> list[bytes]:
-        """Return all parts."""
         self.changed()
         return [self._encoded(number) for number in range(BUCKETS)]
 

@@ -44,7 +44,6 @@ def struct_code(kind: Type) -> str | None:
 
 
 def struct_size(codes: str) -> int:
-    """Return the size of values with these `struct` codes."""
     return sum({"?": 1, "b": 1, "h": 2, "i": 4, "q": 8, "f": 4, "d": 8}[code.lower()] for code in codes)
 
 

@@ -3,7 +3,7 @@
 Each rule of the grammar has a method. The walk is not recursive, so nesting cannot exhaust the stack.
 """
 
-# ruff: noqa: D102  each method handles the rule of the grammar that has its name
+# Each method handles the rule of the grammar that has its name.
 
 import re
 from collections.abc import Callable

@@ -24,7 +24,6 @@ def fields_of(node: SyntaxNode) -> list[Any]:
 
 
 def walk(root: object) -> Iterator[SyntaxNode]:
-    """Yield a node and all nodes in it."""
     waiting = [root]
     while waiting:
         current = waiting.pop()

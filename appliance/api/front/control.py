@@ -189,7 +189,6 @@ class ControlLink:
             self._dropped = 0
 
     def close(self) -> None:
-        """End the link."""
         self._link.close()
 
     def _received(self, message: Any) -> None:

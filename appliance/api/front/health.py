@@ -23,7 +23,6 @@ class Health(msgspec.Struct, frozen=True):
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(tags=["status"])
 
     async def live() -> Health:

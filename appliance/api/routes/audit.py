@@ -192,7 +192,6 @@ def _json(schema: dict[str, Any]) -> Responses:
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = LogReader(services)
     _add_searches(router, services, desk)

@@ -17,7 +17,6 @@ from appliance.audit.search.query import Filter
 
 
 def routes(services: Services) -> Routes:
-    """Return the route."""
     router = Routes(prefix="/v1/audit", tags=["audit"])
     one = Work("summaries of the audit log", 1)
 

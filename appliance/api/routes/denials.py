@@ -22,7 +22,6 @@ _ASKS = {"topic": "requestTopic", "service": "lookupService"}
 
 
 def is_denial(record: AuditRecord) -> bool:
-    """Whether a record is a denial."""
     return record.event in DENIALS and record.decision != "allow"
 
 

@@ -88,7 +88,6 @@ _PEM: Responses = file("application/x-pem-file", "PEM") | {
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(tags=["hosts"])
     _add_enrolment(router, services)
     _add_renewal(router, services)

@@ -56,7 +56,6 @@ class _Now(msgspec.Struct, frozen=True):
 
 
 def routes(services: Services) -> Routes:
-    """Return the routes."""
     router = Routes(prefix="/v1", tags=["status"])
     streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
 

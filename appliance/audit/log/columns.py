@@ -64,7 +64,6 @@ def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
 
 
 def from_columns(columns: StoredColumns) -> AuditRecord:
-    """Return the stored record."""
     rule = None
     if columns.rule is not None:
         rule = RuleReference(

@@ -25,7 +25,6 @@ class IdSource:
         self._lock = threading.Lock()
 
     def next(self) -> str:
-        """Return the next id."""
         with self._lock:
             now = self._clock()
             self._last = now if now > self._last else self._last + 1

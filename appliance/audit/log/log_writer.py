@@ -171,7 +171,6 @@ class ChainWriter:
         return self._connection.execute(query, (limit,)).fetchall()
 
     def checkpoint_text(self, number: int) -> bytes | None:
-        """Return the text of a checkpoint, or None."""
         row = self._connection.execute("SELECT text FROM checkpoint WHERE number = ?", (number,)).fetchone()
         return None if row is None else bytes(row[0])
 

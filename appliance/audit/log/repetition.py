@@ -53,7 +53,6 @@ class FoldState(msgspec.Struct, kw_only=True):
     folds: bool = False
 
     def count_in(self, record: AuditRecord) -> None:
-        """Count a repetition."""
         if not self.count:
             self.first_id, self.first_time = record.id, record.time
         number = repetitions(record.detail)

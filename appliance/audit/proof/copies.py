@@ -58,7 +58,6 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
         return cls(**parse_checkpoint(text)._asdict(), signature=signature.hex(), key=key.hex())
 
     def text(self) -> bytes:
-        """Return the signed text."""
         return Checkpoint(
             self.log, self.number, self.sequence, self.hash, self.time, self.previous, self.removed
         ).text()

@@ -35,7 +35,6 @@ class RestWay:
             return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:], trouble=trouble)
 
     def audit(self) -> "RestLog":
-        """Return its audit log."""
         from appliance.cli.connection.audit_over_rest import RestLog  # noqa: PLC0415  only for the verbs that read it
 
         return RestLog(self.client)

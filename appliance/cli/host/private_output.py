@@ -33,7 +33,6 @@ class Output:
 
     @property
     def is_standard(self) -> bool:
-        """Whether this is standard output."""
         return self.path == STANDARD_OUTPUT
 
     def write(self, data: bytes, lost: str) -> None:

@@ -24,7 +24,6 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 1.0
 
 
 def running(appliance: Appliance) -> Iterator[SelftestFinding]:
-    """Check the running appliance."""
     try:
         answer = appliance.ask(StatusWanted())
     except NotRunningError as error:

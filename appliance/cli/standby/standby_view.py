@@ -56,7 +56,6 @@ def lag_in_words(other: OtherAppliance) -> str:
 
 
 def answer_in_words(witness: WitnessSeen) -> str:
-    """Return whether the witness answers."""
     seconds = witness.answered_seconds
     if seconds is None:
         return "has never answered"

@@ -47,7 +47,6 @@ class Current(Generic[T]):
         self._values: list[T] = []
 
     def set(self, value: T) -> None:
-        """Set the value."""
         self._values = [value]
 
     def __bool__(self) -> bool:

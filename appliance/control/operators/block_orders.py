@@ -79,7 +79,6 @@ class BlockOrders:
         self._changed = asyncio.Event()
 
     async def listed(self, _request: admin.HostBlocks) -> answers.BlockedHosts:
-        """Return all blocked hosts."""
         await self._read_clock()
         return answers.BlockedHosts([self._row(row) for row in self._blocks.rows().values()])
 

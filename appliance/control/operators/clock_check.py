@@ -53,7 +53,6 @@ class ClockCheck:
             self._trail.happened("clock synchronised", text)
 
     def state(self) -> ClockState:
-        """Return the current state of the clock."""
         behind = self._behind()
         return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0, before_program())
 

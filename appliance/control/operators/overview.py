@@ -15,7 +15,6 @@ from appliance.specifications.allocation import SERVICE, TOPIC
 
 
 def graph_of(parts: Parts) -> Graph:
-    """Return the present graph."""
     registry = parts.core.registry
     shown = [
         incarnation

@@ -38,7 +38,6 @@ class Grants:
         return effects
 
     def all(self) -> list[PermissionRow]:
-        """Return all grants."""
         return [row for rows in self._of_node.values() for row in rows]
 
     def of(self, key: str) -> Collection[PermissionRow]:

@@ -221,7 +221,6 @@ class Registry:
         return incarnation if there else None
 
     def live(self) -> list[Incarnation]:
-        """Return all live incarnations."""
         return list(self._live.values())
 
     def all(self) -> list[Incarnation]:
@@ -282,7 +281,6 @@ class Registry:
         return self._registrations_of.total()
 
     def registrations_by_host(self) -> Iterable[tuple[Address, int]]:
-        """Return the number of registrations by host."""
         return self._registrations_of.items()
 
     def registrations_of(self, host: Address) -> int:

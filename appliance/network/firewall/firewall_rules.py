@@ -84,7 +84,6 @@ class PortRange:
 
     @classmethod
     def one(cls, port: int) -> "PortRange":
-        """Return the range of one port."""
         return cls(port, port)
 
     def overlaps(self, other: "PortRange") -> bool:

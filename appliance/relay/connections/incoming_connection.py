@@ -69,7 +69,6 @@ class IncomingConnection:
         self._stream.read(False)
 
     def close(self) -> None:
-        """Close the connection."""
         self._timer.cancel()
         self._pending.leave(self)
         self._stream.close()

@@ -165,7 +165,6 @@ class RelayedTopic:
 
     @property
     def members(self) -> tuple[TopicSubscriber, ...]:
-        """Return all subscribers of this topic."""
         return (*self._waiting, *self._served)
 
     def join(self, member: TopicSubscriber) -> None:

@@ -37,7 +37,6 @@ class Senders:
         self._last = 0
 
     def number(self, point: ObservationPoint) -> int:
-        """Return the number of a point."""
         found = self._numbers.get(point)
         if found is None:
             self._last = found = self._last + 1
@@ -49,7 +48,6 @@ class Senders:
         return found
 
     def point(self, number: int) -> ObservationPoint | None:
-        """Return the point with this number."""
         return self._points.get(number)
 
 

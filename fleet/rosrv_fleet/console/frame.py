@@ -68,7 +68,6 @@ def alert(reason: str) -> str:
 
 
 def badge(tone: Tone, word: str) -> str:
-    """Return a word with a tone."""
     return f'<span class="badge {tone}">{text(word)}</span>'
 
 

@@ -41,7 +41,6 @@ Word = Annotated[str, PathParameter(max_length=63)]
 
 
 def console_router(collector: Collector) -> APIRouter:
-    """Return the routes of the console."""
     router = APIRouter(include_in_schema=False)
 
     def shown(request: Request, title: str, body: Callable[[OperatorToken], str]) -> Response:

@@ -19,7 +19,6 @@ class RolloutMetrics(MetricSource):
         self._service = service
 
     def collect(self) -> Iterator[Metric]:
-        """Return the metrics."""
         service = self._service
         robots = GaugeMetricFamily(
             "rosrv_fleet_robots", "robots of a group by condition", labels=["site", "group", "condition"]

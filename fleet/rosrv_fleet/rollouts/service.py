@@ -236,7 +236,6 @@ class BundleService:
         return [] if stored is None else machine.counts(stored.rollout, self._heard(group), self._clock())
 
     def conditions(self, group: RobotGroup) -> dict[str, RobotCondition]:
-        """Return the condition of each robot of a group."""
         stored = self.rollouts.get(group)
         rollout = None if stored is None else stored.rollout
         return conditions(rollout, self._heard(group), self._clock())
