@@ -1,4 +1,4 @@
-"""Decode CBOR frames of clients, within bounds.
+"""Turn CBOR frames of clients into JSON, within bounds.
 
 cbor2 knows many tags, among them big numbers, dates, regular expressions and references to earlier values. A door needs
 none of them. So a scan of the heads comes first, and accepts only the kinds that JSON also has, byte strings, and the
@@ -9,6 +9,7 @@ import struct
 from typing import Any
 
 import cbor2
+import msgspec
 
 from appliance.features.doors.message_reader import MessageValueError
 
@@ -24,19 +25,18 @@ _CODES = {
 }  # fmt: skip
 _BYTE_TAGS = frozenset({64, 68})
 _INTEGERS, _NEGATIVES, _BYTES, _TEXT, _ARRAY, _MAP, _TAG, _OTHER = range(8)
-_OTHERS = frozenset(
-    {20, 21, 22, 23, 25, 26, 27}
-)  # false, true, null, undefined, floats of 16, 32 and 64 bits
+_OTHERS = frozenset({20, 21, 22, 25, 26, 27})  # false, true, null, floats of 16, 32 and 64 bits
 
 
-def decode_cbor(frame: bytes) -> Any:
-    """Return the value of a frame; raises `MessageValueError`.
+def json_of_cbor(frame: bytes) -> bytes:
+    """Return a frame as JSON; raises `MessageValueError`.
 
-    Typed arrays become lists, or bytes if their elements are `uint8`.
+    Byte strings become base64, and typed arrays lists, or base64 if their elements are `uint8`. NaN becomes null, which
+    no field accepts.
     """
     try:
         _scan(frame)
-        return cbor2.loads(frame, tag_hook=_typed_array)
+        return msgspec.json.encode(cbor2.loads(frame, tag_hook=_typed_array))
     except (ValueError, cbor2.CBORError) as error:
         raise MessageValueError(f"not CBOR: {error}") from None
 

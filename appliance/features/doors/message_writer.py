@@ -75,16 +75,9 @@ class MessageWriter:
 
     def from_json(self, text: bytes | msgspec.Raw, now: Now) -> bytes:
         """Return the message of a JSON object; raises `MessageValueError` with the path."""
-        return self._written(lambda: self._decoder.decode(text), now)
-
-    def from_values(self, values: object, now: Now) -> bytes:
-        """Return the message of decoded values; raises `MessageValueError` with the path."""
-        return self._written(lambda: msgspec.convert(values, self._schema), now)
-
-    def _written(self, decode: Callable[[], object], now: Now) -> bytes:
         out = bytearray()
         try:
-            self._write(decode(), out, now)
+            self._write(self._decoder.decode(text), out, now)
         except (ValueError, RecursionError) as error:  # of msgspec
             raise MessageValueError(f"{self._name}: {error}") from None
         except _FieldError as error:

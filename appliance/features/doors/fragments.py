@@ -1,0 +1,50 @@
+"""Frames that a client sends in fragments: kept, within a limit of bytes, until they are complete."""
+
+from dataclasses import dataclass, field
+
+from appliance.features.doors.requests import ClientId
+from appliance.features.doors.rosbridge_frames import FragmentOp, OperationError
+
+_OVERHEAD = 64  # bytes that a fragment takes besides its text
+
+
+@dataclass(slots=True)
+class _Incomplete:
+    total: int
+    parts: dict[int, str] = field(default_factory=dict)
+    bytes: int = 0
+
+
+class FragmentStore:
+    """The frames of one client that are not complete, of at most `most_bytes` together."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._frames: dict[ClientId, _Incomplete] = {}
+
+    def add(self, fragment: FragmentOp) -> bytes | None:
+        """Add a fragment; return the frame once it is complete. Raises `OperationError`, and drops the frame."""
+        frame = self._frames.setdefault(fragment.id, _Incomplete(fragment.total))
+        if fragment.total != frame.total or fragment.num >= frame.total or fragment.num in frame.parts:
+            self._remove(fragment.id)
+            raise OperationError(
+                f"fragment {fragment.num} of {fragment.total} does not fit its frame of {frame.total}; send it again"
+            )
+        size = len(fragment.data) + _OVERHEAD
+        frame.parts[fragment.num] = fragment.data
+        frame.bytes += size
+        self._bytes += size
+        if self._bytes > self._most_bytes:
+            self._frames.clear()
+            self._bytes = 0
+            raise OperationError(
+                f"more than {self._most_bytes} bytes of fragments without the rest of their frames; all are dropped"
+            )
+        if len(frame.parts) < frame.total:
+            return None
+        self._remove(fragment.id)
+        return "".join(frame.parts[number] for number in range(frame.total)).encode()
+
+    def _remove(self, key: ClientId) -> None:
+        self._bytes -= self._frames.pop(key).bytes

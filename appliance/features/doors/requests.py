@@ -1,0 +1,112 @@
+"""The requests of a client to the node of its door, in the order in which the client made them.
+
+The protocols of doors make them, without I/O; the session carries them out. `reply_to` is the id that the client gave,
+which the answer or the refusal repeats. Names are canonical.
+"""
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import msgspec
+
+ClientId: TypeAlias = str | int | float | None
+"""The id of a client's operation; None if it gave none."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdvertiseTopic:
+    """Advertise a topic. Without a type, the topic has the type that its other publishers and subscribers use."""
+
+    topic: str
+    type: str | None
+    latched: bool = False
+    queue: int = 100
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class UnadvertiseTopic:
+    """Advertise a topic no longer."""
+
+    topic: str
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class PublishMessage:
+    """Publish a message on an advertised topic, as JSON values or as the bytes of the message."""
+
+    topic: str
+    values: msgspec.Raw | bytes
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class SubscribeTopic:
+    """Subscribe to a topic; if there is a type, the topic must have this type."""
+
+    topic: str
+    type: str | None = None
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class UnsubscribeTopic:
+    """Subscribe to a topic no longer."""
+
+    topic: str
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class CallOfService:
+    """Call a service. `call` identifies the call; `values` are an object, or a list of values in order."""
+
+    service: str
+    call: int
+    values: msgspec.Raw | bytes
+    seconds: float | None = None
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class OfferService:
+    """Offer a service, whose calls go to the client."""
+
+    service: str
+    type: str
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class WithdrawService:
+    """Offer a service no longer."""
+
+    service: str
+    reply_to: ClientId = None
+
+
+@dataclass(frozen=True, slots=True)
+class AnswerCall:
+    """Answer a call of an offered service: with values, or with the reason of the failure."""
+
+    service: str
+    call: str
+    ok: bool
+    values: msgspec.Raw
+    reply_to: ClientId = None
+
+
+DoorRequest: TypeAlias = (
+    AdvertiseTopic
+    | UnadvertiseTopic
+    | PublishMessage
+    | SubscribeTopic
+    | UnsubscribeTopic
+    | CallOfService
+    | OfferService
+    | WithdrawService
+    | AnswerCall
+)
+Frame: TypeAlias = str | bytes
+"""A WebSocket message: text or binary."""

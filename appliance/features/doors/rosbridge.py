@@ -1,0 +1,352 @@
+"""The rosbridge protocol, version 2, of one connection, without I/O.
+
+A frame of the client goes in; requests to the node of the door and frames for the client come out. Rules:
+
+1. The requests of one frame are a sequence: if the session cannot carry one out, it drops the rest of the sequence.
+2. Every refusal is words: a `status` of the level error with the id of the operation, or a `service_response` with
+   `result` false and an object with `message`. Nothing else is sent without a request.
+3. Frames repeat the client's own spelling of a name; requests have the canonical name.
+4. Everything that a client can make grow has a limit: names, ids, topics, services, calls, fragments.
+5. No fragments are sent: no client library reads them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from msgspec import Raw
+
+from appliance.features.doors.fragments import FragmentStore
+from appliance.features.doors.message_reader import MessageValueError
+from appliance.features.doors.requests import (
+    AdvertiseTopic,
+    AnswerCall,
+    CallOfService,
+    ClientId,
+    DoorRequest,
+    Frame,
+    OfferService,
+    PublishMessage,
+    SubscribeTopic,
+    UnadvertiseTopic,
+    UnsubscribeTopic,
+    WithdrawService,
+)
+from appliance.features.doors.rosbridge_frames import (
+    AdvertiseOp,
+    AdvertiseServiceOp,
+    CallServiceOp,
+    Compression,
+    DoorMessage,
+    FragmentOp,
+    OperationError,
+    PublishOp,
+    ServiceResponseOp,
+    SetLevelOp,
+    StatusOp,
+    SubscribeOp,
+    UnadvertiseOp,
+    UnadvertiseServiceOp,
+    UnsubscribeOp,
+    decode_operation,
+    frame_as_json,
+    id_of,
+    json_frame,
+    publish_frame,
+)
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.errors import PeerError, quoted
+from roswire.names import resolve
+
+_LEVELS = ("none", "error", "warning", "info")
+_STRENGTH: tuple[Compression, ...] = ("none", "png", "cbor", "cbor-raw")
+
+
+@dataclass(frozen=True, slots=True)
+class RosbridgeLimits:
+    """Upper bounds for one connection."""
+
+    topics: int = 1000  # subscriptions and advertisements, by topic
+    ids: int = 100  # of one topic
+    services: int = 100
+    calls: int = 100  # without an answer, in each direction
+    fragment_bytes: int = 8 << 20  # of all frames that are not complete
+    depth: int = 10  # messages that wait for a slow client, if it sets no queue_length
+    call_seconds: float = 60.0
+
+
+@dataclass(slots=True)
+class _Subscription:
+    topic: str
+    clients: dict[ClientId, tuple[float, int, Compression]] = field(default_factory=dict)
+
+    @property
+    def compression(self) -> Compression:
+        return max((one[2] for one in self.clients.values()), key=_STRENGTH.index)
+
+
+@dataclass(slots=True)
+class _Call:
+    service: str  # as the client spells it
+    reply_to: ClientId
+
+
+class Rosbridge:
+    """The protocol of one connection; `node` is the name of the door's node, against which names are resolved."""
+
+    def __init__(self, node: str, limits: RosbridgeLimits, queue: ViewerQueue[str]) -> None:
+        self.queue = queue
+        self._node = node
+        self._limits = limits
+        self._level = _LEVELS.index("error")
+        self._subscriptions: dict[str, _Subscription] = {}  # by the client's spelling
+        self._spellings: dict[str, set[str]] = {}  # of each topic with a subscription
+        self._advertised: dict[str, set[ClientId]] = {}
+        self._services: dict[str, str] = {}  # the client's spelling, by canonical name
+        self._calls: dict[int, _Call] = {}
+        self._asked: dict[str, str] = {}  # calls to the client: their service, by id
+        self._number = 0
+        self._fragments = FragmentStore(limits.fragment_bytes)
+        self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
+            AdvertiseOp: self._advertise,
+            UnadvertiseOp: self._unadvertise,
+            PublishOp: self._publish,
+            SubscribeOp: self._subscribe,
+            UnsubscribeOp: self._unsubscribe,
+            CallServiceOp: self._call,
+            AdvertiseServiceOp: self._offer,
+            UnadvertiseServiceOp: self._withdraw,
+            ServiceResponseOp: self._answer,
+            FragmentOp: self._fragment,
+            SetLevelOp: self._set_level,
+            StatusOp: lambda _operation: [],
+        }
+
+    # --- frames of the client ---
+
+    def receive(self, frame: Frame) -> list[DoorRequest]:
+        """Return the requests of a frame; replies go to the queue. Raises `ViewerStalledError`."""
+        reply_to: ClientId = None
+        try:
+            operation = decode_operation(frame_as_json(frame))
+            reply_to = operation.id
+            return self._carry_out[type(operation)](operation)
+        except PeerError as error:
+            self.status("error", str(error), reply_to if reply_to is not None else id_of(frame))
+            return []
+
+    def _advertise(self, operation: AdvertiseOp) -> list[DoorRequest]:
+        topic = self._resolved(operation.topic)
+        self._add_advertisement(topic, operation.id)
+        return [
+            AdvertiseTopic(topic, operation.type, operation.latch, operation.queue_size or 1, operation.id)
+        ]
+
+    def _add_advertisement(self, topic: str, client: ClientId) -> None:
+        _check_room(self._advertised, topic, self._limits.topics, "topics are advertised")
+        clients = self._advertised.setdefault(topic, set())
+        if client not in clients and len(clients) >= self._limits.ids:
+            raise OperationError(f"{topic} has {len(clients)} advertisements; at most {self._limits.ids}")
+        clients.add(client)
+
+    def _unadvertise(self, operation: UnadvertiseOp) -> list[DoorRequest]:
+        topic = self._resolved(operation.topic)
+        clients = self._advertised.get(topic)
+        if clients is None:
+            return []
+        clients.discard(operation.id)
+        if clients and operation.id is not None:
+            return []
+        del self._advertised[topic]
+        return [UnadvertiseTopic(topic, operation.id)]
+
+    def _publish(self, operation: PublishOp) -> list[DoorRequest]:
+        topic = self._resolved(operation.topic)
+        publish = PublishMessage(topic, operation.msg, operation.id)
+        if topic in self._advertised:
+            return [publish]
+        self._add_advertisement(topic, None)
+        queue = operation.queue_size or 1
+        return [AdvertiseTopic(topic, None, operation.latch, queue, operation.id), publish]
+
+    def _subscribe(self, operation: SubscribeOp) -> list[DoorRequest]:
+        topic = self._resolved(operation.topic)
+        _check_room(self._subscriptions, operation.topic, self._limits.topics, "topics are subscribed")
+        subscription = self._subscriptions.setdefault(operation.topic, _Subscription(topic))
+        if operation.id not in subscription.clients and len(subscription.clients) >= self._limits.ids:
+            raise OperationError(
+                f"{topic} has {len(subscription.clients)} subscriptions; at most {self._limits.ids}"
+            )
+        self._spellings.setdefault(topic, set()).add(operation.topic)
+        seconds, length = (operation.throttle_rate or 0) / 1000, operation.queue_length or 0
+        subscription.clients[operation.id] = seconds, length, operation.compression
+        self._configure(operation.topic, subscription)
+        return [SubscribeTopic(topic, operation.type, operation.id)]
+
+    def _configure(self, spelling: str, subscription: _Subscription) -> None:
+        """Use the least of the rates and lengths of all subscriptions to a topic, as rosbridge does."""
+        seconds = min(one[0] for one in subscription.clients.values())
+        length = min(one[1] for one in subscription.clients.values())
+        depth = length or self._limits.depth
+        self.queue.configure(spelling, depth=depth, interval=seconds, queued=length > 0)
+
+    def _unsubscribe(self, operation: UnsubscribeOp) -> list[DoorRequest]:
+        subscription = self._subscriptions.get(operation.topic)
+        if subscription is None:
+            return []
+        subscription.clients.pop(operation.id, None)
+        if subscription.clients and operation.id is not None:
+            self._configure(operation.topic, subscription)
+            return []
+        return self._forget_subscription(operation.topic, operation.id)
+
+    def _forget_subscription(self, spelling: str, reply_to: ClientId) -> list[DoorRequest]:
+        topic = self._subscriptions.pop(spelling).topic
+        self.queue.remove(spelling)
+        self._spellings[topic].discard(spelling)
+        if self._spellings[topic]:
+            return []
+        del self._spellings[topic]
+        return [UnsubscribeTopic(topic, reply_to)]
+
+    def _call(self, operation: CallServiceOp) -> list[DoorRequest]:
+        name, _, number = operation.service.partition("#")  # the older notation of the id
+        reply_to = operation.id if operation.id is not None or not number else number
+        self._number += 1
+        call = _Call(operation.service, reply_to)
+        if len(self._calls) >= self._limits.calls:
+            self._fail_call(
+                call, f"{len(self._calls)} calls of this client wait for answers; repeat it later"
+            )
+            return []
+        try:
+            service = self._resolved(name)
+        except PeerError as error:
+            self._fail_call(call, str(error))
+            return []
+        self._calls[self._number] = call
+        longest = self._limits.call_seconds
+        seconds = longest if operation.timeout is None else min(max(operation.timeout, 0.0), longest)
+        values = Raw(b"{}") if bytes(operation.args) == b"null" else operation.args
+        return [CallOfService(service, self._number, values, seconds or longest, reply_to)]
+
+    def _offer(self, operation: AdvertiseServiceOp) -> list[DoorRequest]:
+        service = self._resolved(operation.service)
+        _check_room(self._services, service, self._limits.services, "services are offered")
+        self._services[service] = operation.service
+        return [OfferService(service, operation.type, operation.id)]
+
+    def _withdraw(self, operation: UnadvertiseServiceOp) -> list[DoorRequest]:
+        service = self._resolved(operation.service)
+        if self._services.pop(service, None) is None:
+            raise OperationError(f"this client does not offer the service {quoted(operation.service)}")
+        self._asked = {call: name for call, name in self._asked.items() if name != service}
+        return [WithdrawService(service, operation.id)]
+
+    def _answer(self, operation: ServiceResponseOp) -> list[DoorRequest]:
+        call = operation.id
+        service = self._asked.pop(call, None) if isinstance(call, str) else None
+        if service is None or not isinstance(call, str):
+            raise OperationError(f"no call of {quoted(operation.service)} has this id")
+        return [AnswerCall(service, call, operation.result, operation.values, operation.id)]
+
+    def _fragment(self, operation: FragmentOp) -> list[DoorRequest]:
+        text = self._fragments.add(operation)
+        if text is None:
+            return []
+        inner = decode_operation(text)
+        if isinstance(inner, FragmentOp):
+            raise OperationError("a fragment inside a fragment")
+        return self._carry_out[type(inner)](inner)
+
+    def _set_level(self, operation: SetLevelOp) -> list[DoorRequest]:
+        self._level = _LEVELS.index(operation.level)
+        return []
+
+    def _resolved(self, name: str) -> str:
+        return resolve(name, self._node)
+
+    # --- answers and refusals ---
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Refuse a request in words, and forget what it began. Raises `ViewerStalledError`."""
+        match request:
+            case CallOfService():
+                call = self._calls.pop(request.call, None)
+                if call is not None:
+                    self._fail_call(call, reason)
+                return
+            case AdvertiseTopic():
+                self._advertised.pop(request.topic, None)
+            case SubscribeTopic():
+                for spelling in [
+                    key for key, one in self._subscriptions.items() if one.topic == request.topic
+                ]:
+                    self._forget_subscription(spelling, None)
+            case OfferService():
+                self._services.pop(request.service, None)
+        self.status("error", reason, request.reply_to)
+
+    def _fail_call(self, call: _Call, reason: str) -> None:
+        fields = {
+            "op": "service_response",
+            "service": call.service,
+            "values": {"message": reason},
+            "result": False,
+        }
+        self.queue.reply(json_frame(fields, call.reply_to))
+
+    def answered(self, number: int, values: Raw) -> None:
+        """Answer a call of the client. Raises `ViewerStalledError`."""
+        call = self._calls.pop(number, None)
+        if call is not None:
+            fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
+            self.queue.reply(json_frame(fields, call.reply_to))
+
+    def ask(self, service: str, values: Raw) -> str:
+        """Send the client a call of its service, and return the id of the call.
+
+        Raises `OperationError` if it does not offer the service or has many calls, and `ViewerStalledError`.
+        """
+        spelling = self._services.get(service)
+        if spelling is None:
+            raise OperationError(f"the client does not offer {service} any longer")
+        if len(self._asked) >= self._limits.calls:
+            raise OperationError(f"the client has not answered {len(self._asked)} calls")
+        self._number += 1
+        call = f"service_request:{spelling}:{self._number}"
+        self._asked[call] = service
+        self.queue.reply(json_frame({"op": "call_service", "service": spelling, "args": values}, call))
+        return call
+
+    def give_up(self, call: str) -> None:
+        """Expect no answer to a call of the client's service."""
+        self._asked.pop(call, None)
+
+    def status(self, level: str, text: str, reply_to: ClientId = None) -> None:
+        """Send a status, if the client wants its level. Raises `ViewerStalledError`."""
+        if _LEVELS.index(level) <= self._level:
+            self.queue.reply(json_frame({"op": "status", "level": level, "msg": text}, reply_to))
+
+    # --- messages of topics ---
+
+    def message(self, message: DoorMessage, now: float) -> None:
+        """Queue a message for each subscription to its topic; `now` is a monotonic time in seconds."""
+        for spelling in self._spellings.get(message.topic, ()):
+            self.queue.put(spelling, message, len(message.body), now)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """Return the next frame for the client; None if nothing may be sent now."""
+        taken = self.queue.take(now)
+        if taken is None or taken[0] is None:
+            return None if taken is None else taken[1]
+        spelling, message = taken
+        try:
+            return publish_frame(spelling, message, self._subscriptions[spelling].compression)
+        except MessageValueError as error:
+            return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
+
+
+def _check_room(table: dict[str, Any], key: str, most: int, what: str) -> None:
+    if key not in table and len(table) >= most:
+        raise OperationError(f"{len(table)} {what} by this client; at most {most}")

@@ -1,0 +1,261 @@
+"""The frames of the rosbridge protocol, version 2: the operations of clients as structs, and frames to clients."""
+
+import base64
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Raw, Struct
+
+from appliance.features.doors.cbor_frames import json_of_cbor
+from appliance.features.doors.message_reader import MessageValueError
+from appliance.features.doors.requests import ClientId, Frame
+from appliance.features.doors.values import MessageCodec, cbor
+from roswire.errors import PeerError, quoted
+
+_MOST_CHARACTERS = 1024
+_MOST_INTEGER = (1 << 63) - 1
+Name = Annotated[str, Meta(max_length=_MOST_CHARACTERS)]
+Id = (
+    Annotated[str, Meta(max_length=_MOST_CHARACTERS)]
+    | Annotated[int, Meta(ge=-_MOST_INTEGER, le=_MOST_INTEGER)]
+    | float
+    | None
+)
+Compression = Literal["none", "png", "cbor", "cbor-raw"]
+_Count = Annotated[int, Meta(ge=0, le=1_000_000)]
+_NOTHING = Raw(b"{}")
+
+
+class _Operation(Struct, tag_field="op", kw_only=True):
+    id: Id = None
+
+
+class AdvertiseOp(_Operation, tag="advertise"):
+    """Advertise a topic."""
+
+    topic: Name
+    type: Name
+    latch: bool = False
+    queue_size: _Count = 100
+
+
+class UnadvertiseOp(_Operation, tag="unadvertise"):
+    """Advertise a topic no longer; without an id, end all advertisements of the topic."""
+
+    topic: Name
+
+
+class PublishOp(_Operation, tag="publish"):
+    """Publish a message."""
+
+    topic: Name
+    msg: Raw = _NOTHING
+    latch: bool = False
+    queue_size: _Count = 100
+
+
+class SubscribeOp(_Operation, tag="subscribe"):
+    """Subscribe to a topic; `throttle_rate` is the least number of milliseconds between two messages."""
+
+    topic: Name
+    type: Name | None = None
+    throttle_rate: Annotated[int, Meta(ge=0, le=86_400_000)] | None = 0
+    queue_length: _Count | None = 0
+    compression: Compression = "none"
+
+
+class UnsubscribeOp(_Operation, tag="unsubscribe"):
+    """Subscribe to a topic no longer; without an id, end all subscriptions to the topic."""
+
+    topic: Name
+
+
+class CallServiceOp(_Operation, tag="call_service"):
+    """Call a service; `timeout` is in seconds."""
+
+    service: Name
+    args: Raw = _NOTHING
+    timeout: float | None = None
+
+
+class AdvertiseServiceOp(_Operation, tag="advertise_service"):
+    """Offer a service."""
+
+    service: Name
+    type: Name
+
+
+class UnadvertiseServiceOp(_Operation, tag="unadvertise_service"):
+    """Offer a service no longer."""
+
+    service: Name
+
+
+class ServiceResponseOp(_Operation, tag="service_response"):
+    """Answer a call of an offered service."""
+
+    service: Name
+    values: Raw = _NOTHING
+    result: bool = True
+
+
+class FragmentOp(_Operation, tag="fragment"):
+    """A part of a frame."""
+
+    data: str
+    num: _Count
+    total: Annotated[int, Meta(ge=1, le=10_000)]
+
+
+class SetLevelOp(_Operation, tag="set_level"):
+    """Set the level from which statuses are sent."""
+
+    level: Literal["info", "warning", "error", "none"]
+
+
+class StatusOp(_Operation, tag="status"):
+    """A status of the client, which has no effect."""
+
+
+Operation = (
+    AdvertiseOp
+    | UnadvertiseOp
+    | PublishOp
+    | SubscribeOp
+    | UnsubscribeOp
+    | CallServiceOp
+    | AdvertiseServiceOp
+    | UnadvertiseServiceOp
+    | ServiceResponseOp
+    | FragmentOp
+    | SetLevelOp
+    | StatusOp
+)
+OPERATIONS = (
+    "advertise", "unadvertise", "publish", "subscribe", "unsubscribe", "call_service", "advertise_service",
+    "unadvertise_service", "service_response", "fragment", "set_level", "status",
+)  # fmt: skip
+
+
+class Envelope(Struct):
+    """The part that all operations have, for the answer to one that cannot be decoded."""
+
+    op: Any = None
+    id: Any = None
+    receiver: Any = None
+
+
+@dataclass(frozen=True)
+class DoorMessage:
+    """A message that came on a topic; its encodings are made at most once, for all clients.
+
+    `received` is the system time in nanoseconds.
+    """
+
+    topic: str
+    codec: MessageCodec
+    body: bytes
+    received: int
+
+    @cached_property
+    def json(self) -> Raw:
+        """The message as JSON; raises `MessageValueError`."""
+        return self.codec.json(self.body)
+
+    @cached_property
+    def cbor_values(self) -> dict[str, Any]:
+        """The message as values for CBOR; raises `MessageValueError`."""
+        return self.codec.cbor_values(self.body)
+
+
+def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> str | bytes:
+    """Return a message for a client; raises `MessageValueError`."""
+    if compression == "cbor-raw":
+        secs, nsecs = divmod(message.received, 1_000_000_000)
+        raw = {"secs": secs, "nsecs": nsecs, "bytes": message.body}
+        return cbor({"op": "publish", "topic": topic, "msg": raw})
+    if compression == "cbor":
+        return cbor({"op": "publish", "topic": topic, "msg": message.cbor_values})
+    text = msgspec.json.encode({"op": "publish", "topic": topic, "msg": message.json})
+    if compression == "png":
+        return json_frame({"op": "png", "data": base64.b64encode(as_png(text)).decode("ascii")})
+    return text.decode()
+
+
+def json_frame(fields: dict[str, Any], reply_to: ClientId = None) -> str:
+    """Return a text frame, with the id if the client gave one."""
+    return msgspec.json.encode(fields if reply_to is None else fields | {"id": reply_to}).decode()
+
+
+def as_png(data: bytes) -> bytes:
+    """Return an image whose pixels (8-bit RGB) are these bytes, filled up with line feeds."""
+    width = max(math.isqrt(len(data) // 3), 1)
+    height = -(-len(data) // (3 * width))
+    row = 3 * width
+    padded = data.ljust(row * height, b"\n")
+    rows = b"".join(b"\0" + padded[start : start + row] for start in range(0, len(padded), row))
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = (b"IHDR", header), (b"IDAT", zlib.compress(rows, 1)), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in parts
+    )
+
+
+class OperationError(PeerError):
+    """An operation that cannot be carried out."""
+
+
+_OPERATION: msgspec.json.Decoder[Operation] = msgspec.json.Decoder(Operation)
+_ENVELOPE = msgspec.json.Decoder(Envelope)
+
+
+def frame_as_json(frame: Frame) -> bytes:
+    """Return a frame of a client as JSON. A binary frame is CBOR, unless it begins like a JSON object.
+
+    Raises `MessageValueError`.
+    """
+    if isinstance(frame, str):
+        return frame.encode("utf-8", "replace")
+    return frame if frame.lstrip()[:1] == b"{" else json_of_cbor(frame)
+
+
+def decode_operation(text: bytes) -> Operation:
+    """Return the operation of a frame; raises `OperationError`."""
+    try:
+        return _OPERATION.decode(text)
+    except (ValueError, RecursionError) as error:
+        raise OperationError(_complaint(text, error)) from None
+
+
+def _complaint(text: bytes, error: Exception) -> str:
+    envelope = _envelope(text)
+    if envelope is None:
+        return f"not a rosbridge operation: {error}"
+    if envelope.op is None:
+        version = " (rosbridge 1.0 is not supported)" if envelope.receiver is not None else ""
+        return f"an operation without `op`{version}; the operations are {', '.join(OPERATIONS)}"
+    if envelope.op not in OPERATIONS:
+        return f"unknown operation {quoted(str(envelope.op))}; the operations are {', '.join(OPERATIONS)}"
+    return f"{envelope.op}: {error}"
+
+
+def id_of(frame: Frame) -> ClientId:
+    """Return the id of an operation that cannot be carried out, if it has a short one."""
+    try:
+        envelope = _envelope(frame_as_json(frame))
+        return None if envelope is None else msgspec.convert(envelope.id, Id)
+    except (MessageValueError, ValueError):
+        return None
+
+
+def _envelope(text: bytes) -> Envelope | None:
+    try:
+        return _ENVELOPE.decode(text)
+    except (ValueError, RecursionError):
+        return None

@@ -1,0 +1,132 @@
+"""The frames that wait for one client: replies in order, and of each topic the newest messages.
+
+A client that reads slowly loses the oldest messages of its topics, never a reply. Invariants:
+
+1. At most `message_bytes` of messages wait. If more come, the topic with the most bytes loses its oldest message.
+2. At most `reply_bytes` of replies wait. A client that requests more without reading gets `ViewerStalledError`.
+3. Topics take turns, so that a large topic delays a small one by one message.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+from appliance.features.doors.requests import Frame
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+class ViewerStalledError(Exception):
+    """A client that makes requests and does not read the replies."""
+
+
+@dataclass(slots=True)
+class _Waiting:
+    depth: int
+    interval: float
+    items: deque[tuple[Any, int]] = field(default_factory=deque)
+    bytes: int = 0
+    next_time: float = 0.0
+    queued: bool = False  # whether messages that come too early wait; otherwise they are dropped
+
+
+class ViewerQueue(Generic[Key]):
+    """The queue of one client; times are those of a monotonic clock, in seconds."""
+
+    def __init__(self, *, message_bytes: int = 16 << 20, reply_bytes: int = 4 << 20) -> None:
+        self.dropped = 0
+        self._most_message_bytes = message_bytes
+        self._most_reply_bytes = reply_bytes
+        self._replies: deque[Frame] = deque()
+        self._reply_bytes = 0
+        self._message_bytes = 0
+        self._topics: dict[Key, _Waiting] = {}
+        self._turns: OrderedDict[Key, None] = OrderedDict()  # the topics with messages, the next one first
+
+    def reply(self, frame: Frame) -> None:
+        """Add a reply. Raises `ViewerStalledError`."""
+        self._reply_bytes += len(frame)
+        if self._reply_bytes > self._most_reply_bytes and self._replies:
+            raise ViewerStalledError(
+                f"more than {self._most_reply_bytes} bytes of replies wait for this client"
+            )
+        self._replies.append(frame)
+
+    def configure(self, key: Key, *, depth: int, interval: float, queued: bool) -> None:
+        """Set the number of messages that wait, and the seconds between two of them.
+
+        A message that comes earlier waits if `queued`, and is dropped otherwise.
+        """
+        topic = self._topics.setdefault(key, _Waiting(depth, interval))
+        topic.next_time += interval - topic.interval
+        topic.depth, topic.interval, topic.queued = max(depth, 1), interval, queued
+        self._trim(topic)
+
+    def remove(self, key: Key) -> None:
+        """Forget a topic and its messages."""
+        topic = self._topics.pop(key, None)
+        self._turns.pop(key, None)
+        if topic is not None:
+            self._message_bytes -= topic.bytes
+
+    def put(self, key: Key, item: object, size: int, now: float) -> None:
+        """Add a message of a topic that is configured; otherwise it is dropped."""
+        topic = self._topics.get(key)
+        if topic is None:
+            return
+        if topic.interval and not topic.queued:
+            if now < topic.next_time:
+                return
+            topic.next_time = now + topic.interval
+        topic.items.append((item, size))
+        self._turns.setdefault(key)
+        topic.bytes += size
+        self._message_bytes += size
+        self._trim(topic)
+        while self._message_bytes > self._most_message_bytes:
+            key = max(self._turns, key=lambda one: self._topics[one].bytes)
+            largest = self._topics[key]
+            if len(largest.items) == 1 and largest is topic:
+                break  # the newest message of the topic stays, whatever its size
+            self._drop(largest)
+            if not largest.items:
+                del self._turns[key]
+
+    def take(self, now: float) -> "tuple[None, Frame] | tuple[Key, Any] | None":
+        """Return the next reply (with the key None) or message; None if nothing may be sent now."""
+        if self._replies:
+            frame = self._replies.popleft()
+            self._reply_bytes -= len(frame)
+            return None, frame
+        for key in self._turns:
+            topic = self._topics[key]
+            if not topic.queued or topic.next_time <= now:
+                item, size = topic.items.popleft()
+                topic.bytes -= size
+                self._message_bytes -= size
+                if topic.queued:
+                    topic.next_time = now + topic.interval
+                if topic.items:
+                    self._turns.move_to_end(key)
+                else:
+                    del self._turns[key]
+                return key, item
+        return None
+
+    def next_time(self) -> float | None:
+        """Return the time at which the next message may be sent; None if none waits."""
+        if self._replies:
+            return 0.0
+        waiting = [self._topics[key] for key in self._turns]
+        return min((topic.next_time if topic.queued else 0.0 for topic in waiting), default=None)
+
+    def _trim(self, topic: _Waiting) -> None:
+        while len(topic.items) > topic.depth:
+            self._drop(topic)
+
+    def _drop(self, topic: _Waiting) -> None:
+        _item, size = topic.items.popleft()
+        topic.bytes -= size
+        self._message_bytes -= size
+        self.dropped += 1
