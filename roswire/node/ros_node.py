@@ -149,15 +149,18 @@ class RosNode:
                 await self._forget("unregisterSubscriber", topic, self._uri)
                 await self.subscribers.pop(topic).close()
 
-    async def advertise(self, topic: str, kind: MessageType, *, latched: bool, queue: int) -> NodePublication:
+    async def advertise(
+        self, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float = 0.0
+    ) -> NodePublication:
         """Advertise a topic; `queue` is the number of messages that may wait for each subscriber.
 
+        Subscribers that connect within `replay` seconds get the messages that were published until then.
         Raises ValueError if the node already publishes it, and `RosError` if the master denies it.
         """
         async with self._lock("publisher", topic):
             if topic in self.publishers:
                 raise ValueError(f"{self.name} already publishes {topic}")
-            publisher = NodePublication(self._link, topic, kind, latched=latched, queue=queue)
+            publisher = NodePublication(self._link, topic, kind, latched=latched, queue=queue, replay=replay)
             self.publishers[topic] = publisher
             try:
                 await self.master("registerPublisher", topic, kind.name, self._uri)

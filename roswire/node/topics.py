@@ -147,10 +147,13 @@ class NodePublication:
     """A publication of a node.
 
     At most `queue` messages wait for each subscriber; if more come, the oldest are dropped, which `dropped` counts. A
-    latched publisher sends its last message to each new subscriber.
+    latched publication sends its last message to each new subscriber. Subscribers connect some time after the
+    registration; those that connect within `replay` seconds get the messages that were published until then.
     """
 
-    def __init__(self, link: NodeLink, topic: str, kind: MessageType, *, latched: bool, queue: int) -> None:
+    def __init__(
+        self, link: NodeLink, topic: str, kind: MessageType, *, latched: bool, queue: int, replay: float
+    ) -> None:
         if queue < 1:
             raise ValueError(f"a queue of {queue} messages; give at least 1")
         self.topic = topic
@@ -159,7 +162,8 @@ class NodePublication:
         self.dropped = 0
         self._link = link
         self._queue = queue
-        self._last: bytes | None = None
+        self._replay_until = asyncio.get_running_loop().time() + replay
+        self._kept: deque[bytes] = deque(maxlen=1 if latched else queue)  # for subscribers that connect later
         self._served: set[_SendQueue] = set()
         self._tasks = OwnedTasks()
 
@@ -171,10 +175,15 @@ class NodePublication:
     def publish(self, body: bytes) -> None:
         """Send a serialised message to all subscribers."""
         frame = encode_frame(body)
-        if self.latched:
-            self._last = frame
+        if self.latched or self._replays():
+            self._kept.append(frame)
+        else:
+            self._kept.clear()
         for one in self._served:
             self.dropped += one.put(frame)
+
+    def _replays(self) -> bool:
+        return asyncio.get_running_loop().time() < self._replay_until
 
     async def serve(
         self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
@@ -197,8 +206,9 @@ class NodePublication:
         }
         writer.write(encode_header(fields))
         queue = _SendQueue(header.get("callerid", "")[:200], self._queue, self._link.limits.queue_bytes)
-        if self._last is not None:
-            queue.put(self._last)
+        if self.latched or self._replays():
+            for frame in self._kept:
+                queue.put(frame)
         self._served.add(queue)
         sending = self._tasks.start(queue.send_to(writer))
         try:

@@ -280,7 +280,7 @@ WALL_CLOCK = {
         "cli/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
         "control/assembly/host_blocks.py", "control/passive.py",
         "control/assembly/policies.py", "control/operators/queries.py", "control/replication.py",
-        "control/recording_orders.py", "evidence/bundle.py", "features/syslog/log_forwarder.py",
+        "control/recording_orders.py", "evidence/bundle.py", "features/doors/door_node.py", "features/syslog/log_forwarder.py",
         "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",

@@ -17,7 +17,7 @@ from typing import Any
 from msgspec import Raw
 
 from appliance.features.doors.fragments import FragmentStore
-from appliance.features.doors.message_reader import MessageValueError
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -37,7 +37,6 @@ from appliance.features.doors.rosbridge_frames import (
     AdvertiseServiceOp,
     CallServiceOp,
     Compression,
-    DoorMessage,
     FragmentOp,
     OperationError,
     PublishOp,
@@ -296,7 +295,7 @@ class Rosbridge:
         }
         self.queue.reply(json_frame(fields, call.reply_to))
 
-    def answered(self, number: int, values: Raw) -> None:
+    def answered(self, number: int, values: Raw | bytes) -> None:
         """Answer a call of the client. Raises `ViewerStalledError`."""
         call = self._calls.pop(number, None)
         if call is not None:
@@ -343,8 +342,14 @@ class Rosbridge:
         spelling, message = taken
         try:
             return publish_frame(spelling, message, self._subscriptions[spelling].compression)
-        except MessageValueError as error:
+        except (
+            PeerError
+        ) as error:  # the message does not fit its definition, or the definition cannot be used
             return json_frame({"op": "status", "level": "error", "msg": f"{spelling}: {error}"})
+
+    def next_time(self) -> float | None:
+        """Return the time of the next frame that waits; None if none waits."""
+        return self.queue.next_time()
 
 
 def _check_room(table: dict[str, Any], key: str, most: int, what: str) -> None:

@@ -4,17 +4,16 @@ import base64
 import math
 import struct
 import zlib
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Raw, Struct
 
 from appliance.features.doors.cbor_frames import json_of_cbor
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.message_reader import MessageValueError
 from appliance.features.doors.requests import ClientId, Frame
-from appliance.features.doors.values import MessageCodec, cbor
+from appliance.features.doors.values import cbor
 from roswire.errors import PeerError, quoted
 
 _MOST_CHARACTERS = 1024
@@ -148,29 +147,6 @@ class Envelope(Struct):
     op: Any = None
     id: Any = None
     receiver: Any = None
-
-
-@dataclass(frozen=True)
-class DoorMessage:
-    """A message that came on a topic; its encodings are made at most once, for all clients.
-
-    `received` is the system time in nanoseconds.
-    """
-
-    topic: str
-    codec: MessageCodec
-    body: bytes
-    received: int
-
-    @cached_property
-    def json(self) -> Raw:
-        """The message as JSON; raises `MessageValueError`."""
-        return self.codec.json(self.body)
-
-    @cached_property
-    def cbor_values(self) -> dict[str, Any]:
-        """The message as values for CBOR; raises `MessageValueError`."""
-        return self.codec.cbor_values(self.body)
 
 
 def publish_frame(topic: str, message: DoorMessage, compression: Compression) -> str | bytes:

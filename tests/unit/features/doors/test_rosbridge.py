@@ -10,6 +10,7 @@ from typing import Any
 import cbor2
 import pytest
 
+from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.requests import (
     AdvertiseTopic,
     AnswerCall,
@@ -24,7 +25,6 @@ from appliance.features.doors.requests import (
     WithdrawService,
 )
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
-from appliance.features.doors.rosbridge_frames import DoorMessage
 from appliance.features.doors.values import MessageCodec, ValueLimits
 from appliance.features.doors.viewer_queue import ViewerQueue, ViewerStalledError
 from roswire.definitions import Definitions
@@ -60,7 +60,7 @@ class Client:
 
     def hears(self, text: str, topic: str = "/chatter") -> None:
         body = struct.pack("<I", len(text)) + text.encode()
-        self.rosbridge.message(DoorMessage(topic, STRING, body, 7_000_000_005), self.now)
+        self.rosbridge.message(DoorMessage(topic, body, {}, 7_000_000_005, lambda _header: STRING), self.now)
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """A node in virtual time: two nodes, a scripted master and peers that break the rules, on a network in memory."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -17,11 +17,11 @@ from roswire.node import (
     ServiceFailedError,
     ServiceType,
 )
-from roswire.node.xmlrpc_http import call_xmlrpc, serve_xmlrpc
 from roswire.tcpros import HeaderParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import MethodCall, Value
 from tests.support.memory_network import MemoryNetwork
+from tests.support.scripted_master import MASTER, ScriptedMaster
 
 pytestmark = pytest.mark.anyio
 STRING = MessageType("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1", "string data\n")
@@ -31,63 +31,6 @@ SET_BOOL = ServiceType(
     "std_srvs/SetBoolRequest",
     "std_srvs/SetBoolResponse",
 )
-MASTER = "http://10.0.0.1:11311/"
-
-
-class ScriptedMaster:
-    """A master that keeps registrations, notifies subscribers, and denies what a test names."""
-
-    def __init__(self, network: MemoryNetwork) -> None:
-        self.network = network
-        self.publishers: dict[str, list[str]] = {}
-        self.subscribers: dict[str, list[str]] = {}
-        self.services: dict[str, str] = {}
-        self.denials: dict[str, str] = {}  # the reason, by method
-        self.before_answer: Callable[[MethodCall], Any] | None = None
-        self.calls: list[str] = []
-        self.server = network.listen(
-            "10.0.0.1", lambda reader, writer: serve_xmlrpc(reader, writer, self.answer), 11311
-        )
-
-    async def answer(self, call: MethodCall) -> Value:
-        self.calls.append(call.method)
-        if self.before_answer is not None:
-            await self.before_answer(call)
-        if call.method in self.denials:
-            return [-1, self.denials[call.method], 0]
-        params: list[Any] = list(call.params)
-        match call.method:
-            case "registerSubscriber":
-                self.subscribers.setdefault(params[1], []).append(params[3])
-                return [1, "", [*self.publishers.get(params[1], [])]]
-            case "registerPublisher":
-                self.publishers.setdefault(params[1], []).append(params[3])
-                await self.notify(params[1])
-            case "unregisterPublisher":
-                self.publishers[params[1]].remove(params[2])
-                await self.notify(params[1])
-            case "unregisterSubscriber":
-                self.subscribers[params[1]].remove(params[2])
-            case "registerService":
-                self.services[params[1]] = params[2]
-            case "unregisterService":
-                del self.services[params[1]]
-            case "lookupService":
-                return (
-                    [1, "", self.services[params[1]]]
-                    if params[1] in self.services
-                    else [-1, "no provider", ""]
-                )
-        return [1, "", 1]
-
-    async def notify(self, topic: str) -> None:
-        for uri in self.subscribers.get(topic, []):
-            await self.call(uri, "publisherUpdate", topic, [*self.publishers[topic]])
-
-    async def call(self, uri: str, method: str, *params: Value) -> Value:
-        return await call_xmlrpc(
-            self.network.at("10.0.0.1"), parse_node_uri(uri), method, ("/master", *params), seconds=5.0
-        )
 
 
 class Nodes:
@@ -162,6 +105,21 @@ async def test_a_latched_message_reaches_a_late_subscriber() -> None:
         await listener.subscribe("/map", lambda body, _header: heard.append(body))
         await later()
         assert heard == [b"new"]
+
+
+@pytest.mark.parametrize(("wait", "heard"), [(0.5, [b"early", b"next"]), (1.5, [])])
+async def test_early_messages_are_replayed_only_for_a_while(wait: float, heard: list[bytes]) -> None:
+    """A subscriber that connects within the time of the replay gets them; a later one gets no old command."""
+    async with nodes() as world:
+        talker, listener = await world.node("10.0.0.2"), await world.node("10.0.0.3")
+        publisher = await talker.advertise("/cmd_vel", STRING, latched=False, queue=2, replay=1)
+        for body in (b"dropped", b"early", b"next"):
+            publisher.publish(body)
+        await later(wait)
+        got: list[bytes] = []
+        await listener.subscribe("/cmd_vel", lambda body, _header: got.append(body))
+        await later()
+        assert got == heard
 
 
 async def test_a_slow_subscriber_loses_the_oldest_messages() -> None:

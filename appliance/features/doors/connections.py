@@ -1,0 +1,91 @@
+"""The connections of one door, which come as descriptors from the front process, bounded in number and rate.
+
+An agent that makes a connection for each call is normal; a client that connects in a loop is not.
+"""
+
+import asyncio
+import socket
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from http import HTTPStatus
+
+from roswire.node.network import BUFFER_BYTES, ByteWriter, OwnedTasks
+
+_REFUSAL_SECONDS = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionLimits:
+    """Upper bounds for all clients of one door."""
+
+    connections: int = 32  # at the same time
+    in_ten_seconds: int = 200  # new ones
+
+
+class DoorConnections:
+    """Serves connections, each in a task of its own; `refused` counts those that came in excess."""
+
+    def __init__(
+        self, serve: Callable[[asyncio.StreamReader, ByteWriter], Awaitable[None]], limits: ConnectionLimits
+    ) -> None:
+        self.refused = 0
+        self._serve = serve
+        self._limits = limits
+        self._open = 0
+        self._recent: deque[float] = deque()
+        self._tasks = OwnedTasks()
+
+    def adopt(self, descriptor: int) -> None:
+        """Serve the connection behind a descriptor, which this object then owns."""
+        self._tasks.start(self._adopt(socket.socket(fileno=descriptor)))
+
+    async def _adopt(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        reader, writer = await asyncio.open_connection(sock=connection, limit=BUFFER_BYTES)
+        await self.serve(reader, writer)
+
+    async def serve(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        """Serve a connection, or refuse it with HTTP 503 and the reason."""
+        reason = self._excess()
+        if reason:
+            self.refused += 1
+            await _refuse(writer, reason)
+            return
+        self._open += 1
+        try:
+            await self._serve(reader, writer)
+        finally:
+            self._open -= 1
+
+    def _excess(self) -> str:
+        now = asyncio.get_running_loop().time()
+        while self._recent and self._recent[0] <= now - 10:
+            self._recent.popleft()
+        if self._open >= self._limits.connections:
+            return f"this door has {self._open} connections; at most {self._limits.connections} are allowed"
+        if len(self._recent) >= self._limits.in_ten_seconds:
+            return f"this door had {len(self._recent)} new connections in ten seconds; connect again later"
+        self._recent.append(now)
+        return ""
+
+    async def close(self) -> None:
+        """End all connections."""
+        await self._tasks.close()
+
+
+async def _refuse(writer: ByteWriter, reason: str) -> None:
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+    body = f"{reason}\n".encode()
+    head = (
+        f"HTTP/1.1 {status.value} {status.phrase}\r\nContent-Type: text/plain; charset=utf-8\r\n"
+        f"Content-Length: {len(body)}\r\nRetry-After: 10\r\nConnection: close\r\n\r\n"
+    )
+    writer.write(head.encode() + body)
+    try:
+        async with asyncio.timeout(_REFUSAL_SECONDS):
+            await writer.drain()
+    except OSError:
+        return
+    finally:
+        writer.close()

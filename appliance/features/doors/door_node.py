@@ -1,0 +1,324 @@
+"""The node of a door, which all connections of its identity share.
+
+Agents make a new connection for each call. So a topic stays registered for some seconds after its last client left,
+and a client that comes back finds it. The master sees one publication and one subscription for each topic, however
+many connections use it. Every registration and every call of a service is decided by the master and the relay, as for
+any host; the door decides nothing.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+from weakref import WeakValueDictionary
+
+import msgspec
+from msgspec import Raw
+
+from appliance.base import clock
+from appliance.features.doors.known_types import DoorMessage, KnownTypes
+from appliance.features.doors.message_writer import Now
+from appliance.features.doors.requests import (
+    AdvertiseTopic,
+    AnswerCall,
+    CallOfService,
+    DoorRequest,
+    OfferService,
+    PublishMessage,
+    SubscribeTopic,
+    UnadvertiseTopic,
+    UnsubscribeTopic,
+    WithdrawService,
+)
+from appliance.features.doors.values import MessageCodec
+from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
+from roswire.node import MessageType, NodePublication, RosNode, ServiceFailedError, ServiceType
+from roswire.node.network import OwnedTasks
+from roswire.node.tcpros_streams import ANY
+
+_LINGER_SECONDS = 10.0
+_REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
+_ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
+
+BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
+"""Answers a call of a service that the door itself has; None if the service is not one of these."""
+
+
+class DoorClient(Protocol):
+    """A connection, as the node uses it."""
+
+    def heard(self, message: DoorMessage) -> None:
+        """Take a message of a subscribed topic."""
+
+    def answered(self, call: int, values: Raw | bytes) -> None:
+        """Take the answer to a call."""
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Take the refusal of a call."""
+
+    def ask(self, service: str, values: Raw) -> str:
+        """Take a call of an offered service, and return its id. Raises `PeerError`."""
+
+    def give_up(self, call: str) -> None:
+        """Forget a call that needs no answer any more."""
+
+
+@dataclass(slots=True)
+class _Publication:
+    publication: NodePublication
+    codec: MessageCodec
+    clients: set[DoorClient] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class _Offer:
+    client: DoorClient
+    response: MessageCodec
+    calls: dict[str, asyncio.Future[bytes]] = field(default_factory=dict)
+
+
+class DoorNode:
+    """Carries out the requests of all connections of one door.
+
+    The connections use at most `most_topics` publications, and as many subscriptions.
+    """
+
+    def __init__(self, node: RosNode, types: KnownTypes, built_in: BuiltIn, *, most_topics: int) -> None:
+        self.node = node
+        self._most_topics = most_topics
+        self._types = types
+        self._built_in = built_in
+        self._publications: dict[str, _Publication] = {}
+        self._heard: dict[str, set[DoorClient]] = {}
+        self._offers: dict[str, _Offer] = {}
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+        self._tasks = OwnedTasks()
+
+    async def close(self) -> None:
+        """End all that is still waiting, and the node."""
+        await self._tasks.close()
+        await self.node.close()
+
+    async def carry_out(self, request: DoorRequest, client: DoorClient) -> None:
+        """Carry out a request. Raises `RosError`, whose text is the refusal."""
+        match request:
+            case AdvertiseTopic():
+                await self._advertise(request, client)
+            case UnadvertiseTopic(topic):
+                self._unadvertise(topic, client)
+            case PublishMessage():
+                self._publish(request)
+            case SubscribeTopic():
+                await self._subscribe(request, client)
+            case UnsubscribeTopic(topic):
+                self._unsubscribe(topic, client)
+            case CallOfService():
+                self._tasks.start(self._call(request, client))
+            case OfferService():
+                await self._offer(request, client)
+            case WithdrawService(service):
+                await self._withdraw(service)
+            case AnswerCall():
+                self._answer(request)
+
+    async def forget(self, client: DoorClient) -> None:
+        """Release all that a connection used."""
+        for topic in [topic for topic, one in self._publications.items() if client in one.clients]:
+            self._unadvertise(topic, client)
+        for topic in [topic for topic, clients in self._heard.items() if client in clients]:
+            self._unsubscribe(topic, client)
+        for service in [service for service, offer in self._offers.items() if offer.client is client]:
+            await self._withdraw(service)
+
+    # --- publications ---
+
+    async def _advertise(self, request: AdvertiseTopic, client: DoorClient) -> None:
+        async with self._lock(f"publisher {request.topic}"):
+            known = self._publications.get(request.topic)
+            if known is None:
+                self._check_room(self._publications)
+                name = request.type or await self._type_of(request.topic)
+                codec, definitions = self._types.message(name)
+                publication = await self.node.advertise(
+                    request.topic,
+                    MessageType.defined(definitions, name),
+                    latched=request.latched,
+                    queue=request.queue,
+                    replay=_REPLAY_SECONDS,
+                )
+                known = self._publications[request.topic] = _Publication(publication, codec)
+            elif request.type not in (None, known.publication.type.name):
+                raise ProtocolError(
+                    f"{request.topic} is advertised as {known.publication.type.name}, not {request.type}"
+                )
+            known.clients.add(client)
+
+    async def _type_of(self, topic: str) -> str:
+        types = await self.node.master("getTopicTypes")
+        for row in types if isinstance(types, list) else []:
+            match row:
+                case [str(name), str(kind)] if name == topic and kind != "*":
+                    return kind
+        raise ProtocolError(f"the type of {topic} is not known; advertise it with its type first")
+
+    def _unadvertise(self, topic: str, client: DoorClient) -> None:
+        known = self._publications.get(topic)
+        if known is not None:
+            known.clients.discard(client)
+            if not known.clients:
+                self._tasks.start(self._end_publication(topic))
+
+    async def _end_publication(self, topic: str) -> None:
+        await asyncio.sleep(_LINGER_SECONDS)
+        async with self._lock(f"publisher {topic}"):
+            known = self._publications.get(topic)
+            if known is not None and not known.clients:
+                del self._publications[topic]
+                await self.node.unadvertise(topic)
+
+    def _publish(self, request: PublishMessage) -> None:
+        known = self._publications.get(request.topic)
+        if known is None:
+            raise ProtocolError(f"{request.topic} is not advertised by this client")
+        values = request.values
+        known.publication.publish(
+            known.codec.writer.from_json(values, _now()) if isinstance(values, Raw) else values
+        )
+
+    # --- subscriptions ---
+
+    async def _subscribe(self, request: SubscribeTopic, client: DoorClient) -> None:
+        topic = request.topic
+        async with self._lock(f"subscriber {topic}"):
+            if topic in self._heard:
+                self._heard[topic].add(client)
+                return
+            self._check_room(self._heard)
+            self._heard[topic] = {client}
+            try:
+                await self.node.subscribe(
+                    topic,
+                    lambda body, header: self._hear(topic, body, header),
+                    MessageType(request.type or ANY, ANY, ""),
+                )
+            except BaseException:
+                del self._heard[topic]
+                raise
+
+    def _hear(self, topic: str, body: bytes, header: Mapping[str, str]) -> None:
+        message = DoorMessage(topic, body, header, clock.wall_ns(), self._types.learn)
+        for client in self._heard.get(topic, ()):
+            client.heard(message)
+
+    def _unsubscribe(self, topic: str, client: DoorClient) -> None:
+        clients = self._heard.get(topic)
+        if clients is not None:
+            clients.discard(client)
+            if not clients:
+                self._tasks.start(self._end_subscription(topic))
+
+    async def _end_subscription(self, topic: str) -> None:
+        await asyncio.sleep(_LINGER_SECONDS)
+        async with self._lock(f"subscriber {topic}"):
+            if topic in self._heard and not self._heard[topic]:
+                del self._heard[topic]
+                await self.node.unsubscribe(topic)
+
+    # --- services ---
+
+    async def _call(self, request: CallOfService, client: DoorClient) -> None:
+        try:
+            own = self._built_in(request)
+            client.answered(request.call, await (self._call_node(request) if own is None else own))
+        except RosError as error:
+            client.failed(request, str(error))
+
+    async def _call_node(self, request: CallOfService) -> Raw | bytes:
+        header = await self.node.probe_service(request.service)
+        seconds = request.seconds or _ANSWER_SECONDS
+        md5sum = header.get("md5sum", "*")
+        if not isinstance(request.values, Raw):
+            return await self.node.call_service(request.service, md5sum, request.values, seconds)
+        name = header.get("type", "")
+        sent, received, definitions = self._types.service(name)
+        if definitions.service_md5sum(name) != md5sum:
+            raise DefinitionError(f"{request.service} has another version of this type", name[:200])
+        body = sent.writer.from_json(_named(request.values, sent.writer.fields), _now())
+        return received.json(await self.node.call_service(request.service, md5sum, body, seconds))
+
+    async def _offer(self, request: OfferService, client: DoorClient) -> None:
+        if request.service in self._offers:
+            raise ProtocolError(f"{request.service} is already offered by a client of this door")
+        given, response, definitions = self._types.service(request.type)
+        offer = self._offers[request.service] = _Offer(client, response)
+
+        async def answer(body: bytes) -> bytes:
+            call = client.ask(request.service, given.json(body))
+            future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
+            offer.calls[call] = future
+            try:
+                async with asyncio.timeout(_ANSWER_SECONDS):
+                    return await future
+            except TimeoutError:
+                raise ServiceFailedError(f"the client did not answer within {_ANSWER_SECONDS:g} s") from None
+            finally:
+                del offer.calls[call]
+                client.give_up(call)
+
+        try:
+            await self.node.offer(request.service, ServiceType.defined(definitions, request.type), answer)
+        except BaseException:
+            del self._offers[request.service]
+            raise
+
+    async def _withdraw(self, service: str) -> None:
+        offer = self._offers.pop(service, None)
+        if offer is not None:
+            for future in offer.calls.values():
+                if not future.done():
+                    future.set_exception(ServiceFailedError("the client offers the service no longer"))
+            await self.node.withdraw(service)
+
+    def _answer(self, request: AnswerCall) -> None:
+        offer = self._offers.get(request.service)
+        future = offer.calls.get(request.call) if offer is not None else None
+        if offer is None or future is None or future.done():
+            raise ProtocolError(f"no call of {request.service} waits for this answer")
+        if not request.ok:
+            future.set_exception(ServiceFailedError(bytes(request.values)[:1000].decode("utf-8", "replace")))
+            return
+        try:
+            future.set_result(offer.response.writer.from_json(request.values, _now()))
+        except PeerError as error:
+            future.set_exception(ServiceFailedError(str(error)))
+            raise
+
+    def _check_room(self, topics: dict[str, Any]) -> None:
+        if len(topics) >= self._most_topics:
+            raise LimitExceededError(
+                f"the clients of this door use {len(topics)} topics; at most {self._most_topics}. A topic that no "
+                f"client uses any longer ends after {_LINGER_SECONDS:g} s"
+            )
+
+    def _lock(self, name: str) -> asyncio.Lock:
+        lock = self._locks.get(name) or asyncio.Lock()
+        self._locks[name] = lock
+        return lock
+
+
+def _named(values: Raw, names: list[str]) -> bytes:
+    """Return the arguments of a call as an object; a list gives them in the order of the fields."""
+    text = bytes(values)
+    if not text.lstrip().startswith(b"["):
+        return text
+    given = msgspec.json.decode(text, type=list[Raw])
+    if len(given) > len(names):
+        raise ProtocolError(
+            f"{len(given)} arguments; the request has {len(names)} fields: {', '.join(names)}"
+        )
+    return msgspec.json.encode(dict(zip(names, given, strict=False)))
+
+
+def _now() -> Now:
+    seconds, nanoseconds = divmod(clock.wall_ns(), 1_000_000_000)
+    return seconds, nanoseconds

@@ -1,0 +1,106 @@
+"""The message and service types that a door knows.
+
+A message type is known if ROS's own packages define it, or if a publisher sent its definition in a connection header.
+Headers carry no definitions of services: a service type is known if ROS's own packages define it, or if the operator
+gave its file.
+"""
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from msgspec import Raw
+
+from appliance.features.doors.values import MessageCodec, ValueLimits
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+
+_MOST_CODECS = 512
+
+
+@dataclass(frozen=True)
+class DoorMessage:
+    """A message that came on a topic, with its publisher's header; its encodings are made at most once.
+
+    `received` is the system time in nanoseconds.
+    """
+
+    topic: str
+    body: bytes
+    header: Mapping[str, str]
+    received: int
+    codec_of: Callable[[Mapping[str, str]], MessageCodec] = field(repr=False)
+
+    @cached_property
+    def json(self) -> Raw:
+        """The message as JSON; raises `MessageValueError`, or `DefinitionError` if its definition cannot be used."""
+        return self.codec_of(self.header).json(self.body)
+
+    @cached_property
+    def cbor_values(self) -> dict[str, Any]:
+        """The message as values for CBOR; raises the same."""
+        return self.codec_of(self.header).cbor_values(self.body)
+
+
+class KnownTypes:
+    """The types of one door. The least recently used of many codecs are made again when they are needed."""
+
+    def __init__(self, defined: Definitions, limits: ValueLimits) -> None:
+        self._defined = defined
+        self._limits = limits
+        self._codecs: OrderedDict[tuple[str, str], tuple[MessageCodec, Definitions]] = OrderedDict()
+        self._latest: dict[str, str] = {}  # the md5sum of each type that a header defined
+
+    def learn(self, header: Mapping[str, str]) -> MessageCodec:
+        """Return the codec for a publisher's messages; raises `DefinitionError`."""
+        name, md5sum = header.get("type", ""), header.get("md5sum", "")
+        known = self._codecs.get((name, md5sum))
+        if known is not None:
+            self._codecs.move_to_end((name, md5sum))
+            return known[0]
+        definitions = Definitions.from_full_text(name, header.get("message_definition", ""))
+        if definitions.md5sum(name) != md5sum:
+            raise DefinitionError(
+                f"the publisher's definition does not have its md5sum {md5sum[:32]}", name[:200]
+            )
+        return self._keep(name, md5sum, definitions)
+
+    def message(self, name: str) -> tuple[MessageCodec, Definitions]:
+        """Return the codec and the definitions of a type; raises `DefinitionError`."""
+        md5sum = self._latest.get(name, "")
+        known = self._codecs.get((name, md5sum))
+        if known is None:
+            if name not in self._defined.message_types:
+                raise DefinitionError(
+                    "the door does not know this message type: no publisher of it has been heard, and it is not "
+                    "one of ROS's own packages",
+                    name[:200],
+                )
+            self._keep(name, self._defined.md5sum(name), self._defined)
+            known = self._codecs[name, self._latest[name]]
+        return known
+
+    def service(self, name: str) -> tuple[MessageCodec, MessageCodec, Definitions]:
+        """Return the codecs of the request and the response of a service type; raises `DefinitionError`."""
+        if name not in self._defined.service_types:
+            raise DefinitionError(
+                "the door does not know this service type: it is not one of ROS's own packages", name[:200]
+            )
+        service = self._defined.service(name)
+        return (
+            self.message(service.request.name)[0],
+            self.message(service.response.name)[0],
+            self._defined,
+        )
+
+    def _keep(self, name: str, md5sum: str, definitions: Definitions) -> MessageCodec:
+        codec = MessageCodec(definitions, name, self._limits)
+        self._codecs[name, md5sum] = codec, definitions
+        self._latest[name] = md5sum
+        if len(self._codecs) > _MOST_CODECS:
+            (oldest, oldest_md5sum), _ = self._codecs.popitem(last=False)
+            if self._latest.get(oldest) == oldest_md5sum:
+                del self._latest[oldest]
+        return codec

@@ -1,0 +1,291 @@
+"""The WebSocket of one client: handshake, frames in both directions, and the end.
+
+The front process identifies the client, and passes its connection here as a stream. Rules:
+
+1. A frame is at most `frame_bytes` long, also after inflation. A browser's Origin must be listed.
+2. The session carries out the requests of the client in order. While it does so, it does not read; calls of services
+   do not hold up later requests.
+3. Frames are sent only as fast as the client reads. In the meantime, its queue keeps the newest messages of each topic.
+4. A client that sends nothing, and does not answer pings, is disconnected.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from msgspec import Raw
+from websockets.exceptions import ProtocolError as WebSocketError
+from websockets.extensions.permessage_deflate import ServerPerMessageDeflateFactory
+from websockets.frames import CloseCode, Opcode
+from websockets.frames import Frame as WebSocketFrame
+from websockets.http11 import Request
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+from websockets.typing import Origin, Subprotocol
+
+from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.requests import DoorRequest, Frame
+from appliance.features.doors.viewer_queue import ViewerStalledError
+from roswire.errors import RosError
+from roswire.node.network import ByteWriter
+
+_READ_BYTES = 1 << 16
+_CLOSING_SECONDS = 2.0
+_WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
+
+
+@dataclass(frozen=True, slots=True)
+class SessionOptions:
+    """The limits of a connection, and the origins whose pages may open one; times are in seconds."""
+
+    origins: tuple[str, ...] = ()
+    frame_bytes: int = 8 << 20
+    handshake_seconds: float = 10.0
+    ping_seconds: float = 20.0
+    silent_seconds: float = 60.0
+
+
+class ClientProtocol(Protocol):
+    """The protocol that a client speaks, without I/O. Its methods may raise `ViewerStalledError`."""
+
+    def receive(self, frame: Frame) -> Sequence[DoorRequest]:
+        """Return the requests of a frame."""
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Refuse a request in words."""
+
+    def answered(self, number: int, values: Raw | bytes) -> None:
+        """Answer a call."""
+
+    def ask(self, service: str, values: Raw) -> str:
+        """Send a call of an offered service, and return its id."""
+
+    def give_up(self, call: str) -> None:
+        """Forget a call of an offered service."""
+
+    def message(self, message: DoorMessage, now: float) -> None:
+        """Queue a message."""
+
+    def next_frame(self, now: float) -> Frame | None:
+        """Return the next frame to send now, or None."""
+
+    def next_time(self) -> float | None:
+        """Return the time of the next frame that waits, or None."""
+
+
+Protocols = Callable[[str | None], ClientProtocol]
+"""Makes the protocol for the subprotocol of the WebSocket, or for None."""
+
+
+class DoorSession:
+    """One connection, from the handshake on; `end` has the reason of its end, in words."""
+
+    def __init__(
+        self,
+        reader: asyncio.StreamReader,
+        writer: ByteWriter,
+        *,
+        door: DoorNode,
+        protocols: Protocols,
+        subprotocols: Sequence[str],
+        options: SessionOptions,
+    ) -> None:
+        self.end = ""
+        self._reader, self._writer = reader, writer
+        self._door = door
+        self._protocols = protocols
+        self._subprotocols = subprotocols
+        self._options = options
+        self._protocol: ClientProtocol
+        self._parts: list[bytes] = []
+        self._is_text = False
+        self._wake = asyncio.Event()
+        self._socket = ServerProtocol(
+            origins=[None, *map(Origin, options.origins)],
+            extensions=[
+                ServerPerMessageDeflateFactory(
+                    server_max_window_bits=_WINDOW_BITS,
+                    client_max_window_bits=_WINDOW_BITS,
+                    compress_settings={"level": 1, "memLevel": 5},
+                )
+            ],
+            select_subprotocol=lambda _socket, offered: self._choose(offered),
+            max_size=options.frame_bytes,
+        )
+
+    def _choose(self, offered: Sequence[Subprotocol]) -> Subprotocol | None:
+        return next((one for one in offered if one in self._subprotocols), None)
+
+    async def run(self) -> None:
+        """Serve the connection until its end, and release everything that it used."""
+        try:
+            if await self._handshake():
+                await self._serve()
+        except TimeoutError:
+            self.end = self.end or "the client was silent for too long"
+        except OSError as error:
+            self.end = self.end or f"the connection broke: {error}"
+        finally:
+            self._writer.close()
+            await self._door.forget(self)
+
+    async def _handshake(self) -> bool:
+        async with asyncio.timeout(self._options.handshake_seconds):
+            while not (events := self._socket.events_received()):
+                data = await self._reader.read(_READ_BYTES)
+                if not data:
+                    self.end = "the client left before the handshake"
+                    return False
+                self._socket.receive_data(data)
+                if self._socket.handshake_exc is not None:
+                    break
+            if events and isinstance(events[0], Request):
+                self._socket.send_response(self._socket.accept(events[0]))
+            await self._flush()
+        if self._socket.state is not State.OPEN:
+            self.end = f"no WebSocket handshake: {self._socket.handshake_exc}"
+            return False
+        self._protocol = self._protocols(self._socket.subprotocol)
+        return True
+
+    async def _serve(self) -> None:
+        sending = asyncio.ensure_future(self._send())
+        receiving = asyncio.ensure_future(self._receive())
+        tasks = (sending, receiving)
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            ends = await asyncio.gather(*tasks, return_exceptions=True)
+            with contextlib.suppress(OSError, TimeoutError):
+                async with asyncio.timeout(1):
+                    await self._flush()
+        for end in ends:
+            if isinstance(end, Exception):
+                raise end
+
+    # --- frames of the client ---
+
+    async def _receive(self) -> None:
+        while not self._socket.close_expected():
+            async with asyncio.timeout(self._options.silent_seconds):
+                data = await self._reader.read(_READ_BYTES)
+            if not data:
+                self._socket.receive_eof()
+                break
+            self._socket.receive_data(data)
+            for event in self._socket.events_received():
+                if isinstance(event, WebSocketFrame):
+                    await self._take(event)
+            await self._flush()
+        self.end = self.end or f"the client ended the connection{_reason(self._socket)}"
+
+    async def _take(self, frame: WebSocketFrame) -> None:
+        if frame.opcode in (Opcode.TEXT, Opcode.BINARY):
+            self._is_text = frame.opcode is Opcode.TEXT
+            self._parts = [bytes(frame.data)]
+        elif frame.opcode is Opcode.CONT:
+            self._parts.append(bytes(frame.data))
+        else:
+            return
+        if frame.fin:
+            data, self._parts = b"".join(self._parts), []
+            try:
+                await self._carry_out(data.decode() if self._is_text else data)
+            except UnicodeDecodeError:
+                self._disconnect(CloseCode.INVALID_DATA, "a text frame that is not UTF-8")
+            except ViewerStalledError as error:
+                self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
+
+    async def _carry_out(self, frame: Frame) -> None:
+        """Carry out the requests of a frame; after a refusal, drop the rest."""
+        requests = self._protocol.receive(frame)
+        self._wake.set()
+        for request in requests:
+            try:
+                await self._door.carry_out(request, self)
+            except RosError as error:
+                self._protocol.failed(request, str(error))
+                self._wake.set()
+                return
+
+    # --- frames for the client ---
+
+    async def _send(self) -> None:
+        loop = asyncio.get_running_loop()
+        next_ping = loop.time() + self._options.ping_seconds
+        while self._socket.state is State.OPEN:
+            frame = self._protocol.next_frame(loop.time())
+            if frame is not None:
+                if isinstance(frame, str):
+                    self._socket.send_text(frame.encode())
+                else:
+                    self._socket.send_binary(frame)
+                await self._flush()
+                continue
+            if loop.time() >= next_ping:
+                next_ping = loop.time() + self._options.ping_seconds
+                self._socket.send_ping(b"")
+                await self._flush()
+            due = self._protocol.next_time()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(next_ping if due is None else min(due, next_ping)):
+                    await self._wake.wait()
+            self._wake.clear()
+        await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
+
+    async def _flush(self) -> None:
+        for data in self._socket.data_to_send():
+            if data:
+                self._writer.write(data)
+        await self._writer.drain()
+
+    def _disconnect(self, code: CloseCode, reason: str) -> None:
+        self.end = self.end or reason
+        if self._socket.state is State.OPEN:
+            with contextlib.suppress(WebSocketError):
+                self._socket.send_close(code, reason[:120])
+        self._wake.set()
+
+    # --- the door's side: a `DoorClient` ---
+
+    def heard(self, message: DoorMessage) -> None:
+        """Queue a message for the client."""
+        self._protocol.message(message, asyncio.get_running_loop().time())
+        self._wake.set()
+
+    def answered(self, call: int, values: Raw | bytes) -> None:
+        """Queue the answer to a call."""
+        self._tell(lambda: self._protocol.answered(call, values))
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Queue the refusal of a call."""
+        self._tell(lambda: self._protocol.failed(request, reason))
+
+    def ask(self, service: str, values: Raw) -> str:
+        """Queue a call for the client, and return its id. Raises `PeerError`."""
+        call = self._protocol.ask(service, values)
+        self._wake.set()
+        return call
+
+    def give_up(self, call: str) -> None:
+        """Forget a call for the client."""
+        self._protocol.give_up(call)
+
+    def _tell(self, tell: Callable[[], None]) -> None:
+        try:
+            tell()
+        except ViewerStalledError as error:
+            self._disconnect(CloseCode.POLICY_VIOLATION, str(error))
+        self._wake.set()
+
+
+def _reason(socket: ServerProtocol) -> str:
+    """Return why the protocol ended, if it was not a normal end."""
+    if socket.parser_exc is not None:
+        return f": {socket.parser_exc}"
+    return f" with the code {socket.close_code}" if socket.close_code is not None else ""

@@ -1,0 +1,174 @@
+"""A door in virtual time: its node, a scripted master, other nodes, and WebSocket clients, on a network in memory."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from typing import Any
+
+import cbor2
+from websockets.client import ClientProtocol
+from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Response
+from websockets.protocol import State
+from websockets.typing import Origin, Subprotocol
+from websockets.uri import parse_uri
+
+from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.requests import CallOfService
+from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
+from appliance.features.doors.session import DoorSession, SessionOptions
+from appliance.features.doors.values import ValueLimits
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.node import NodeLimits, RosNode
+from roswire.standard import standard_definitions
+from tests.support.memory_network import MemoryNetwork, MemoryWriter
+from tests.support.scripted_master import MASTER, ScriptedMaster
+
+DOOR = ("10.0.0.2", 9090)
+
+
+class WebSocketClient:
+    """A client of the door, made of the protocol of `websockets`."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: MemoryWriter, **options: Any) -> None:
+        self.reader, self.writer = reader, writer
+        self.socket = ClientProtocol(parse_uri("ws://10.0.0.2:9090"), max_size=None, **options)
+        self.response: Response | None = None
+        self.frames: asyncio.Queue[Any] = asyncio.Queue()
+        self._reading = asyncio.ensure_future(self._read())
+        self.socket.send_request(self.socket.connect())
+        self.flush()
+
+    async def _read(self) -> None:
+        while data := await self.reader.read(1 << 16):
+            self.socket.receive_data(data)
+            for event in self.socket.events_received():
+                if isinstance(event, Response):
+                    self.response = event
+                elif isinstance(event, Frame) and event.opcode is Opcode.TEXT:
+                    self.frames.put_nowait(json.loads(bytes(event.data)))
+                elif isinstance(event, Frame) and event.opcode is Opcode.BINARY:
+                    self.frames.put_nowait(cbor2.loads(bytes(event.data)))
+            self.flush()
+        self.socket.receive_eof()
+
+    def flush(self) -> None:
+        """Send what the protocol has to send."""
+        for data in self.socket.data_to_send():
+            if data:
+                self.writer.write(data)
+
+    def send(self, frame: "dict[str, Any] | str | bytes") -> None:
+        """Send a frame."""
+        if isinstance(frame, bytes):
+            self.socket.send_binary(frame)
+        else:
+            self.socket.send_text((frame if isinstance(frame, str) else json.dumps(frame)).encode())
+        self.flush()
+
+    async def next(self) -> Any:
+        """Return the next frame of the door."""
+        async with asyncio.timeout(100):
+            return await self.frames.get()
+
+    async def closed(self) -> str:
+        """Wait for the end of the connection; return its reason."""
+        await asyncio.wait([self._reading], timeout=1000)
+        assert self._reading.done()
+        return str(self.socket.close_reason or "")
+
+    def stop_reading(self) -> None:
+        """Read nothing more, as a client that hangs."""
+        self._reading.cancel()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection is open."""
+        return self.socket.state is State.OPEN
+
+
+class DoorWorld:
+    """The door at 10.0.0.2, and its surroundings."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork()
+        self.master = ScriptedMaster(self.network)
+        self.limits = ConnectionLimits()
+        self.sessions: list[DoorSession] = []
+        self.queues: list[ViewerQueue[str]] = []
+        self.options = SessionOptions(origins=("https://robot.example",))
+        self.types = KnownTypes(standard_definitions(), ValueLimits())
+        self.nodes: list[RosNode] = []
+        self.node: RosNode
+        self.door: DoorNode
+
+    async def start(self) -> None:
+        """Start the door."""
+        self.node = await self.robot("10.0.0.2", "/door_alice")
+        self.door = DoorNode(self.node, self.types, built_in, most_topics=50)
+        connections = DoorConnections(self.serve, self.limits)
+        self.network.listen(DOOR[0], connections.serve, DOOR[1])
+
+    async def robot(self, address: str, name: str) -> RosNode:
+        """Start another node."""
+        node = RosNode(
+            name, MASTER, self.network.at(address), limits=NodeLimits(), shut_down=lambda _reason: None
+        )
+        await node.start()
+        self.nodes.append(node)
+        return node
+
+    async def serve(self, reader: asyncio.StreamReader, writer: Any) -> None:
+        """Serve one client."""
+        queue: ViewerQueue[str] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20)
+        self.queues.append(queue)
+        session = DoorSession(
+            reader,
+            writer,
+            door=self.door,
+            protocols=lambda _name: Rosbridge("/door_alice", RosbridgeLimits(), queue),
+            subprotocols=(),
+            options=self.options,
+        )
+        self.sessions.append(session)
+        await session.run()
+
+    async def client(
+        self, *, origin: str | None = None, subprotocols: Sequence[str] = (), deflate: bool = False
+    ) -> WebSocketClient:
+        """Connect a client, and wait for the answer to its handshake."""
+        client = WebSocketClient(
+            *self.network.connect("10.0.0.9", DOOR),
+            origin=None if origin is None else Origin(origin),
+            subprotocols=[*map(Subprotocol, subprotocols)] or None,
+            extensions=[ClientPerMessageDeflateFactory()] if deflate else None,
+        )
+        await asyncio.sleep(0.1)
+        return client
+
+
+def built_in(_request: CallOfService) -> None:
+    """Offer no services of the door itself."""
+
+
+@asynccontextmanager
+async def door_world() -> AsyncIterator[DoorWorld]:
+    """Yield a door; at the end it is closed, and no task of it remains."""
+    before = asyncio.all_tasks()
+    world = DoorWorld()
+    await world.start()
+    try:
+        yield world
+    finally:
+        world.network.break_off(DOOR)
+        await asyncio.sleep(5)
+        await world.door.close()
+        for node in world.nodes:
+            await node.close()
+        await asyncio.sleep(1)
+        left = [task for task in asyncio.all_tasks() - before if not task.done()]
+        assert not left, left

@@ -1,0 +1,286 @@
+"""A door in virtual time: WebSocket clients on one side, a master and other nodes on the other."""
+
+import asyncio
+import struct
+from typing import Any
+
+import pytest
+
+from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
+from roswire.standard import standard_definitions
+from tests.support.door_world import DOOR, WebSocketClient, door_world
+
+pytestmark = pytest.mark.anyio
+
+
+def string(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+async def talks(node: RosNode, topic: str) -> Any:
+    kind = MessageType.defined(standard_definitions(), "std_msgs/String")
+    return await node.advertise(topic, kind, latched=False, queue=100)
+
+
+async def test_messages_pass_in_both_directions() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        heard: list[bytes] = []
+        await robot.subscribe("/cmd", lambda body, _header: heard.append(body))
+        publication = await talks(robot, "/state")
+        client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+        client.send({"op": "publish", "topic": "/cmd", "msg": {"data": "go"}})
+        client.send({"op": "subscribe", "topic": "/state"})
+        await asyncio.sleep(1)
+        assert heard == [string("go")]
+        publication.publish(string("ready"))
+        assert await client.next() == {"op": "publish", "topic": "/state", "msg": {"data": "ready"}}
+        assert client.frames.empty()  # nothing unsolicited
+
+
+@pytest.mark.parametrize("deflate", [False, True])
+async def test_a_denial_of_the_master_is_words_with_the_id(deflate: bool) -> None:
+    async with door_world() as world:
+        client = await world.client(deflate=deflate)
+        assert bool(client.socket.extensions) is deflate
+        reason = "denied by [Publishers] /cmd_vel (site.ini:14)"
+        for method in ("registerPublisher", "registerSubscriber", "registerService", "lookupService"):
+            world.master.denials[method] = reason
+        client.send({"op": "advertise", "topic": "/cmd_vel", "type": "geometry_msgs/Twist", "id": "a"})
+        client.send({"op": "subscribe", "topic": "/camera", "id": 2})
+        client.send({"op": "advertise_service", "service": "/s", "type": "std_srvs/Empty", "id": "s"})
+        for reply_to in ("a", 2, "s"):
+            status = await client.next()
+            assert status == {"op": "status", "level": "error", "msg": reason, "id": reply_to}
+        client.send({"op": "call_service", "service": "/brake", "id": "c"})
+        response = await client.next()
+        assert response["result"] is False and response["values"] == {"message": reason}
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"),
+    [
+        ({"topic": "/a", "type": "std_msgs/String", "msg": {"datum": 1}}, "unknown field `datum`"),
+        ({"topic": "/b", "type": "own/Type", "msg": {}}, "does not know this message type"),
+        ({"topic": "/c", "msg": {}}, "the type of /c is not known"),
+    ],
+)
+async def test_values_that_do_not_fit_are_refused_in_words(sent: dict[str, Any], words: str) -> None:
+    async with door_world() as world:
+        client = await world.client()
+        if "type" in sent:
+            client.send({"op": "advertise", "id": 1} | sent)
+        client.send({"op": "publish", "id": 1} | sent)
+        assert words in (await client.next())["msg"]
+
+
+async def test_a_service_of_the_robot_is_called_by_name_or_in_order() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+
+        async def answer(request: bytes) -> bytes:
+            if request == b"\x00":
+                raise ServiceFailedError("the arm is blocked")
+            return b"\x01" + string("done")
+
+        kind = ServiceType.defined(standard_definitions(), "std_srvs/SetBool")
+        await robot.offer("/brake", kind, answer)
+        for number, args in enumerate(({"data": True}, [True])):
+            client.send({"op": "call_service", "service": "brake", "args": args, "id": number})
+            response = await client.next()
+            assert response["values"] == {"success": True, "message": "done"} and response["id"] == number
+        for args, words in (
+            ([False], "the arm is blocked"),
+            ([1], "got `int` - at `$.data`"),
+            ([True, 1], "2 arguments; the request has 1 fields: data"),
+            ({"x": 1}, "unknown field `x`"),
+            ("true", "Expected `object`, got `str`"),
+        ):
+            client.send({"op": "call_service", "service": "brake", "args": args})
+            response = await client.next()
+            assert response["result"] is False and words in response["values"]["message"]
+
+
+async def test_a_service_of_a_client_is_answered_or_fails_when_the_client_leaves() -> None:
+    async with door_world() as world:
+        robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
+        client.send({"op": "advertise_service", "service": "/grip", "type": "std_srvs/SetBool"})
+        await asyncio.sleep(1)
+        calls = [asyncio.ensure_future(robot.call_service("/grip", "*", b"\x01", 100)) for _ in range(3)]
+        asked = [await client.next() for _ in calls]
+        assert asked[0]["args"] == {"data": True}
+        answer = {"op": "service_response", "service": "/grip", "id": asked[0]["id"]}
+        client.send(answer | {"values": {"success": True, "message": "ok"}, "result": True})
+        assert await calls[0] == b"\x01" + string("ok")
+        client.send(answer | {"id": asked[1]["id"], "values": {"succes": True}, "result": True})
+        with pytest.raises(ServiceFailedError, match="unknown field `succes`"):
+            await calls[1]
+        assert "unknown field `succes`" in (await client.next())["msg"]
+        client.writer.close()
+        with pytest.raises(ServiceFailedError, match="offers the service no longer"):
+            await calls[2]
+        await asyncio.sleep(1)
+        assert world.master.services == {}
+
+
+async def test_an_agent_that_connects_for_each_call_registers_once() -> None:
+    """Its topics stay for ten seconds after its last connection, and then end."""
+    async with door_world() as world:
+        for _ in range(5):
+            client = await world.client()
+            client.send({"op": "publish", "topic": "/cmd", "msg": {}})
+            client.send({"op": "advertise", "topic": "/cmd", "type": "std_msgs/String"})
+            client.send({"op": "subscribe", "topic": "/state"})
+            await asyncio.sleep(1)
+            client.writer.close()
+            await asyncio.sleep(1)
+        assert world.master.calls.count("registerPublisher") == 1
+        assert world.master.calls.count("registerSubscriber") == 1
+        await asyncio.sleep(15)
+        assert world.master.publishers["/cmd"] == [] and world.master.subscribers["/state"] == []
+
+
+async def test_a_viewer_that_stops_reading_delays_no_other_and_takes_bounded_memory() -> None:
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+        publication = await talks(robot, "/image")
+        stuck, reading = await world.client(), await world.client()
+        for client in (stuck, reading):
+            client.send(
+                {"op": "subscribe", "topic": "/image", "compression": "cbor-raw", "queue_length": 1000}
+            )
+        await asyncio.sleep(1)
+        stuck.stop_reading()
+        for number in range(100):
+            publication.publish(string(f"{number:03}" + "x" * 200_000))
+            await asyncio.sleep(0.05)
+        received = [await reading.next() for _ in range(100)]
+        assert [frame["msg"]["bytes"][4:7] for frame in received] == [
+            b"%03d" % number for number in range(100)
+        ]
+        assert 90 < world.queues[0].dropped < 100  # its queue has 1 MB
+        assert world.queues[1].dropped == 0
+        await asyncio.sleep(100)
+        assert world.sessions[0].end == "the client was silent for too long"
+        assert reading.is_open
+
+
+@pytest.mark.parametrize(
+    ("deflate", "frame", "code"),
+    [
+        (True, "[" + " " * 50_000_000, 1009),
+        (False, " " * (8 << 20) + "{", 1009),
+        (False, b"\x00" * (8 << 20) + b"a", 1009),
+    ],
+)
+async def test_a_frame_that_is_too_large_even_inflated_ends_the_connection(
+    deflate: bool, frame: str | bytes, code: int
+) -> None:
+    async with door_world() as world:
+        client = await world.client(deflate=deflate)
+        client.send(frame)
+        await client.closed()
+        assert client.socket.close_code == code
+        other = await world.client()
+        assert other.is_open
+
+
+async def test_fragments_of_websocket_frames_have_one_limit_together() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.socket.send_text(b" " * (5 << 20), fin=False)
+        client.socket.send_continuation(b" " * (5 << 20), fin=True)
+        client.flush()
+        await client.closed()
+        assert client.socket.close_code == 1009
+
+
+async def test_a_text_frame_that_is_not_utf_8_ends_the_connection() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.socket.send_text(b'{"op":"\xff"}')
+        client.flush()
+        assert await client.closed() == "a text frame that is not UTF-8"
+        assert client.socket.close_code == 1007
+
+
+async def test_a_client_that_asks_without_reading_is_disconnected() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        client.stop_reading()
+        for _ in range(3000):
+            client.send({"op": "nonsense" * 100, "id": "x" * 1000})
+        await asyncio.sleep(100)
+        assert world.sessions[0].end
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [(None, 101), ("https://robot.example", 101), ("https://evil.example", 403), ("null", 403)],
+)
+async def test_only_listed_pages_may_connect(origin: str | None, status: int) -> None:
+    async with door_world() as world:
+        client = await world.client(origin=origin)
+        assert client.response is not None and client.response.status_code == status
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"",
+        b"GET / HTTP/1.1\r\nHost: x\r\n\r\n",
+        b"\x16\x03\x01\x02\x00",
+        b"GET /" + b"a" * 20_000,
+        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 2000,
+        b"POST / HTTP/1.1\r\n\r\n",
+    ],
+)
+async def test_a_peer_without_a_handshake_is_disconnected_in_time(sent: bytes) -> None:
+    async with door_world() as world:
+        reader, writer = world.network.connect("10.0.0.9", DOOR)
+        writer.write(sent)
+        async with asyncio.timeout(20):
+            await reader.read()
+        assert world.sessions[0].end
+
+
+async def test_a_viewer_that_answers_pings_stays_connected_for_hours() -> None:
+    async with door_world() as world:
+        client = await world.client()
+        await asyncio.sleep(3600)
+        assert client.is_open and client.frames.empty()
+
+
+async def test_connections_of_a_door_are_bounded_in_number_and_rate() -> None:
+    async with door_world() as world:
+        answers = [(await world.client()).response for _ in range(world.limits.connections + 5)]
+        statuses = [answer.status_code for answer in answers if answer is not None]
+        assert statuses == [101] * world.limits.connections + [503] * 5
+        assert answers[-1] is not None and b"at most 32 are allowed" in (answers[-1].body or b"")
+        world.network.break_off(DOOR)
+        await asyncio.sleep(20)
+        assert world.limits.in_ten_seconds == 200
+        refused = 0
+        for _ in range(250):
+            client = WebSocketClient(*world.network.connect("10.0.0.9", DOOR))
+            await asyncio.sleep(0.01)
+            refused += client.response is not None and client.response.status_code == 503
+            client.writer.close()
+        assert refused == 50
+        await asyncio.sleep(20)
+        assert (await world.client()).is_open
+
+
+async def test_topics_of_a_door_are_bounded_over_all_its_connections() -> None:
+    async with door_world() as world:
+        refused = 0
+        for _connection in range(3):
+            client = await world.client()
+            for number in range(20):
+                client.send({"op": "subscribe", "topic": f"/t{_connection}_{number}"})
+            await asyncio.sleep(2)
+            while not client.frames.empty():
+                assert "use 50 topics; at most 50" in client.frames.get_nowait()["msg"]
+                refused += 1
+            client.writer.close()
+        assert refused == 10
