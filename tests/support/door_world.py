@@ -18,7 +18,7 @@ from websockets.uri import parse_uri
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import KnownTypes
-from appliance.features.doors.requests import CallOfService
+from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import DoorSession, SessionOptions
 from appliance.features.doors.values import ValueLimits
@@ -109,7 +109,8 @@ class DoorWorld:
     async def start(self) -> None:
         """Start the door."""
         self.node = await self.robot("10.0.0.2", "/door_alice")
-        self.door = DoorNode(self.node, self.types, built_in, most_topics=50)
+        rosapi = Rosapi(MasterSight(self.node, lambda: (7, 8)), self.types)
+        self.door = DoorNode(self.node, self.types, rosapi.answer, most_topics=50)
         connections = DoorConnections(self.serve, self.limits)
         self.network.listen(DOOR[0], connections.serve, DOOR[1])
 
@@ -149,10 +150,6 @@ class DoorWorld:
         )
         await asyncio.sleep(0.1)
         return client
-
-
-def built_in(_request: CallOfService) -> None:
-    """Offer no services of the door itself."""
 
 
 @asynccontextmanager

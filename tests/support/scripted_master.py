@@ -20,6 +20,7 @@ class ScriptedMaster:
         self.subscribers: dict[str, list[str]] = {}
         self.services: dict[str, str] = {}
         self.denials: dict[str, str] = {}  # the reason, by method
+        self.answers: dict[str, Value] = {}  # values, by method
         self.before_answer: Callable[[MethodCall], Any] | None = None
         self.calls: list[str] = []
         self.server = network.listen(
@@ -33,6 +34,8 @@ class ScriptedMaster:
             await self.before_answer(call)
         if call.method in self.denials:
             return [-1, self.denials[call.method], 0]
+        if call.method in self.answers:
+            return [1, "", self.answers[call.method]]
         params: list[Any] = list(call.params)
         match call.method:
             case "registerSubscriber":

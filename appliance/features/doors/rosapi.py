@@ -1,0 +1,370 @@
+"""The services of rosapi, answered from the part of the graph that the identity of the door may see.
+
+The answers have the fields of rosapi's own service types. `get_ros_version` belongs to ROS 2: clients call it to find
+out which ROS this is, and it fails at once. A call that the policy denies fails with the master's words.
+"""
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+import msgspec
+from msgspec import Raw, Struct
+
+from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.message_writer import Now
+from appliance.features.doors.requests import CallOfService
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError, ProtocolError, quoted
+from roswire.message_text import PRIMITIVES, MessageDefinition
+from roswire.node import RosNode
+from roswire.xmlrpc import Value
+
+_PREFIX = "/rosapi/"
+_ACTION_TOPICS = ("cancel", "feedback", "goal", "result", "status")
+_TIME_TYPES = ("time", "duration")
+_EXAMPLES = {"bool": "False", "string": "", "float32": "0.0", "float64": "0.0"}
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleGraph:
+    """The names of nodes by topic and service, and the type of each topic."""
+
+    publishers: Mapping[str, Sequence[str]]
+    subscribers: Mapping[str, Sequence[str]]
+    services: Mapping[str, Sequence[str]]
+    types: Mapping[str, str]
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the names of all topics, sorted."""
+        return sorted({*self.publishers, *self.subscribers})
+
+
+class Sight(Protocol):
+    """The part of the system that an identity may see. All methods raise `RosError` with the reason of a denial."""
+
+    async def graph(self) -> VisibleGraph:
+        """Return topics, services and nodes."""
+
+    async def service_header(self, service: str) -> Mapping[str, str]:
+        """Return the connection header of a service."""
+
+    async def service_uri(self, service: str) -> str:
+        """Return the URI of a service."""
+
+    async def parameter(self, call: str, *arguments: Value) -> Value:
+        """Make a call of the parameter API."""
+
+    def time(self) -> Now:
+        """Return the present time."""
+
+
+class MasterSight:
+    """The sight of a node: the answers of the master to its calls, each of which the policy decides."""
+
+    def __init__(self, node: RosNode, now: Callable[[], Now]) -> None:
+        self._node = node
+        self._now = now
+
+    async def graph(self) -> VisibleGraph:
+        """Return topics, services and nodes."""
+        state = await self._node.master("getSystemState")
+        if not isinstance(state, list) or len(state) != 3:
+            raise ProtocolError("the master gave no valid answer to getSystemState")
+        types = await self._node.master("getTopicTypes")
+        publishers, subscribers, services = map(_rows, state)
+        return VisibleGraph(
+            publishers, subscribers, services, types={name: str(kind) for name, kind in _pairs(types)}
+        )
+
+    async def service_header(self, service: str) -> Mapping[str, str]:
+        """Return the connection header of a service."""
+        return await self._node.probe_service(service)
+
+    async def service_uri(self, service: str) -> str:
+        """Return the URI of a service."""
+        return str(await self._node.master("lookupService", service))
+
+    async def parameter(self, call: str, *arguments: Value) -> Value:
+        """Make a call of the parameter API."""
+        return await self._node.master(call, *arguments)
+
+    def time(self) -> Now:
+        """Return the present time."""
+        return self._now()
+
+
+def _pairs(value: Value) -> list[tuple[str, Value]]:
+    rows = value if isinstance(value, list) else []
+    return [
+        (row[0], row[1])
+        for row in rows
+        if isinstance(row, list) and len(row) == 2 and isinstance(row[0], str)
+    ]
+
+
+def _rows(value: Value) -> dict[str, list[str]]:
+    return {name: [str(node) for node in nodes] for name, nodes in _pairs(value) if isinstance(nodes, list)}
+
+
+class _Arguments(Struct):
+    """The fields of all requests of rosapi."""
+
+    topic: str = ""
+    type: str = ""
+    service: str = ""
+    node: str = ""
+    name: str = ""
+    value: str = ""
+    default: str = ""
+
+
+_Answer = Callable[[_Arguments], Awaitable[dict[str, Any]]]
+
+
+class Rosapi:
+    """The services of one door."""
+
+    def __init__(self, sight: Sight, types: KnownTypes) -> None:
+        self._sight = sight
+        self._types = types
+        self._answers: dict[str, tuple[tuple[str, ...], _Answer]] = {
+            "topics": ((), self._topics),
+            "topics_and_raw_types": ((), self._topics_and_raw_types),
+            "topics_for_type": (("type",), self._topics_for_type),
+            "topic_type": (("topic",), self._topic_type),
+            "publishers": (("topic",), self._publishers),
+            "subscribers": (("topic",), self._subscribers),
+            "services": ((), self._services),
+            "services_for_type": (("type",), self._services_for_type),
+            "service_type": (("service",), self._service_type),
+            "service_node": (("service",), self._service_node),
+            "service_providers": (("service",), self._service_providers),
+            "service_host": (("service",), self._service_host),
+            "nodes": ((), self._nodes),
+            "node_details": (("node",), self._node_details),
+            "action_servers": ((), self._action_servers),
+            "message_details": (("type",), self._message_details),
+            "service_request_details": (("type",), self._request_details),
+            "service_response_details": (("type",), self._response_details),
+            "get_param": (("name", "default"), self._get_param),
+            "set_param": (("name", "value"), self._set_param),
+            "has_param": (("name",), self._has_param),
+            "search_param": (("name",), self._search_param),
+            "delete_param": (("name",), self._delete_param),
+            "get_param_names": ((), self._param_names),
+            "get_time": ((), self._time),
+        }
+
+    def answer(self, request: CallOfService) -> Awaitable[Raw] | None:
+        """Answer a call of rosapi; return None for a call of another service."""
+        if request.service.endswith("/get_ros_version"):
+            return _fail("get_ros_version is a service of ROS 2; this robot has ROS 1")
+        if not request.service.startswith(_PREFIX):
+            return None
+        row = self._answers.get(request.service.removeprefix(_PREFIX))
+        if row is None:
+            return _fail(f"rosapi has no service {quoted(request.service)}")
+        return self._answer(*row, bytes(request.values))
+
+    async def _answer(self, fields: tuple[str, ...], answer: _Answer, values: bytes) -> Raw:
+        try:
+            if values.lstrip().startswith(b"["):
+                given = msgspec.json.decode(values, type=list[Raw])
+                values = msgspec.json.encode(dict(zip(fields, given, strict=False)))
+            arguments = msgspec.json.decode(values, type=_Arguments)
+        except (ValueError, RecursionError) as error:
+            raise ProtocolError(f"arguments of a call of rosapi: {error}") from None
+        return Raw(msgspec.json.encode(await answer(arguments)))
+
+    # --- topics ---
+
+    async def _topics(self, _given: _Arguments) -> dict[str, Any]:
+        graph = await self._sight.graph()
+        return {"topics": graph.topics, "types": [graph.types.get(topic, "") for topic in graph.topics]}
+
+    async def _topics_and_raw_types(self, given: _Arguments) -> dict[str, Any]:
+        found = await self._topics(given)
+        return found | {"typedefs_full_text": [self._full_text(name) for name in found["types"]]}
+
+    def _full_text(self, name: str) -> str:
+        try:
+            return self._types.message(name)[1].full_text(name)
+        except DefinitionError:
+            return ""  # as rosapi does for a package that is not installed
+
+    async def _topics_for_type(self, given: _Arguments) -> dict[str, Any]:
+        graph = await self._sight.graph()
+        return {"topics": [topic for topic in graph.topics if graph.types.get(topic) == given.type]}
+
+    async def _topic_type(self, given: _Arguments) -> dict[str, Any]:
+        return {"type": (await self._sight.graph()).types.get(given.topic, "")}
+
+    async def _publishers(self, given: _Arguments) -> dict[str, Any]:
+        return {"publishers": (await self._sight.graph()).publishers.get(given.topic, [])}
+
+    async def _subscribers(self, given: _Arguments) -> dict[str, Any]:
+        return {"subscribers": (await self._sight.graph()).subscribers.get(given.topic, [])}
+
+    # --- services and nodes ---
+
+    async def _services(self, _given: _Arguments) -> dict[str, Any]:
+        return {"services": sorted((await self._sight.graph()).services)}
+
+    async def _services_for_type(self, given: _Arguments) -> dict[str, Any]:
+        services = sorted((await self._sight.graph()).services)
+        return {"services": [one for one in services if await self._type_of(one) == given.type]}
+
+    async def _type_of(self, service: str) -> str:
+        return (await self._sight.service_header(service)).get("type", "")
+
+    async def _service_type(self, given: _Arguments) -> dict[str, Any]:
+        return {"type": await self._type_of(given.service)}
+
+    async def _service_node(self, given: _Arguments) -> dict[str, Any]:
+        nodes = (await self._sight.graph()).services.get(given.service, [])
+        return {"node": nodes[0] if nodes else ""}
+
+    async def _service_providers(self, given: _Arguments) -> dict[str, Any]:
+        return {"providers": (await self._sight.graph()).services.get(given.service, [])}
+
+    async def _service_host(self, given: _Arguments) -> dict[str, Any]:
+        return {"host": urlsplit(await self._sight.service_uri(given.service)).hostname or ""}
+
+    async def _nodes(self, _given: _Arguments) -> dict[str, Any]:
+        graph = await self._sight.graph()
+        tables = (graph.publishers, graph.subscribers, graph.services)
+        return {"nodes": sorted({node for table in tables for nodes in table.values() for node in nodes})}
+
+    async def _node_details(self, given: _Arguments) -> dict[str, Any]:
+        graph = await self._sight.graph()
+
+        def of(table: Mapping[str, Sequence[str]]) -> list[str]:
+            return sorted(name for name, nodes in table.items() if given.node in nodes)
+
+        return {
+            "subscribing": of(graph.subscribers),
+            "publishing": of(graph.publishers),
+            "services": of(graph.services),
+        }
+
+    async def _action_servers(self, _given: _Arguments) -> dict[str, Any]:
+        topics = {*(await self._sight.graph()).topics}
+        roots = {topic.rpartition("/")[0] for topic in topics if topic.endswith("/goal")}
+        return {
+            "action_servers": sorted(
+                root for root in roots if all(f"{root}/{part}" in topics for part in _ACTION_TOPICS)
+            )
+        }
+
+    # --- types ---
+
+    async def _message_details(self, given: _Arguments) -> dict[str, Any]:
+        return {"typedefs": typedefs(self._types.message(given.type)[1], given.type)}
+
+    async def _request_details(self, given: _Arguments) -> dict[str, Any]:
+        definitions = self._types.service(given.type)[2]
+        return {"typedefs": typedefs(definitions, definitions.service(given.type).request.name)}
+
+    async def _response_details(self, given: _Arguments) -> dict[str, Any]:
+        definitions = self._types.service(given.type)[2]
+        return {"typedefs": typedefs(definitions, definitions.service(given.type).response.name)}
+
+    # --- parameters and time ---
+
+    async def _get_param(self, given: _Arguments) -> dict[str, Any]:
+        if given.default and not await self._sight.parameter("hasParam", given.name):
+            return {"value": _as_text(_as_value(given.default))}
+        return {"value": _as_text(await self._sight.parameter("getParam", given.name))}
+
+    async def _set_param(self, given: _Arguments) -> dict[str, Any]:
+        await self._sight.parameter("setParam", given.name, _as_value(given.value))
+        return {}
+
+    async def _has_param(self, given: _Arguments) -> dict[str, Any]:
+        return {"exists": bool(await self._sight.parameter("hasParam", given.name))}
+
+    async def _search_param(self, given: _Arguments) -> dict[str, Any]:
+        return {"global_name": str(await self._sight.parameter("searchParam", given.name) or "")}
+
+    async def _delete_param(self, given: _Arguments) -> dict[str, Any]:
+        await self._sight.parameter("deleteParam", given.name)
+        return {}
+
+    async def _param_names(self, _given: _Arguments) -> dict[str, Any]:
+        return {"names": await self._sight.parameter("getParamNames")}
+
+    async def _time(self, _given: _Arguments) -> dict[str, Any]:
+        secs, nsecs = self._sight.time()
+        return {"time": {"secs": secs, "nsecs": nsecs}}
+
+
+async def _fail(reason: str) -> Raw:
+    raise ProtocolError(reason)
+
+
+def _as_value(text: str) -> Value:
+    """Return the value of a JSON text; a text that is not JSON is a string, as in rosapi."""
+    try:
+        value: Value = msgspec.json.decode(text)
+    except (ValueError, RecursionError):
+        return text
+    return value
+
+
+def _as_text(value: Value) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+def typedefs(definitions: Definitions, name: str) -> list[dict[str, Any]]:
+    """Return rosapi's descriptions of a message type and the types inside it, each once, outer types first."""
+    found: dict[str, dict[str, Any]] = {}
+
+    def add(kind: str) -> None:
+        if kind in found or (kind in PRIMITIVES and kind not in _TIME_TYPES) or kind == "string":
+            return
+        if kind in _TIME_TYPES:
+            found[kind] = _time_typedef(kind)
+            return
+        message = definitions.message(kind)
+        found[kind] = _typedef(message)
+        for one in message.fields:
+            add(one.type)
+
+    definitions.layout(name)  # raises if a type contains itself
+    add(name)
+    return [*found.values()]
+
+
+def _typedef(message: MessageDefinition) -> dict[str, Any]:
+    fields, constants = message.fields, sorted(message.constants, key=lambda one: one.name)
+    return {
+        "type": message.name,
+        "fieldnames": [field.name for field in fields],
+        "fieldtypes": [field.type for field in fields],
+        "fieldarraylen": [(field.length or 0) if field.is_array else -1 for field in fields],
+        "examples": [
+            "[]" if field.is_array else _EXAMPLES.get(field.type, "0" if _is_number(field.type) else "{}")
+            for field in fields
+        ],
+        "constnames": [one.name for one in constants],
+        "constvalues": [str(one.value) for one in constants],
+    }
+
+
+def _is_number(kind: str) -> bool:
+    return kind in PRIMITIVES and kind not in _TIME_TYPES
+
+
+def _time_typedef(kind: str) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "fieldnames": ["secs", "nsecs"],
+        "fieldtypes": ["int32", "int32"],
+        "fieldarraylen": [-1, -1],
+        "examples": ["0", "0"],
+        "constnames": [],
+        "constvalues": [],
+    }
