@@ -191,7 +191,7 @@ def _bind_one(
 ) -> PatternField:
     field = type_of_path(scope.messages, kind, binding.path)
     if binding.constant is not None:
-        return PatternField(binding, field, constant=_constant(scope, binding, field))
+        return PatternField(binding, field, constant=constant_of_field(scope, binding, field))
     assert binding.variable is not None  # a binding has a constant or a variable
     parameter = parameters.get(binding.variable)
     if parameter is None:
@@ -221,7 +221,8 @@ def _bind_one(
     return PatternField(binding, field, variable)
 
 
-def _constant(scope: FunctionScope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
+def constant_of_field(scope: FunctionScope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
+    """Return the constant of a binding as its field holds it. Raises `SpecificationError`."""
     assert binding.constant is not None  # the caller checks this
     constant = scope.value_of(binding.constant).constant
     held = None if constant is None else _held(constant, field)

@@ -19,6 +19,8 @@ def bypassing(
     places = {one.name: place for place, one in enumerate(specifications)}
     seen: set[tuple[str, str, str]] = set()
     for publication in publications:
+        if publication.safe:
+            continue
         for earlier in specifications[: places.get(publication.specification, 0)]:
             pair = publication.specification, earlier.name, publication.topic
             if pair in seen or not _acts_on(earlier, publication.topic, functions):
@@ -36,7 +38,7 @@ def _acts_on(code: SpecificationCode, topic: str, functions: Mapping[str, nodes.
     events = [event.function for event in code.events if event.topic == topic and event.part is None]
     handlers = [name for each in code.properties for name in each.handlers.values()] if events else []
     return any(
-        isinstance(node, nodes.Drop) or (isinstance(node, nodes.WriteBack) and node.writes)
+        isinstance(node, nodes.Drop | nodes.Stop) or (isinstance(node, nodes.WriteBack) and node.writes)
         for name in (*events, *handlers)
         for node in nodes.walk(functions[name])
     )

@@ -71,6 +71,8 @@ class SpecificationNames:
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
     """The comparisons that are noted."""
     lent: list[ConstantReference] = field(default_factory=list)
+    safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
+    """The safe messages, by topic."""
 
     def changed_by(self, name: str) -> frozenset[str]:
         """Return the code's names of the shared variables that a function, or one that it calls, assigns."""

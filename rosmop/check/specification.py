@@ -20,6 +20,7 @@ from rosmop.check.function_bodies import (
 )
 from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
+from rosmop.check.safe_messages import declare_safes
 from rosmop.check.scope import CompilationContext, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.specification_lint import kept_slices, lint_property, lint_statements, unused_events
@@ -160,6 +161,7 @@ def _compile(
 ) -> SpecificationCode | None:
     shared.symbols.begin(specification.name)
     _check_head(shared, specification)
+    declare_safes(shared, names, specification)
     start = _noted(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():
         _noted(shared, partial(compile_function, shared, names, function))
@@ -197,6 +199,7 @@ def _compile(
         tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
         slicing_of(shared, names, good, known),
         any(modifier.parts == ("begin",) for modifier in specification.modifiers),
+        tuple(names.safes.values()),
     )
 
 
@@ -291,7 +294,7 @@ def _property(
         category: {type(part) for part in nodes.walk(shared.functions[name])}
         for category, name in handlers.items()
     }
-    dropping = [category for category, parts in made.items() if nodes.Drop in parts]
+    dropping = [category for category, parts in made.items() if parts & {nodes.Drop, nodes.Stop}]
     if compiled.suppresses:
         at = {handler.category: handler.position for handler in node.handlers}
         shared.findings += [

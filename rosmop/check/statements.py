@@ -259,6 +259,21 @@ def _drop(scope: FunctionScope, node: tree.Statement) -> None:
     scope.add(nodes.Drop(scope.lines.site))
 
 
+def _stop(scope: FunctionScope, node: tree.Statement) -> None:
+    if scope.role in ("function", "init"):
+        why = "a function has no message" if scope.role == "function" else scope.drop_refused
+        raise SpecificationError.at(
+            node.position, f"`STOP;` is not allowed here: {why}; write it in an action, a timer or a handler"
+        )
+    safes = tuple(scope.names.safes.values())
+    if not safes and "STOP" not in scope.names.misdeclared:
+        text = "`STOP;` sends the safe message, and there is none; declare"
+        raise SpecificationError.at(
+            node.position, f"{text} `safe package/Type {{ }} on /topic every 100ms;` before the events"
+        )
+    scope.add(nodes.Stop(scope.lines.site, safes))
+
+
 def _reset(scope: FunctionScope, node: tree.Statement) -> None:
     if scope.role != "handler":
         raise SpecificationError.at(node.position, "`__RESET;` is only allowed in the handlers of a property")
@@ -301,6 +316,7 @@ _KINDS: Mapping[type[tree.Statement], Callable[[FunctionScope, Any], None]] = {
     tree.ContinueStatement: _continue,
     tree.ReturnStatement: _return,
     tree.DropStatement: _drop,
+    tree.StopStatement: _stop,
     tree.ResetStatement: _reset,
     tree.DeleteStatement: _delete,
     tree.PublishStatement: _publish,

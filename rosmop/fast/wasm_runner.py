@@ -34,7 +34,6 @@ from rosmop.fast.abi import (
     UNDO,
     Cells,
     CompiledModule,
-    TopicCode,
 )
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, failure
@@ -258,10 +257,11 @@ class WasmLane:
         self,
         home: ModuleState,
         module: CompiledModule,
-        feed: TopicCode,
+        topic: str,
         monitors: Sequence[MonitorInstance],
         events: Sequence[str],
     ) -> None:
+        self._topic, feed = topic, module.feeds[topic]
         self.events = tuple((name,) for name in events)
         self.monitors = tuple(monitor.name for monitor in monitors)
         self.drops = feed.drops
@@ -299,8 +299,8 @@ class WasmLane:
 
     def ready(self) -> bool:
         """See `FastLane`."""
-        for monitor in self._monitors:  # noqa: SIM110  for each batch: half the price of a generator
-            if monitor.enabled and (monitor.held or not monitor.seen):
+        for monitor in self._monitors:
+            if monitor.enabled and (monitor.held or not monitor.seen or self._topic in monitor.starting):
                 return False
         return True
 
@@ -609,5 +609,5 @@ class WasmFastPath:
                         f"{monitors[number].name}.{monitors[number].code.events[index].name}"
                         for number, index in events
                     ]
-                    walks[topic] = WasmLane(home, module, module.feeds[topic], own, names)
+                    walks[topic] = WasmLane(home, module, topic, own, names)
         return Lanes(walks, machine.memory[module.frames : module.frames + AREA])

@@ -66,12 +66,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Publication:
-    """A topic that a specification publishes, and the position of the statement."""
+    """A topic that a specification publishes, and the position of the statement. `safe`: only its safe message."""
 
     specification: str
     topic: str
     type: str
     position: Position
+    safe: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,7 @@ class SpecificationCode:
     """Parameters and own variables of slices; None without parameters."""
     begins: bool = False
     """Whether it is declared `begin`: if its state is lost, it restarts instead of holding its topics."""
+    safes: tuple[nodes.SafeMessage, ...] = ()
 
 
 @dataclass(eq=False)
@@ -146,10 +148,15 @@ class Compiled:
         """Return `part` without the data of other specifications, so that the result does not depend on them."""
         part = self.part(names)
         functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
-        sites = sorted(nodes.sites_of(tuple(functions.values())))
+        safes = tuple(one.safes for one in part.specifications)
+        sites = sorted(nodes.sites_of((*functions.values(), safes)))
         numbers = {-1: -1} | {site: number for number, site in enumerate(sites)}
         return replace(
             part,
+            specifications=tuple(
+                replace(one, safes=nodes.moved(one.safes, numbers)) if one.safes else one
+                for one in part.specifications
+            ),
             warnings=(),
             functions={name: nodes.moved(function, numbers) for name, function in functions.items()},
             sites=[self.sites[site] for site in sites],

@@ -11,10 +11,11 @@ function. A *site* is the number of a position in the text, for reports of fault
 A message is its bytes, counted from 0. A `Spot` is a position in the message: an offset from the start, or from a
 position that an earlier statement named. Reading beyond the end is a fault.
 
-The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), write fields
-(`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the property (`Reset`). Each back end has a
-table with a row for each kind of expression and statement: an implementation, or `Left`. `Charge` and `Allocate` take
-from the budgets of instructions and bytes, and functions with long values do the same. Exceeding a budget is a fault.
+The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), replace it by
+the safe one (`Stop`), write fields (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the
+property (`Reset`). Each back end has a table with a row for each kind of expression and statement: an implementation,
+or `Left`. `Charge` and `Allocate` take from the budgets of instructions and bytes, and functions with long values do
+the same. Exceeding a budget is a fault.
 """
 
 from collections.abc import Iterator, Mapping
@@ -418,6 +419,27 @@ class Drop(FormNode, frozen=True):
     site: int
 
 
+class SafeMessage(FormNode, frozen=True):
+    """The message that a monitor sends on a topic, and passes, while it cannot judge; `site` is its declaration.
+
+    A `stamped` message begins with a header whose `seq` and `stamp` do not count and are set when it is sent.
+    """
+
+    topic: str
+    type: str
+    data: bytes
+    stamped: bool
+    period_ns: int
+    site: int
+
+
+class Stop(FormNode, frozen=True):
+    """Replace the message by the safe one of its topic. Without such a message, publish all of `safes`."""
+
+    site: int
+    safes: tuple[SafeMessage, ...]
+
+
 class Reset(FormNode, frozen=True):
     """Restart the property when its handlers have run."""
 
@@ -549,7 +571,7 @@ class Pending(FormNode, frozen=True):
 
 class WriteBack(FormNode, frozen=True):
     """Write all assigned fields to the message or, if that faults, none. `name` is a variable for spliced bytes. A
-    dropped message is not changed, and the event has happened.
+    dropped or replaced message is not changed, and the event has happened.
     """
 
     site: int
@@ -559,7 +581,7 @@ class WriteBack(FormNode, frozen=True):
 
 Statement = (
     Evaluate | If | Loop | ForEach | Break | Continue | Select | Return | Leave | Charge | Allocate | LimitDepth | Drop
-    | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue | Require
+    | Stop | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue | Require
     | Pending | WriteBack
 )  # fmt: skip
 

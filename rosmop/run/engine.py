@@ -441,6 +441,8 @@ class MonitorSet:
         outcome = self._start(self._monitors, time_ns, expected)
         for monitor in self._monitors if restarted else ():
             monitor.held = monitor.code.hold
+            monitor.start_anew()
+        self._agenda.schedule()
         return self._with_shadows(outcome, [shadow.start(time_ns, expected) for shadow in self.shadows])
 
     def kept_groups(self) -> "list[KeptGroup]":
@@ -457,7 +459,7 @@ class MonitorSet:
 
         A specification restarts if its state is `lost` (with the reason; key "": all) or unusable. Then `hold_lost`
         decides whether it holds its topics. With `restarted`, specifications with the modifier `hold` always hold their
-        topics.
+        topics. Safe messages are sent until a message comes on their topics.
         """
         states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
@@ -487,8 +489,10 @@ class MonitorSet:
         for monitor in fresh:
             if monitor.name in reasons:
                 self.hold_lost(monitor, reasons[monitor.name])
-        for monitor in self._monitors if restarted else ():
-            monitor.held = monitor.held or monitor.code.hold
+        for monitor in self._monitors:
+            monitor.held = monitor.held or (restarted and monitor.code.hold)
+            monitor.start_anew()
+        self._agenda.schedule()
         return self._with_shadows(outcome, [shadow.start(time_ns) for shadow in self.shadows])
 
     def hold_lost(self, monitor: MonitorInstance, why: str) -> None:
@@ -498,7 +502,13 @@ class MonitorSet:
         declared `begin`.
         """
         if self.holds_if_lost(monitor.code):
-            monitor.hold(why)
+            self.hold(monitor, why)
+
+    def hold(self, monitor: MonitorInstance, why: str) -> None:
+        """Let a specification drop the messages of its topics, and send its safe messages, until `resume`."""
+        monitor.touch()
+        monitor.hold(why)
+        self._agenda.schedule()
 
     def holds_if_lost(self, code: SpecificationCode) -> bool:
         """Whether a specification holds its topics if its state is lost."""
@@ -609,6 +619,7 @@ class MonitorSet:
             monitor.move_to_python()
             monitor.touch()
             monitor.enabled = wanted
+            monitor.starting.clear()
             if wanted:
                 for timer in monitor.timers:
                     timer.due = time_ns + timer.period
@@ -627,6 +638,7 @@ class MonitorSet:
         monitor = self.monitor(name)
         monitor.resume()
         monitor.touch()
+        self._agenda.schedule()
 
     # Events
 
@@ -690,6 +702,7 @@ class MonitorSet:
         outcomes = self._agenda.advance(time_ns)
         for outcome in outcomes:
             self._follow_up(outcome)
+        self._agenda.schedule()
         return outcomes
 
     def _follow_up(self, outcome: Outcome) -> None:
@@ -728,8 +741,7 @@ class MonitorSet:
             ]
             holding = [one for one in monitors if self._holds and not one.held and not one.code.begins]
             for monitor in holding:
-                monitor.touch()
-                monitor.hold(f"an event that it depends on had a fault: {fault.position}: {fault.text}")
+                self.hold(monitor, f"an event that it depends on had a fault: {fault.position}: {fault.text}")
             outcome.began_holding = (*outcome.began_holding, *(one.name for one in holding))
             if any(one.code.begins for one in monitors):
                 began = self.began
@@ -738,6 +750,8 @@ class MonitorSet:
                     *outcome.before,
                     self._start([*map(self.monitor, again)], outcome.time, None),
                 ]
+                for name in again if self._holds else ():
+                    self.monitor(name).start_anew()
                 self.began = began
 
     # The set
@@ -758,7 +772,9 @@ class MonitorSet:
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):
             timer.due, timer.ticked = ticking.due, ticking.ticked
         monitor.enabled, monitor.seen = before.enabled, before.seen
-        monitor.held, monitor.why_held = before.held, before.why_held
+        monitor.held, monitor.why_held, monitor.starting = before.held, before.why_held, before.starting
+        for topic, sender in monitor.safes.items():
+            sender.due = before.safes[topic].due
         monitor.broken = before.broken
         monitor.faults = before.faults
 

@@ -8,6 +8,9 @@ the event is processed in each of its slices in turn (`slices.py`).
 For properties that are formulas (`CompiledProperty.suppresses`), a dropped message does not count. In all
 specifications, these properties undo the steps that they made for the message, so their trace is the one that
 subscribers saw. Variables, output and other properties keep the effects of the message.
+
+`STOP;`, and a fault of a monitor with a safe message on the topic, replace the message by the safe one. Formulas undo
+their steps as for a drop; the events behind this one process the safe message.
 """
 
 import struct
@@ -23,10 +26,11 @@ from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Categories, RunFaultError
 from rosmop.run.explain import Bound, of_slice
 from rosmop.run.interpreter import Interpreter, LastFailure
-from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, Step
+from rosmop.run.monitor import Handler, MonitorInstance, RunningProperty, SafeSender, Step
 from rosmop.run.outcomes import DROPPED, NOBODY, Fault, MessageSender, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices
-from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError
+from rosmop.runtime import safe_messages
+from rosmop.runtime.action_context import FOLDED_NS, FaultError, LogLine, MalformedError, Published
 from rosmop.runtime.wire import Buffer, WireMessage
 
 OnFault = Literal["drop", "pass"]
@@ -109,15 +113,22 @@ class MonitorExecution:
         self._sender = sender
         self._taking_back.clear()
         self._trailed.clear()
-        message = WireMessage(buffer, outcome.time)
+        message = WireMessage(buffer, outcome.time, steps[0].event.channel)
+        passing: MonitorInstance | None = None
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
                 monitor.context.begin()
+                monitor.starting.discard(message.channel or "")
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
+                    if not message.dropped:
+                        passing = monitor
+                        continue
                     outcome.dropped_by = monitor.name
                     break
+            if step.monitor is passing:
+                continue
             self._function = step.event.function
             if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
                 outcome.dropped_by = step.monitor.name
@@ -126,6 +137,9 @@ class MonitorExecution:
                 sites = [site for bit, site in enumerate(message.marks) if message.touched >> bit & 1]
                 message.touched = 0
                 writers = (*writers, (step, sites))
+            if message.stopped is not None:
+                writers = (*writers, (step, [message.stopped]))
+                self._replaced(message)
         self._finish(message, writers, outcome)
 
     def tick(self, step: Step, time_ns: int) -> Outcome:
@@ -156,6 +170,19 @@ class MonitorExecution:
             self._bound = Bound(step.index, (), (True,), time_ns, NOBODY, step.event.creates)
             self._each(step, (True,), None, outcome, act)
             outcome.events = (step.name,)
+        return outcome
+
+    def send_safe(self, monitor: MonitorInstance, sender: SafeSender, time_ns: int) -> Outcome:
+        """Send a safe message, and return the outcome. All but the first of a series are `repeated`."""
+        safe = sender.safe
+        outcome = Outcome(time=time_ns)
+        outcome.timer, outcome.repeated = f"{monitor.name}.safe", sender.due is not None
+        data = safe_messages.sent(safe, time_ns)
+        outcome.published = [Published(monitor.name, safe.topic, safe.type, data, safe.site)]
+        outcome.sites = self._interpreter.sites
+        sender.due = time_ns + safe.period_ns
+        self._turn.now = time_ns
+        self._turn.begin()
         return outcome
 
     def expire(
@@ -245,15 +272,15 @@ class MonitorExecution:
             if self._interpreter.had_happened(error):
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
-            self._block(message, outcome)
+            self._block(step.monitor, message, outcome)
             return message.dropped
         if not has_happened:
             if message.past:
                 self._past(step, message)
             return False
         outcome.events = (*outcome.events, step.name)
-        if message.dropped:
-            return True
+        if message.dropped or message.stopped is not None:
+            return message.dropped
         if step.monitor.properties:
             self._step_properties(step, message, message.time, outcome)
             return message.dropped
@@ -266,7 +293,7 @@ class MonitorExecution:
             found = step.key(message)
         except Exception as error:  # noqa: BLE001  the bytes do not fit the message type
             self._fault(error, step.monitor, step.event.position, outcome)
-            self._block(message, outcome)
+            self._block(step.monitor, message, outcome)
             return message.dropped
         if not found:
             if message.past:
@@ -345,7 +372,7 @@ class MonitorExecution:
                 events = outcome.events if slices.is_whole(slice_) else events
             if message is None:
                 commits.pop()()
-            elif message.dropped:
+            elif message.dropped or message.stopped is not None:
                 break
         self._copies = False
         for commit in commits:
@@ -392,7 +419,7 @@ class MonitorExecution:
         """Run the event in a slice that lacks a parameter, on a copy of the message and without output."""
         turn, explains = self._turn, self._explains
         lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
-        copied = None if message is None else WireMessage(bytes(message.buffer), message.time)
+        copied = message and WireMessage(bytes(message.buffer), message.time, message.channel)
         self._explains = False
         commit = self._in_slice(monitor, slice_, outcome, copied, act)
         self._explains = explains
@@ -431,7 +458,7 @@ class MonitorExecution:
         monitor.faults += 1
         text = f"{why}: {step.name} is not monitored for this binding"
         outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
-        self._block(message, outcome)
+        self._block(monitor, message, outcome)
 
     def _finish(
         self, message: WireMessage, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
@@ -457,7 +484,7 @@ class MonitorExecution:
     def _first(self, monitor: MonitorInstance, message: WireMessage, outcome: Outcome) -> bool:
         """Handle a monitor's first message, or a message on a topic that it holds.
 
-        Return whether the message was dropped.
+        Return whether the monitor does not judge it: it is dropped, unless it is the safe message.
         """
         if monitor.held:
             why = f" ({monitor.why_held})" if monitor.why_held else ""
@@ -465,6 +492,10 @@ class MonitorExecution:
         elif monitor.broken and self.on_fault == "drop":
             outcome.reason = f"{monitor.name} could not start: its initial values or `init` faulted"
         if outcome.reason is not None:
+            sender = monitor.safes.get(message.channel or "")
+            if sender is not None and safe_messages.is_safe(sender.safe, message.buffer):
+                outcome.reason = None
+                return True
             outcome.dropped_at = monitor.code.position
             message.dropped = True
             return True
@@ -494,7 +525,7 @@ class MonitorExecution:
                     categories = running.run.step(step.index, time_ns)
             except RunFaultError as error:
                 self._fault(error, step.monitor, running.code.property.source.origin, outcome)
-                self._block(message, outcome)
+                self._block(step.monitor, message, outcome)
                 continue
             if categories:
                 self._tell(step.monitor, running, categories, message, outcome)
@@ -571,13 +602,30 @@ class MonitorExecution:
             handler(message)
         except Exception as error:  # noqa: BLE001  any exception is a recorded fault of this handler
             self._fault(error, monitor, running.code.property.source.origin, outcome)
-            self._block(message, outcome)
+            self._block(monitor, message, outcome)
 
-    def _block(self, message: WireMessage | None, outcome: Outcome) -> None:
-        """Apply the effect of the last fault to the message."""
-        if message is not None and self.on_fault == "drop":
-            message.dropped = True
-            outcome.fatal = outcome.faults[-1]
+    def _block(self, monitor: MonitorInstance, message: WireMessage | None, outcome: Outcome) -> None:
+        """Apply the effect of the last fault to the message: it is dropped, or replaced by the safe one."""
+        if message is None or self.on_fault != "drop":
+            return
+        sender = monitor.safes.get(message.channel or "")
+        if sender is not None:
+            message.stop(sender.safe, sender.safe.site)
+            return
+        message.dropped = True
+        outcome.fatal = outcome.faults[-1]
+
+    def _replaced(self, message: WireMessage) -> None:
+        """Go on with the safe message: for formulas, the replaced message has not happened.
+
+        If the monitors before it have used up the time of the message, those behind it have the same time again.
+        """
+        self._take_back()
+        self._taking_back.clear()
+        self._trailed.clear()
+        message.stopped = None
+        if self._turn.late():
+            self._turn.begin()
 
     def _fault(
         self, error: Exception, monitor: MonitorInstance, otherwise: Position, outcome: Outcome

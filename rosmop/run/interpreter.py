@@ -26,7 +26,7 @@ from typing import Any
 
 from rosmop.form import nodes
 from rosmop.form.sites import Site
-from rosmop.runtime import formatting, numbers, strings, times, vectors, wire
+from rosmop.runtime import formatting, numbers, safe_messages, strings, times, vectors, wire
 from rosmop.runtime.action_context import MAX_CALLS, Context, FaultError, Turn
 from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
 from rosmop.runtime.values import BILLION, ValueCodec, struct_code, struct_size
@@ -283,7 +283,7 @@ class _Maker:
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
         """Build a branch. Its condition is noted if the branch drops, changes or publishes a message."""
         block = self.block(statements)
-        if not any(isinstance(node, nodes.Drop | nodes.Publish) or self._marks_field(node)
+        if not any(isinstance(node, nodes.Drop | nodes.Stop | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
             return block
         look = self._look(site)
@@ -398,6 +398,20 @@ class _Maker:
             message = v["m"]
             if message is not None:
                 message.dropped, message.cause = True, site
+
+        return run
+
+    def _stop(self, node: nodes.Stop) -> _Run:
+        context, turn, site = self._context, self._interpreter.turn, node.site
+        own = {safe.topic: safe for safe in node.safes}
+
+        def run(v: Variables) -> None:
+            message = v["m"]
+            if message is not None and message.channel in own:
+                message.stop(own[message.channel], site)
+                return
+            for safe in node.safes:
+                context.publish(safe.topic, safe.type, safe_messages.sent(safe, turn.now), site)
 
         return run
 
@@ -550,7 +564,7 @@ class _Maker:
 
         def run(v: Variables) -> str | None:
             message = v["m"]
-            if message.dropped:
+            if message.dropped or message.stopped is not None:
                 v[_RESULT] = True
                 return _LEAVE
             if not writes:
@@ -939,6 +953,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Run]] = Mappi
         nodes.Allocate: _Maker._allocate,
         nodes.LimitDepth: _Maker._limit_depth,
         nodes.Drop: _Maker._drop,
+        nodes.Stop: _Maker._stop,
         nodes.Reset: _Maker._reset,
         nodes.Publish: _Maker._publish,
         nodes.AfterText: _Maker._after_text,

@@ -9,6 +9,7 @@ from typing import Any, Protocol, cast
 import msgspec
 
 from rosmop.form.compiled import Compiled, EventCode, PropertyCode, SpecificationCode
+from rosmop.form.nodes import SafeMessage
 from rosmop.logics.interface import FormulaRun, Run
 from rosmop.run.explain import TRAIL, Bound, Exits, Steps, history_of
 from rosmop.run.interpreter import Interpreter
@@ -145,6 +146,14 @@ class Timer:
 
 
 @dataclass(eq=False, slots=True)
+class SafeSender:
+    """Sends a safe message while its monitor cannot judge; `due` is the time of the next one, None before the first."""
+
+    safe: SafeMessage
+    due: int | None = None
+
+
+@dataclass(eq=False, slots=True)
 class MonitorInstance:
     """A running specification."""
 
@@ -171,6 +180,10 @@ class MonitorInstance:
     group: MonitorGroup | None = None
     """The monitors whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
+    safes: dict[str, SafeSender] = field(default_factory=dict)
+    """The senders of its safe messages, by topic."""
+    starting: set[str] = field(default_factory=set)
+    """The topics with a safe message on which no message has come since the monitor started again."""
     """The last events of all slices of a parametric specification."""
 
     @property
@@ -196,6 +209,20 @@ class MonitorInstance:
     def resume(self) -> None:
         """Let messages of its topics pass again."""
         self.held, self.why_held = False, ""
+
+    def sending(self, *, passes: bool) -> list[SafeSender]:
+        """Return the senders that send now: all while no message can be judged, else those of `starting` topics.
+
+        `passes`: faults pass messages, also those of the start.
+        """
+        if not self.safes or not self.enabled:
+            return []
+        blocks = self.held or (self.broken and not passes)
+        return [sender for topic, sender in self.safes.items() if blocks or topic in self.starting]
+
+    def start_anew(self) -> None:
+        """Send the safe messages until a message comes on their topics."""
+        self.starting = {*self.safes}
 
     def touch(self) -> None:
         """Note that the state of its group is about to change."""
@@ -242,6 +269,7 @@ def _monitor(
     monitor = MonitorInstance(code, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
         monitor.slices = Slices(code, interpreter.variables, slices, holder_of)
+    monitor.safes = {safe.topic: SafeSender(safe) for safe in code.safes}
     steps = [
         Step(
             monitor,

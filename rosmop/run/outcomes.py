@@ -123,7 +123,8 @@ class Outcome:
 
     `buffer` is the message to relay: the buffer that came in (changed in place where possible), or another buffer.
     `events` are named `specification.event`. `timer` names the source of a tick or deadline (`specification.tick`,
-    `specification.timeout`, `specification.deadline`). `time` is in nanoseconds. `before` has the outcomes of ticks and
+    `specification.timeout`, `specification.deadline`, `specification.safe`).
+    `time` is in nanoseconds. `before` has the outcomes of ticks and
     deadlines that were due before this message. `shadowed` has the outcomes of the sets in shadow mode when a set
     starts.
 
@@ -138,6 +139,8 @@ class Outcome:
 
     `judged` has the outcomes of the published messages that have gone through the monitors behind their publisher, by
     their indices in `published`.
+
+    `repeated`: the outcome only repeats a safe message, so it needs no report.
 
     `looked` are the conditions that were met during processing, by site, with the values that they compared. They are
     each `when` of an event that happened, and each `if` around a statement that dropped, changed or published a
@@ -170,6 +173,7 @@ class Outcome:
     judged: Mapping[int, "Outcome"] = MappingProxyType({})
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
+    repeated: bool = False
 
     def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
         self.buffer = buffer

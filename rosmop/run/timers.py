@@ -1,4 +1,4 @@
-"""Ticks (`every`) and deadlines, in the order of their times.
+"""Ticks (`every`), deadlines and safe messages, in the order of their times.
 
 The caller gives the time, in nanoseconds. At a given time, all ticks up to and including that time happen, and all
 deadlines before it. Ticks beyond the caller's `patience` are skipped, which is logged. Deadlines wait for the next
@@ -40,7 +40,9 @@ class Agenda:
         self._patience = patience
         self._most = most
         self._timed = any(
-            monitor.timers or any(running.code.property.timed for running in monitor.properties)
+            monitor.timers
+            or monitor.safes
+            or any(running.code.property.timed for running in monitor.properties)
             for monitor in monitors
         )
 
@@ -62,6 +64,12 @@ class Agenda:
         times = [timer.due] if timer is not None and timer.due is not None else []
         if deadline is not None:
             times.append(deadline[0] + 1)
+        for monitor in self._monitors:
+            sending = monitor.sending(passes=self._execution.on_fault == "pass")
+            times += [sender.due or 0 for sender in sending]
+            for sender in monitor.safes.values():
+                if sender not in sending:
+                    sender.due = None
         self.due = min(times, default=None)
 
     def when_due(self, *, anew: bool) -> int | None:
@@ -75,7 +83,7 @@ class Agenda:
 
     def advance(self, time_ns: int) -> list[Outcome]:
         """Process the ticks up to this time and the deadlines before it, in the order of their times."""
-        outcomes: list[Outcome] = []
+        outcomes = self.send_safe(time_ns)
         ticks: dict[int, int] = {}
         left = self._most
         over = self._patience()
@@ -99,6 +107,15 @@ class Agenda:
                 outcomes.append(self._leave_out(time_ns))
                 self.schedule()
                 break
+        return outcomes
+
+    def send_safe(self, time_ns: int) -> list[Outcome]:
+        """Send the safe messages that are due, each at most once: those that were missed are of no use."""
+        outcomes = []
+        for monitor in self._monitors:
+            for sender in monitor.sending(passes=self._execution.on_fault == "pass"):
+                if (sender.due or 0) <= time_ns:
+                    outcomes.append(self._execution.send_safe(monitor, sender, time_ns))
         return outcomes
 
     def _tick(self, timer: Timer, time_ns: int, ticks: dict[int, int]) -> Outcome:

@@ -8,7 +8,9 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rosmop.form.nodes import SafeMessage
 from rosmop.runtime.action_context import PART, Context, MalformedError
+from rosmop.runtime.safe_messages import HEAD, sent
 from rosmop.runtime.times import with_part
 
 Buffer = bytes | bytearray | memoryview
@@ -132,28 +134,33 @@ class WireMessage:
 
     Numbers are written in place, and only the replaced bytes are kept. So a large image, for example, is not copied
     when its stamp changes. `touched` has a bit for each statement (of the sites in `marks`) whose write changed bytes;
-    it is cleared after each event. `cause` is the site of the statement that dropped the message.
+    it is cleared after each event. `cause` is the site of the statement that dropped the message. `stopped` is the
+    site that replaced it by the safe one of its `channel` (see `EventCode.channel`).
     """
 
     __slots__ = (
         "_replaced",
         "buffer",
         "cause",
+        "channel",
         "dropped",
         "marks",
         "past",
+        "stopped",
         "time",
         "touched",
         "written",
     )  # fmt: skip
 
-    def __init__(self, buffer: Buffer, time: int) -> None:
+    def __init__(self, buffer: Buffer, time: int, channel: str | None = None) -> None:
         self.buffer = buffer
         self.time = time
         self.written: list[tuple[int, bytes]] | None = None  # positions and old bytes of changes, in order
         self._replaced: bytes | None = None  # the received bytes, once another buffer is used
         self.dropped = False
         self.cause: int | None = None
+        self.channel = channel
+        self.stopped: int | None = None
         self.touched = 0
         self.marks: Sequence[int] = ()
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
@@ -210,6 +217,13 @@ class WireMessage:
             last = end
         pieces.append(bytes(self.buffer[last:]))
         self.buffer = bytearray(b"".join(pieces))
+
+    def stop(self, safe: SafeMessage, site: int) -> None:
+        """Replace the message by the safe one; a header keeps its `seq` and `stamp`."""
+        first = HEAD if safe.stamped and len(self.buffer) >= HEAD else 0
+        new = safe.data[first:] if first else sent(safe, self.time)
+        self.splice([(first, len(self.buffer), new, 0)])
+        self.stopped = site
 
     def _original(self) -> bytes:
         """Return the received bytes, while the buffer has the same length."""

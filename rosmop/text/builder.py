@@ -116,6 +116,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             items(tree.InitBlock),
             items(tree.EventDefinition),
             items(tree.Property),
+            items(tree.SafeDeclaration),
         )
 
     def function(
@@ -176,11 +177,23 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return self.trigger(meta, topic, kind, *rest, part=str(part))
 
     def timer(self, meta: Meta, _every: Any, duration: Any) -> tree.TimerTrigger:
+        return tree.TimerTrigger(self.at(meta), self._period_ns(duration))
+
+    def _period_ns(self, duration: Token) -> int:
         try:
-            return tree.TimerTrigger(self.at(meta), _duration_ns(duration.strip()))
+            return _duration_ns(duration.strip())
         except _LiteralError as error:
             self.refuse(duration, str(error))
-            return tree.TimerTrigger(self.at(meta), 10**9)
+            return 10**9
+
+    def safe(
+        self, meta: Meta, _: Any, kind: Any, fields: Any, _on: Any, topic: Any, _every: Any, period: Any
+    ) -> tree.SafeDeclaration:
+        name = str(kind).replace("::", "/")
+        place = self.at(kind)
+        return tree.SafeDeclaration(
+            self.at(meta), name, place, tuple(fields or ()), str(topic), self._period_ns(period)
+        )
 
     def pattern(self, _: Meta, _open: Any, fields: Any, _close: Any) -> tuple[tree.Binding, ...]:
         return tuple(fields or ())
@@ -288,6 +301,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
     break_ = _made(tree.BreakStatement, 1)
     continue_ = _made(tree.ContinueStatement, 1)
     drop = _made(tree.DropStatement, 1)
+    stop = _made(tree.StopStatement, 1)
     reset = _made(tree.ResetStatement, 1)
     return_ = _made(tree.ReturnStatement, 1)
 

@@ -74,6 +74,10 @@ _FORMS = tuple(
             "a pattern is `'{field:x, list[0]:y, field:5}'`; a condition follows it: `when (x > 3)`",
         ),
         (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
+        (
+            r"\bsafe\s[^;{}]*(?:\{[^{}]*\}[^;{}]*)?\Z",
+            "a safe message is `safe package/Type { field:5 } on /topic every 100ms;`",
+        ),
         (r"\binit\s*\Z", "write `init() { … }`"),
         (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition is written in parentheses"),
     )
@@ -121,6 +125,9 @@ _WORDS = {
     "DOUBLE_COLON": "`::`",
     "SERVICE": "`service`",
     "EVERY": "`every`",
+    "ON": "`on`",
+    "SAFE": "`safe`",
+    "STOP": "`STOP;`",
     "EQUAL": "`=`",
     "$END": "the end of the file",
 }

@@ -1,8 +1,8 @@
 """The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
 
 The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic is allowed and two divisions
-elsewhere. Inside an action, variables can have the names `event` and `service`. A C++ parser needs the declared types
-to distinguish a declaration from an expression. In this grammar, two names in a row are a declaration.
+elsewhere. Inside an action, variables can have the names `event`, `service`, `safe` and `STOP`. A C++ parser needs the
+declared types to distinguish a declaration from an expression. In this grammar, two names in a row are a declaration.
 """
 
 from rosmop.logics.catalogue import LOGICS
@@ -21,7 +21,7 @@ file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
 
 specification: NAME+ ["(" [parameters] ")"] "{" item* "}"
-?item: shared ";" | function | prototype | init | event | property | ";" -> nothing
+?item: shared ";" | function | prototype | init | event | property | safe | ";" -> nothing
 
 function: type NAME "(" [parameters] ")" block
         | NAME "(" [parameters] ")" block         -> procedure
@@ -52,6 +52,8 @@ path_step: NAME ["[" NUMBER "]"]
          | "+" NUMBER -> number
          | string | character
          | NAME ("::" NAME)+                      -> name
+
+safe: SAFE MESSAGE_TYPE "{" [fields] "}" ON TOPIC EVERY DURATION ";"
 
 property: NAME ":" FORMULA handler*
 handler: AT CATEGORY block
@@ -86,6 +88,7 @@ block: "{" statement* "}"
     | CONTINUE ";"                                -> continue_
     | RETURN [expression] ";"                     -> return_
     | DROP ";"                                    -> drop
+    | STOP ";"                                    -> stop
     | RESET ";"                                   -> reset
     | DELETE ["[" "]"] expression ";"             -> delete
     | PUBLISH "(" (TOPIC | STRING) "," (MESSAGE_TYPE | STRING) "," assignment ")" ";" -> publish
@@ -186,14 +189,17 @@ BREAK: "break"
 CONTINUE: "continue"
 RETURN: "return"
 DROP: "DROP"
+STOP.5: /STOP(?=<GAP>*;)/
 RESET: "__RESET"
 PUBLISH: "PUBLISH"
+SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{)/
+ON.5: /on(?!\w)/
 SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/
 SERVICE_PART.5: /(request|response)(?!\w)/
 TOPIC.2: /[~\/]?[A-Za-z_][\w]*(\/\w+)*\/?/
 MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<GAP>+[A-Za-z_])/
-    | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,]|<GAP>+(request|response)(?!\w))/
+    | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,{]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
 QUOTE: /['\u2018\u2019\u00b4`]/
 FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|<AT>|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/

@@ -327,6 +327,11 @@ class DropStatement(Statement):
 
 
 @dataclass(frozen=True)
+class StopStatement(Statement):
+    """`STOP;`."""
+
+
+@dataclass(frozen=True)
 class ResetStatement(Statement):
     """`__RESET;`."""
 
@@ -435,6 +440,17 @@ class Property(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class SafeDeclaration(SyntaxNode):
+    """`safe type { field:value, … } on topic every period;`."""
+
+    type: str
+    type_position: Position = field(compare=False)
+    fields: tuple[Binding, ...]
+    topic: str
+    period_ns: int
+
+
+@dataclass(frozen=True)
 class Specification(SyntaxNode):
     """One `name() { … }`."""
 
@@ -446,6 +462,7 @@ class Specification(SyntaxNode):
     inits: tuple[InitBlock, ...]
     events: tuple[EventDefinition, ...]
     properties: tuple[Property, ...]
+    safes: tuple[SafeDeclaration, ...] = ()
 
 
 @dataclass(frozen=True)

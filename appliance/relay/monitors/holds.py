@@ -22,9 +22,9 @@ def hold_begun(monitors: "MonitorSet", message: SpecificationsStated, switches: 
                 monitor, "it moved to another relay process, and its state remained in the previous one"
             )
         if monitor.name in message.unbuilt and not monitor.code.begins:
-            monitor.hold(f"its file has an error: {message.unbuilt[monitor.name]}")
+            monitors.hold(monitor, f"its file has an error: {message.unbuilt[monitor.name]}")
         if monitor.why_held and not switches.get(monitor.name, True):
-            monitor.resume()
+            monitors.resume(monitor.name)
 
 
 def taken(

@@ -130,7 +130,7 @@ class Observer:
             self.report_line(
                 line.monitor, line.level, line.text, point=point, time=outcome.time, observed=observed
             )
-        for number, published in enumerate(outcome.published):
+        for number, published in enumerate(() if outcome.repeated else outcome.published):
             self._observations.note(
                 f"{self._prefix}publish",
                 published.monitor,

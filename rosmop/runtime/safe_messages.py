@@ -1,0 +1,25 @@
+"""Compare, send and insert safe messages; they are serialized when the specification is compiled."""
+
+import struct
+
+from rosmop.form.nodes import SafeMessage
+
+HEAD = 12
+"""The bytes of `seq` and `stamp` at the beginning of a header."""
+
+_STAMP = struct.Struct("<III")
+_MOST_SECONDS = (1 << 32) - 1
+
+
+def is_safe(safe: SafeMessage, buffer: bytes | bytearray | memoryview) -> bool:
+    """Whether a message equals the safe one, except for `seq` and `stamp` of its header."""
+    first = HEAD if safe.stamped else 0
+    return len(buffer) == len(safe.data) and buffer[first:] == safe.data[first:]
+
+
+def sent(safe: SafeMessage, time_ns: int) -> bytes:
+    """Return the bytes of the safe message, with this time in its header."""
+    if not safe.stamped:
+        return safe.data
+    seconds, nanoseconds = divmod(max(0, time_ns), 1_000_000_000)
+    return _STAMP.pack(0, min(seconds, _MOST_SECONDS), nanoseconds) + safe.data[HEAD:]

@@ -1,0 +1,255 @@
+"""A monitor that cannot judge sends its safe message, and passes no other; `STOP;` replaces a message by it."""
+
+from itertools import product
+from typing import Any
+
+import pytest
+
+from rosmop.check.sources import compiled_from
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
+from rosmop.run.outcomes import Outcome
+from rosmop.tests.acting import definitions, fields, load, message, refused
+from rosmop.tests.both_ways import BothWays, plain
+from rosmop.tests.examples import examples
+from rosmop.tests.logics.driving import ABC, compiled, seeded
+from rosmop.tests.test_suppression import FORMULAS, Timed, projected, timed
+
+TENTH = 10**8
+TWIST = "geometry_msgs/TwistStamped"
+SAFE = f'safe {TWIST} {{header:{{frame_id:"base"}}, twist.angular.z:0.5}} on /cmd_vel every 100ms;'
+SCAN = "event scan(std::vector<float> r) /scan sensor_msgs/LaserScan '{ranges:r}' { near = r[0]; }"
+DRIVE = (
+    f"event drive(double v) /cmd_vel {TWIST} '{{twist.linear.x:v}}' {{ if (near < 1) {{ STOP; v = 7; }} }}"
+)
+NEAR, EMPTY = (message("sensor_msgs/LaserScan", ranges=ranges) for ranges in ([0.5], []))
+
+
+def guard(*members: str, head: str = "guard()") -> str:
+    """Return a specification."""
+    return f"{head} {{ double near = 9; {' '.join(members or (SAFE, SCAN, DRIVE))} }}"
+
+
+def command(speed: float = 1.0, frame: str = "joy", turn: float = 0.0) -> bytes:
+    """Return a command with seq 7 and stamp 3 s."""
+    return message(TWIST, header__seq=7, header__stamp__sec=3, header__frame_id=frame, twist__linear__x=speed,
+                   twist__angular__z=turn)  # fmt: skip
+
+
+SAFE_BYTES = command(0.0, "base", 0.5)
+
+
+def drive(monitors: MonitorSet, data: bytes, time: int = 5) -> bytes:
+    """Return what the base gets of a command; empty if it gets nothing."""
+    outcome = monitors.process("/cmd_vel", bytearray(data), time)
+    return b"" if outcome.result == "dropped" else bytes(outcome.buffer)
+
+
+def sent(outcomes: list[Outcome]) -> list[Any]:
+    """Return the messages that are published, decoded."""
+    return [fields(one.type, one.data) for outcome in outcomes for one in outcome.sent()]
+
+
+def test_a_stop_replaces_the_message_and_keeps_its_stamp() -> None:
+    """Assignments after it have no effect; the record names the statement."""
+    monitors = load(guard())
+    assert drive(monitors, command()) == command()
+    monitors.process("/scan", NEAR, 1)
+    outcome = monitors.process("/cmd_vel", bytearray(command()), 2)
+    assert (outcome.result, bytes(outcome.buffer)) == ("changed", SAFE_BYTES)
+    assert (outcome.changed_by, [one.line for one in outcome.changed_at]) == (("guard.drive",), [1])
+    assert monitors.process("/cmd_vel", SAFE_BYTES, 3).result == "passed"
+
+
+def test_a_stop_without_a_message_of_its_topic_is_published() -> None:
+    """In a timer, or on another topic, each safe message is sent, with the time in its header."""
+    text = guard(SAFE, SCAN.replace("near = r[0];", "STOP;"), DRIVE, "event e() every 1s { STOP; }")
+    monitors = load(text)
+    [scan] = sent([monitors.process("/scan", NEAR, 2 * 10**9 + 5)])
+    assert (scan.header.stamp.sec, scan.header.stamp.nanosec, scan.header.frame_id) == (2, 5, "base")
+    assert len(sent(monitors.advance(3 * 10**9))) == 1
+
+
+def test_monitors_behind_a_stop_see_the_safe_message() -> None:
+    """They may still change it, and their formulas count it, not the replaced message."""
+    behind = f"""behind() {{ event fast(double v) /cmd_vel {TWIST} '{{twist.linear.x:v}}' when (v > 0) {{ }}
+        event slow(double z) /cmd_vel {TWIST} '{{twist.angular.z:z}}' {{ z = 0.25; }}
+        ere: fast @match {{ ROS_WARN("fast"); }} }}"""
+    monitors = load(guard(), y=behind)
+    monitors.process("/scan", NEAR, 1)
+    outcome = monitors.process("/cmd_vel", bytearray(command()), 2)
+    assert bytes(outcome.buffer) == command(0.0, "base", 0.25)
+    assert (outcome.events, outcome.verdicts) == (("guard.drive", "behind.slow"), ())
+
+
+FAULTY = [
+    (guard(SAFE, SCAN, DRIVE.replace("if (near < 1)", "double w = near; int n = 0; n = 1 / n; if (w < 1)")),
+     command()),
+    (guard(SAFE, SCAN, DRIVE.replace("if (near < 1)", "while (true) { } if (near < 1)")), command()),
+    (guard(), command()[:25]),
+    (guard(), b""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "data"), FAULTY)
+def test_a_fault_on_a_command_sends_the_safe_message(text: str, data: bytes) -> None:
+    """A division by zero, an endless loop, bytes that are no message: the base never gets silence."""
+    monitors = load(text)
+    found = fields(TWIST, drive(monitors, data))
+    assert (found.header.frame_id, found.twist.linear.x, found.twist.angular.z) == ("base", 0, 0.5)
+    assert drive(load(text, on_fault="pass"), data) == data
+
+
+def test_time_that_one_monitor_used_up_is_given_again() -> None:
+    """Behind a monitor that took too long, the safe message is not dropped for lack of time."""
+    monitors = load(FAULTY[1][0], y=guard(head="other()"))
+    monitors.limit_time(iter(range(10_000_000)).__next__, 500)
+    outcome = monitors.process("/cmd_vel", bytearray(command()), 1)
+    assert ["processor time" in one.text for one in outcome.faults] == [True]
+    assert bytes(outcome.buffer) == SAFE_BYTES
+
+
+def held(how: str) -> MonitorSet:
+    """Return monitors that cannot judge."""
+    monitors = load(
+        guard(*(["init() { near = 1 / int(near - 9); }", SAFE, SCAN, DRIVE] if how == "broken" else ()))
+    )
+    if how == "fault":
+        monitors.process("/scan", EMPTY, 1)
+    elif how == "lost":
+        monitors = MonitorSet.of(compiled_from({"x.rv": guard()}, definitions()))
+        monitors.recover([], {"": "power cut"}, 0)
+    elif how == "changed":
+        monitors.process("/scan", NEAR, 1)
+        after = MonitorSet.of(compiled_from({"x.rv": guard().replace("< 1", "< 2")}, definitions()))
+        after.succeed(monitors, 1)
+        monitors = after
+    return monitors
+
+
+@pytest.mark.parametrize("how", ["fault", "lost", "changed", "broken"])
+def test_a_monitor_that_cannot_judge_passes_and_sends_only_the_safe_message(how: str) -> None:
+    """It is sent at once and then periodically, without a backlog; `seq` and `stamp` do not count."""
+    monitors = held(how)
+    times = [TENTH, TENTH + 1, 2 * TENTH, 9 * TENTH, 9 * TENTH + 1]
+    outcomes = [monitors.advance(time) for time in times]
+    series = [[one.header.stamp.nanosec for one in sent(found)] for found in outcomes]
+    assert series == [[TENTH], [], [2 * TENTH], [9 * TENTH], []]
+    assert [one.repeated for found in outcomes for one in found] == [False, True, True]
+    given = [command(), SAFE_BYTES, SAFE_BYTES[4:]]
+    assert [drive(monitors, data, 9 * TENTH + 2) for data in given] == [b"", SAFE_BYTES, b""]
+    if how != "broken":
+        monitors.resume("guard")
+        assert (monitors.next_due, drive(monitors, command(), 10 * TENTH)) == (None, command())
+
+
+def test_a_monitor_that_starts_again_sends_until_the_first_command() -> None:
+    """After a restart, a takeover, or a fault in a monitor that is declared `begin`; never at the first start."""
+    restarted, first = (MonitorSet.of(compiled_from({"x.rv": guard()}, definitions())) for _ in range(2))
+    first.start(0)
+    assert first.next_due is None
+    restarted.start(0, restarted=True)
+    begun = load(guard(head="begin guard()"))
+    begun.process("/scan", EMPTY, 1)
+    for monitors in (restarted, begun):
+        assert len(sent(monitors.advance(TENTH))) == 1
+        monitors.process("/scan", message("sensor_msgs/LaserScan", ranges=[5.0]), TENTH)
+        assert drive(monitors, command()) == command()
+        assert monitors.next_due is None
+
+
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_a_monitor_that_is_disabled_or_in_shadow_mode_sends_nothing(on_fault: OnFault) -> None:
+    """Neither while it would hold its topics, nor after a restart."""
+    compiled_set = compiled_from({"x.rv": guard()}, definitions())
+    shadowed = MonitorSet.of(compiled_set, on_fault, shadows=["guard"])
+    shadowed.start(0, restarted=True)
+    assert not sent(shadowed.advance(TENTH))
+    disabled = held("lost")
+    disabled.switch({"guard": False}, 1)
+    assert (disabled.next_due, drive(disabled, command())) == (None, command())
+
+
+def test_a_safe_message_passes_only_monitors_behind_that_do_not_forbid_it() -> None:
+    """It is an event for them like any other published message."""
+    monitors = load(
+        guard(), y=f"cap() {{ event c(double z) /cmd_vel {TWIST} '{{twist.angular.z:z}}' {{ z = 0; }} }}"
+    )
+    monitors.hold(monitors.monitor("guard"), "test")
+    assert [one.twist.angular.z for one in sent(monitors.advance(1))] == [0]
+
+
+REFUSED = [
+    (SAFE.replace("/cmd_vel", "/other"), "no event of guard is on /other"),
+    (SAFE + SAFE, "declared twice"),
+    (SAFE.replace(TWIST, "geometry_msgs/Twist").replace("header:{frame_id:\"base\"}, ", "").replace("twist.", ""),
+     f"/cmd_vel has the type {TWIST} in an event"),
+    (SAFE.replace("0.5", "near"), "constants"),
+    (SAFE.replace("frame_id", "frame"), "has no field `frame`"),
+    (SAFE.replace('frame_id:"base"', "seq:5"), "are set when the message is sent"),
+    (SAFE.replace('"base"', "5"), "cannot hold 5"),
+    (SAFE.replace("100ms", "0ms"), "a period is from 1 ms"),
+    ("", "`STOP;` sends the safe message, and there is none"),
+    (SAFE + "void f() { STOP; }", "a function has no message"),
+    (SAFE.replace("on /cmd_vel", "/cmd_vel"), "expected `on`"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("safe", "why"), REFUSED)
+def test_a_safe_message_that_cannot_be_sent_is_refused(safe: str, why: str) -> None:
+    """The error names the place and the remedy."""
+    assert any(why in one.text for one in refused(guard(safe, SCAN, DRIVE)))
+
+
+def test_old_files_may_use_the_new_words_as_names() -> None:
+    """`safe`, `on` and `STOP` are words of the language only in the new forms."""
+    monitors = load("s() { const int STOP = 2; bool safe = true; int on; event e(int x) /t std_msgs/Int32 '{data:x}'"
+                    " { on = STOP; switch (x) { case STOP: safe = x != STOP; } } }")  # fmt: skip
+    monitors.process("/t", message("std_msgs/Int32", data=2), 1)
+    assert (monitors.value("s", "on"), monitors.value("s", "safe")) == (2, False)
+
+
+# Formulas
+
+
+def stopping(formula: str) -> str:
+    """Return a specification over the topics /a, /b and /c whose property's handler stops."""
+    parts = [f"event {name}() /{name} std_msgs/Int32 '{{}}' {{ }} safe std_msgs/Int32 {{data:-1}} on /{name} every 1s;"
+             for name in ABC]  # fmt: skip
+    return f"s() {{ {' '.join(parts)} {formula} @violation {{ STOP; }} }}"
+
+
+def passed(monitors: MonitorSet, trace: Timed) -> list[bool]:
+    """Return whether each message of a trace passes unchanged; the others must be the safe message."""
+    found = []
+    for event, time in ((event, time) for time, event in trace):
+        outcome = monitors.process(f"/{event}", bytearray(message("std_msgs/Int32", data=1)), time)
+        value = fields("std_msgs/Int32", bytes(outcome.buffer)).data
+        assert (outcome.result, value) in {("passed", 1), ("changed", -1)}
+        found.append(value == 1)
+    return found
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_a_stopped_message_has_not_happened_for_formulas(formula: str) -> None:
+    """A message is stopped exactly if it violates the formula after the messages that passed."""
+    logic, _, text = formula.partition(": ")
+    property_, random = compiled(logic, text), seeded(31)
+    traces = [timed(random, 9) for _ in range(examples(60))]
+    traces += [
+        [(2 * place + 1, event) for place, event in enumerate(events)] for events in product(ABC, repeat=3)
+    ]
+    for trace in traces:
+        assert passed(load(stopping(formula)), trace) == projected(property_, trace), trace
+
+
+def test_the_module_and_the_interpreter_stop_the_same_messages() -> None:
+    """Random batches, with stops in actions and in handlers, and messages of another size than the safe one."""
+    text = """s() { int n; safe own/Plain {count:5} on /plain every 1s;
+        event e(int c) /plain own/Plain '{count:c}' { n += c; if (c > 6) { STOP; n++; } c = c + 1; }
+        ere: (e e e)*
+        @fail { STOP; __RESET; } @match { if (n % 3 == 0) { STOP; } } }"""
+    both, random = BothWays(text, text.replace("s()", "t()")), seeded(32)
+    for _ in range(40):
+        both.check([plain(random.randint(0, 9), rest=bytes(random.randint(0, 3))) for _ in range(8)])
+    assert both.came["together"] and both.came["changed"]

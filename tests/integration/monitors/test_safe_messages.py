@@ -1,0 +1,112 @@
+"""A base gets the safe message, and no forbidden one, whenever its monitor cannot judge."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from examples.landshark.lab import Host, Lab
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.processes import Process
+from tests.support.requirements import needs
+
+GUARD = """
+guard() {
+    int near = 9;
+    safe std_msgs/String { data:"stop" } on /chatter every 100ms;
+    event scan(std::vector<int> ranges) /scan std_msgs/Int32MultiArray '{data:ranges}' { near = ranges[0]; }
+    event drive() /chatter std_msgs/String '{}' { if (near < 1) { STOP; } }
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def guarded(common_lab: Lab) -> Iterator[Appliance]:
+    """Run an appliance with the guard loaded."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    host = common_lab.host("guarded", "10.77.0.4/24")
+    with Appliance(host, options=("--api", "off")) as running:
+        (running.directory / "guard.rv").write_text(GUARD)
+        running.rosrv("monitor", "load", str(running.directory / "guard.rv"))
+        yield running
+
+
+def scan(_: Appliance, ros: RosSession, ranges: str) -> None:
+    """Publish a scan once."""
+    ros.run("rostopic", "pub", "-1", "/scan", "std_msgs/Int32MultiArray", f"data: [{ranges}]")
+
+
+def change(appliance: Appliance, _: RosSession) -> None:
+    """Load the guard with another text, which loses its state."""
+    spec = appliance.directory / "guard.rv"
+    spec.write_text(spec.read_text().replace("near", "nearest"))
+    appliance.rosrv("monitor", "load", "--hold", str(spec))
+
+
+def restart(appliance: Appliance, _: RosSession) -> None:
+    """Stop the whole appliance, and start it again."""
+    assert appliance.stop() == 0
+    appliance.start()
+
+
+def held(appliance: Appliance) -> list[str]:
+    """Return the monitors that hold their topics."""
+    return [str(row["name"]) for row in appliance.rows("monitor", "list") if row["held"]]
+
+
+def only_stops(base: Process, since: int) -> None:
+    """Wait for twenty safe messages; fail if another message passes meanwhile."""
+    base.wait_for_count(20, event="received", data="stop", since=since, timeout=90)
+    assert [one["data"] for one in base.seen(event="received")[-20:]] == ["stop"] * 20
+
+
+ROWS: dict[str, tuple[Callable[[Appliance, RosSession], object], bool]] = {
+    "an obstacle": (lambda appliance, ros: scan(appliance, ros, "0"), False),
+    "a faulty sensor": (lambda appliance, ros: scan(appliance, ros, ""), True),
+    "a changed text": (change, True),
+}
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_the_base_gets_stops_and_nothing_else(
+    guarded: Appliance, common_robot: Host, tmp_path: Path, row: str
+) -> None:
+    """Also after the relay is killed, until an operator or the sensor releases the base."""
+    disturb, holds = ROWS[row]
+    with RosSession(guarded.master_uri, tmp_path, common_robot) as ros:
+        base = ros.listener("roscpp", "/chatter")
+        ros.talker("roscpp", "/chatter")
+        scan(guarded, ros, "5")
+        base.wait_for_count(3, event="received")
+        scan(guarded, ros, "0")
+        disturb(guarded, ros)
+        only_stops(base, base.mark())
+        assert held(guarded) == (["guard"] if holds else [])
+        guarded.kill("relay")
+        only_stops(base, base.mark())
+        if holds:
+            guarded.rosrv("monitor", "resume", "guard")
+        scan(guarded, ros, "5")
+        base.wait_for(lambda event: "hello" in event.get("data", ""), since=base.mark(), timeout=60)
+
+
+@pytest.mark.parametrize("death", ["relay", "appliance"])
+def test_a_restart_sends_stops_until_a_command_comes(
+    guarded: Appliance, common_robot: Host, tmp_path: Path, death: str
+) -> None:
+    """The publisher has gone, so only the monitor can stop the base."""
+    with RosSession(guarded.master_uri, tmp_path, common_robot) as ros:
+        base = ros.listener("roscpp", "/chatter")
+        talker = ros.talker("roscpp", "/chatter")
+        base.wait_for_count(3, event="received")
+        talker.kill()
+        mark = base.mark()
+        if death == "relay":
+            guarded.kill("relay")
+        else:
+            restart(guarded, ros)
+        base.wait_for_count(10, event="received", data="stop", since=mark, timeout=90)
+        assert held(guarded) == []
+        ros.talker("roscpp", "/chatter", name="again")
+        base.wait_for(lambda event: "hello" in event.get("data", ""), since=mark, timeout=60)
