@@ -291,6 +291,7 @@ class MonitorLoad(AdminRequest[monitor_answers.Replacement], frozen=True, tag="m
     force: Force = False
     shadow: Shadow = False
     hold: Hold = False
+    given: dict[str, dict[str, bodies.GivenValue]] = {}
 
 
 @rest("operator", of=MONITORS)
@@ -304,6 +305,7 @@ class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monito
     force: bool = False
     shadow: bool = False
     hold: bool = False
+    given: dict[str, dict[str, bodies.GivenValue]] = {}
 
 
 @rest(
@@ -428,6 +430,18 @@ class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     shadow: bool
     expected: str | None = None
     force: Force = False
+
+
+@rest(
+    "operator", "PATCH", "/v1/monitors/{name}/given", name="set_monitor", body=bodies.GivenValues, of=MONITORS,
+    problems=_NO_MONITOR,
+)  # fmt: skip
+class MonitorSet(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="monitor set"):
+    """Set constants that are given to a monitor, within their ranges; its state and its text stay."""
+
+    name: OneMonitor
+    values: dict[str, bodies.GivenValue]
+    expected: str | None = None
 
 
 @rest("operator", "PATCH", _SEVERAL, says={"held": False}, of=MONITORS)

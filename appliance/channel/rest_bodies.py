@@ -60,6 +60,10 @@ GivenNanoMoment = Annotated[
 ]
 
 
+GivenValue = bool | int | float | Annotated[str, msgspec.Meta(max_length=256)]
+GivenOfMonitor = Annotated[dict[MonitorName, GivenValue], msgspec.Meta(min_length=1, max_length=100)]
+
+
 class PolicyText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A new policy."""
 
@@ -83,6 +87,16 @@ class NewSpecifications(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     definitions: Definitions = {}
     note: Note = ""
     signatures: Signatures = {}
+    given: Annotated[
+        dict[MonitorName, GivenOfMonitor],
+        doc("constants and topics that are given to monitors, by monitor and name", max_length=1000),
+    ] = {}
+
+
+class GivenValues(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """New values of constants that are given to a monitor, by name."""
+
+    values: Annotated[GivenOfMonitor, doc("in the units of the text, within the ranges of the text")]
 
 
 class NewText(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -97,6 +97,7 @@ VERBS: dict[str, Verb | Group] = {
             ),
             "confirm": Verb("monitor.revision_verbs:confirm", _CONFIRM),
             "resume": Verb("monitor.in_force:resume"),
+            "set": Verb("monitor.in_force:set_given"),
             "reset": Verb("monitor.offline:reset"),
             "rvstate": Verb("monitor.in_force:rv_state", hidden=True),
         },

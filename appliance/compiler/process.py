@@ -98,9 +98,11 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         if wanted.at_start:
-            found = checking.contents_at_start(wanted.files, wanted.definitions)
+            found = checking.contents_at_start(wanted.files, wanted.definitions, wanted.topics)
         else:
-            found = checking.contents(wanted.files, wanted.definitions, load=wanted.dry_run)
+            found = checking.contents(
+                wanted.files, wanted.definitions, load=wanted.dry_run, given_topics=wanted.topics
+            )
         return messages.ContentsFound(wanted.number, found)
     except SpecificationsRefusedError as error:
         return messages.CompilationRefused(wanted.number, error.findings)

@@ -118,8 +118,8 @@ class DataPlane:
             self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated | messages.StateWanted):
             self.interceptor.state(message)
-        elif isinstance(message, messages.MonitorSwitched):
-            self.interceptor.switch(message.name, message.enabled)
+        elif isinstance(message, messages.MonitorSwitched | messages.MonitorGiven):
+            self.interceptor.order(message)
         elif isinstance(message, messages.MonitorResumed):
             self._ask_for_latched(self.interceptor.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):

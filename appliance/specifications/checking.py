@@ -1,11 +1,12 @@
 """Compile whole sets of specifications; for control, this runs in the process `compiler`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
+from types import MappingProxyType
 
 import msgspec
 
-from appliance.channel.messages import Contents, PartNames, StateOwner
+from appliance.channel.messages import Contents, GivenDeclared, PartNames, StateOwner
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
     Sources,
@@ -21,6 +22,11 @@ from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
+Topics = Mapping[str, Mapping[str, str]]
+"""Topics that replace those given in texts, by monitor and name."""
+
+NO_TOPICS: Topics = MappingProxyType({})
+
 _ERROR = ": error: "  # a finding of this severity; the others are warnings
 _LONGEST = 32 << 20  # bytes: half of what a channel carries
 
@@ -31,15 +37,16 @@ def contents(
     *,
     load: bool = False,
     unbuilt: Mapping[str, str] = {},
+    given_topics: Topics = NO_TOPICS,
 ) -> Contents:
     """Compile these files with these definitions. Raises `SpecificationsRefusedError` with all errors.
 
     With `load`, the module of the whole set is also built and loaded. The monitors of the files in `unbuilt` do
-    nothing, for the reason given.
+    nothing, for the reason given. `given_topics` replace topics given in the texts.
     """
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.of(compiled_from(files, definitions, without_code=unbuilt))
+        monitors = MonitorSet.of(compiled_from(files, definitions, without_code=unbuilt, topics=given_topics))
         certificates, data = certified(monitors.compiled)
         if load:
             require_loadable(data)
@@ -84,25 +91,39 @@ def contents(
             )
             for one in monitors.monitors
         },
+        givens={name: found for name in monitors.names if (found := tuple(_givens(monitors, name)))},
     )
 
 
-def contents_at_start(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
+def _givens(monitors: MonitorSet, name: str) -> Iterator[GivenDeclared]:
+    code = monitors.monitor(name).code
+    for given in code.givens:
+        kind = "bool" if given.bounds is None else "int" if isinstance(given.default, int) else "double"
+        yield GivenDeclared(
+            given.name, kind, given.default, given.default, given.unit, *(given.bounds or (None, None))
+        )
+    for topic in code.given_topics:
+        yield GivenDeclared(topic.name, "topic", topic.topic, topic.default)
+
+
+def contents_at_start(
+    files: Mapping[str, str], texts: Mapping[str, str], given_topics: Topics = NO_TOPICS
+) -> Contents:
     """Compile these files; the monitors of files with errors do nothing (`Contents.unbuilt`, `Contents.left_out`).
 
     Raises `SpecificationsRefusedError` if they exceed a limit.
     """
     try:
-        return contents(files, texts, load=True)
+        return contents(files, texts, load=True, given_topics=given_topics)
     except SpecificationsRefusedError as error:
         refusal = error
-    good, errors = _good(files, texts)
+    good, errors = _good(files, texts, given_topics)
     bad = {file: errors[file] for file in files if file not in good}
     left_out = {file: error for file, error in bad.items() if not _topics_known(files[file], file, texts)}
     rest = {file: text for file, text in files.items() if file not in left_out}
     unbuilt = {file: error for file, error in bad.items() if file in rest}
     try:
-        found = contents(rest, texts if rest else {}, load=True, unbuilt=unbuilt)
+        found = contents(rest, texts if rest else {}, load=True, unbuilt=unbuilt, given_topics=given_topics)
     except SpecificationsRefusedError:
         raise refusal from None
     return msgspec.structs.replace(found, left_out=left_out)
@@ -118,7 +139,9 @@ def check(
     if not sources.files:
         return CheckedSpecifications()
     require_bounded(sources)
-    return checked(compiler(sources.files, sources.definitions), sources, site_keys)
+    return checked(
+        compiler(sources.files, sources.definitions, given_topics=sources.topics), sources, site_keys
+    )
 
 
 def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
@@ -129,13 +152,16 @@ def _topics_known(text: str, file: str, texts: Mapping[str, str]) -> bool:
     return True
 
 
-def _good(files: Mapping[str, str], texts: Mapping[str, str]) -> tuple[set[str], dict[str, str]]:
+def _good(
+    files: Mapping[str, str], texts: Mapping[str, str], topics: Topics
+) -> tuple[set[str], dict[str, str]]:
     """Return the files that compile together, and the last error of each file that has had one."""
     errors: dict[str, str] = {}
 
     def grown(good: set[str], more: Sequence[str]) -> set[str]:
         try:
-            contents({file: files[file] for file in files if file in {*good, *more}}, texts, load=True)
+            wanted = {file: files[file] for file in files if file in {*good, *more}}
+            contents(wanted, texts, load=True, given_topics=topics)
         except SpecificationsRefusedError as error:
             if len(more) == 1:
                 errors[more[0]] = next((one for one in error.findings if _ERROR in one), error.findings[0])

@@ -79,7 +79,7 @@ class SpecificationCompiler:
         with self._order():
             answer = await self._asked(
                 lambda number: messages.ContentsWanted(
-                    number, sources.files, sources.definitions, at_start=at_start
+                    number, sources.files, sources.definitions, at_start=at_start, topics=sources.topics
                 )
             )
         return checked(answer.contents, sources, site_keys)
@@ -95,7 +95,7 @@ class SpecificationCompiler:
             try:
                 answer = await self._asked(
                     lambda number: messages.ContentsWanted(
-                        number, sources.files, sources.definitions, dry_run=True
+                        number, sources.files, sources.definitions, dry_run=True, topics=sources.topics
                     ),
                     goes_on=lambda: not self._orders,
                 )

@@ -96,6 +96,7 @@ class Rollout:
     relays: Relays
     slices: int
     parts: Parts
+    given: Callable[[CheckedSpecifications], Mapping[str, dict[str, messages.GivenValue]]] = lambda _: {}
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
     _now: Revision = field(default_factory=Revision)
     # The relays' parts of the specifications in force, and of specifications being tried.
@@ -385,6 +386,7 @@ class Rollout:
             inherited.left,
             inherited.at,
             {name: why for name, why in revision.checked.unbuilt.items() if name in names.monitors},
+            {name: values for name, values in self.given(revision.checked).items() if name in names.monitors},
         )
 
     # --- messages of the relays ---

@@ -1,7 +1,7 @@
 """Files of specifications: the folder, their signatures, and their compiled contents."""
 
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -33,12 +33,21 @@ class SpecificationsRefusedError(Exception):
 class Sources(msgspec.Struct, frozen=True):
     """Texts of specifications by file name, and texts of message definitions by `package/Type.msg` (or `.srv`).
 
-    `signatures` are the signatures of the site, by the same names.
+    `signatures` are the signatures of the site, by the same names. `topics` replace topics given in the texts, by
+    monitor and name.
     """
 
     files: dict[str, str] = {}
     definitions: dict[str, str] = {}
     signatures: dict[str, str] = {}
+    topics: dict[str, dict[str, str]] = {}
+
+    def with_topics(
+        self, topics: Mapping[str, Mapping[str, str]], among: Collection[str] | None = None
+    ) -> "Sources":
+        """Return the same texts with these topics (only those of the monitors `among` others)."""
+        kept = {name: dict(given) for name, given in topics.items() if among is None or name in among}
+        return msgspec.structs.replace(self, topics=kept)
 
     def with_files(self, new: "Sources") -> "Sources":
         """Return the sources with files added or replaced by name, sorted."""
@@ -49,6 +58,8 @@ class Sources(msgspec.Struct, frozen=True):
             dict(sorted((self.files | new.files).items())),
             dict(sorted((self.definitions | new.definitions).items())),
             signatures,
+            self.topics
+            | {name: {**self.topics.get(name, {}), **given} for name, given in new.topics.items()},
         )
 
     def without(self, files: set[str]) -> "Sources":
@@ -57,7 +68,7 @@ class Sources(msgspec.Struct, frozen=True):
             {name: text for name, text in texts.items() if name not in files}
             for texts in (self.files, self.signatures)
         )
-        return Sources(left, self.definitions, signatures)
+        return Sources(left, self.definitions, signatures, self.topics)
 
     def signers(self, site_keys: Sequence[str]) -> list[str]:
         """Return the keys that signed the sources; empty without site keys.

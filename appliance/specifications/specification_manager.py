@@ -23,6 +23,7 @@ import datetime
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -37,6 +38,7 @@ from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replacement, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
+from appliance.specifications.givens import NO_VALUES, Given, Givens, parsed, require_topics, split, with_unit
 from appliance.specifications.live_topics import Published, TopicFindings, judge_holds, judge_topics
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.rollout import SHADOW, Parts, Relays, Revision, Rollout, Switch
@@ -65,6 +67,7 @@ from appliance.telemetry.audit_trail import AuditTrail
 _log = structlog.get_logger()
 _SWITCHES = "monitor switches"
 _ACTS = "monitor acts"
+_GIVEN = "monitor given"
 ALLOCATION = "relays"
 _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
@@ -155,9 +158,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._live = live
         self._trail = trail
         self.switches = Switches(enable)
+        self.givens = Givens()
         self.rollout = Rollout(
-            allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
-        )
+            allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts,
+            given=self.givens.in_force,
+        )  # fmt: skip
         self._acts = 0  # number of all switches and resumptions so far
         self._attempting: set[str] = set()  # clients with a dry run under way
         self.returns = TimedDisables(store, self._come_back)
@@ -177,6 +182,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """
         settings = self.store.settings()
         self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
+        self.givens.said = json.loads(settings.get(_GIVEN, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
         last = self.in_force if self._find_last(restarted=restarted or taken_over) else None
         named = () if restarted else self.switches.named
@@ -220,7 +226,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     @property
     def differs_from_folder(self) -> bool:
         """Whether the specifications in force differ from the folder's; False without a folder."""
-        return self.folder is not None and self._folder.looked_at() != self.sources
+        found = self._folder.looked_at()
+        return self.folder is not None and (
+            found is None or found.with_topics(self.sources.topics) != self.sources
+        )
 
     def names(self) -> list[str]:
         """Return the names of all monitors, in the order in which they get messages."""
@@ -260,14 +269,25 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         confirmed.
         """
         async with self._changing(request.expected):
-            new = Sources(request.files, request.definitions, request.signatures)
+            topics, constants = split(request.given)
+            new = Sources(request.files, request.definitions, request.signatures, topics)
             sources = self.sources.with_files(new)
             shadow = frozenset(new.files) if request.shadow else frozenset()
-            if self.in_force.who != DISK and sources == self.sources and not shadow:
+            if self.in_force.who != DISK and sources == self.sources and not (shadow or request.given):
                 return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
             note, within = request.note or "loaded", request.confirm_within
             how = _Consent(request.force, request.hold)
-            return await self._change(sources, who, who, note, within, shadow=shadow, consent=how)
+            return await self._change(
+                sources,
+                who,
+                who,
+                note,
+                within,
+                shadow=shadow,
+                consent=how,
+                topics=topics,
+                constants=constants,
+            )
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return the effects that a load would have. Raises the errors of `load`, and `DryRunUnderWayError`."""
@@ -280,8 +300,11 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         self._attempting.add(who)
         try:
             present, revision, tag = self.sources, self.revision, self.tag
-            following = present.with_files(Sources(request.files, request.definitions, request.signatures))
+            topics, constants = split(request.given)
+            new = Sources(request.files, request.definitions, request.signatures, topics)
+            following = present.with_files(new)
             checked = await self._try_out(following, self.site_keys)
+            self._check_given(topics, constants, checked)
         finally:
             self._attempting.discard(who)
         shadow = self._in_shadow(checked, request.files if request.shadow else ())
@@ -314,6 +337,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             if self.folder is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
+            sources = sources.with_topics(self.sources.topics)
             kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 sources = self.sources.with_files(sources)
@@ -329,12 +353,14 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
     async def take_bundle(self, sources: Sources, who: str, note: str) -> Replacement:
         """Bring exactly these sources into force. Raises `SpecificationsRefusedError`; then nothing has changed."""
         async with self._changing(None):
+            sources = sources.with_topics(self.sources.topics)
             if self.in_force.who != DISK and sources == self.sources:
                 return self._replaced(self.revision, ([], [], []))  # same texts: no new revision
             return await self._change(sources, who, who, note, consent=_Consent(hold=True))
 
     async def held_by_bundle(self, sources: Sources) -> list[str]:
         """Return why these sources would hold topics that carry messages. Raises `SpecificationsRefusedError`."""
+        sources = sources.with_topics(self.sources.topics)
         if sources == self.sources:
             return []
         checked = await self._check(sources, self.site_keys)
@@ -371,8 +397,10 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         """
         async with self._changing(request.expected):
             row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
-            note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
-            return await self._change(sources_of(row), who, who, note, switches=switches, consent=_ALL)
+            note, last = f"rolled back to revision {row.revision}", kept_in(row)
+            return await self._change(
+                sources_of(row), who, who, note, switches=last.switches, given=last.given, consent=_ALL
+            )
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
@@ -553,6 +581,47 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             await self.rollout.carried_out()
             return self._switched(held)
 
+    async def give(self, request: admin.MonitorSet, who: str) -> answers.GivenSet:
+        """Set constants that are given to a monitor; return everything that is given to it.
+
+        Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for a value outside of its range.
+        """
+        async with self._changing(request.expected):
+            name = request.name
+            self._all_known([name])
+            present = {one.name: one.value for one in self.givens.states(self.checked, name)}
+            new = parsed(self.checked.givens.get(name, ()), name, request.values)
+            changed = [one for one, value in new.items() if value != present[one]]
+            if changed:
+                take_effect()
+                await self._count()
+                self.givens.said = {**self.givens.said, name: {**self.givens.said.get(name, {}), **new}}
+                self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
+                values = self.givens.in_force(self.checked)[name]
+                self.rollout.tell(name, messages.MonitorGiven(name, values))
+                self._say_given(name, {one: present[one] for one in changed}, who)
+                await self.store.settled()
+                await self.rollout.carried_out()
+            given = self.givens.states(self.checked, name)
+            return answers.GivenSet(name, changed, given, self.revision, self.tag)
+
+    def _say_given(self, name: str, before: Mapping[str, messages.GivenValue], who: str) -> None:
+        given = {one.name: one for one in self.givens.states(self.checked, name)}
+        parts = [
+            f"{one} = {with_unit(given[one].value, given[one].unit)} (was {with_unit(old, given[one].unit)})"
+            for one, old in before.items()
+        ]
+        self._trail.happened(
+            "monitor set",
+            f"{name}: {', '.join(parts)}",
+            severity=Severity.NOTICE,
+            category="monitor",
+            resource=name,
+            who=who,
+            values={one: given[one].value for one in before},
+            before=dict(before),
+        )
+
     # --- the relay's messages ---
 
     def received(self, message: messages.Message, relay: int = 0) -> None:
@@ -607,31 +676,40 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         *,
         kept: Sequence[str] = (),
         switches: Mapping[str, Switch] = {},
+        given: Given = NO_VALUES,
         shadow: Collection[str] = (),
         consent: _Consent,
+        topics: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
+        constants: Given = NO_VALUES,
     ) -> Replacement:
         """Compile sources and put them into force; `kept` are files that are not in the folder.
 
-        `switches` are for monitors that are not in force yet; monitors in the files `shadow` start in shadow mode.
+        `switches`, and the values `given`, are for monitors that are not in force yet; monitors in the files `shadow`
+        start in shadow mode. `topics` and `constants` are new values of this change.
         """
         before, previous, switched = self.revision, self.sources, self.switches.said
+        said = self.givens.said
         self.switches.said = {
             **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
             **switched,
         }
         try:
             checked = await self._check(sources, self.site_keys)
+            sources = sources.with_topics(sources.topics, checked.givens)
+            new = self._check_given(topics, constants, checked)
+            back = {name: dict(values) for name, values in given.items() if name not in self.checked.monitors}
+            self.givens.said = {**back, **said} | {name: {**said.get(name, {}), **new[name]} for name in new}
             put = {name: SHADOW for name, file in checked.monitors.items() if file in shadow}
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
             self.switches.said |= put
-            warnings = self._judged(checked, self._in_shadow(checked), consent)
+            warnings = self._judged(checked, self._in_shadow(checked), consent) + self.givens.dropped(checked)
             require_whole(self.switches.states_of(checked) | in_force, checked)
             moved = await self.rollout.take(self._revision(before + 1, sources, checked))
         except WithdrawnError:
-            self.switches.said = switched
+            self.switches.said, self.givens.said = switched, said
             raise
         except SpecificationsRefusedError as error:
-            self.switches.said = switched
+            self.switches.said, self.givens.said = switched, said
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
             findings = error.findings + hint
             self._trail.happened(
@@ -654,12 +732,29 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         )
         for name in put:
             self._say_switched(name, SHADOW, who, ", as it was loaded")
+        for name in new:
+            self._say_given(name, {one: said.get(name, {}).get(one, "the default") for one in new[name]}, who)
         await self.store.settled()
         await self.rollout.all_taken()
         self._published()
         began = self.rollout.began(checked.monitors)  # also on relays that took them only now
         done = self._replaced(before, sources.difference(previous), moved, began, kept)
         return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
+
+    def _check_given(
+        self, topics: Mapping[str, Mapping[str, str]], constants: Given, checked: CheckedSpecifications
+    ) -> dict[str, dict[str, messages.GivenValue]]:
+        """Return the constants as their types hold them. Raises `SpecificationsRefusedError`."""
+        require_topics(topics, checked)
+        if topics and self.site_keys:
+            text = "the site signs the topics of a text, so a load cannot replace them: sign a text with another topic"
+            raise SpecificationsRefusedError([text])
+        unknown = [name for name in constants if name not in checked.monitors]
+        if unknown:
+            raise SpecificationsRefusedError([unknown_monitors(unknown, checked)])
+        return {
+            name: parsed(checked.givens.get(name, ()), name, values) for name, values in constants.items()
+        }
 
     def _in_shadow(self, checked: CheckedSpecifications, files: Collection[str] = ()) -> set[str]:
         """Return which of these monitors are, or would be, in shadow mode, including all monitors in `files`."""
@@ -727,7 +822,12 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         last, before = self.in_force, sources_of(self.in_force)
         if last.revision:
             ended = StoredSpecifications(
-                before.files, before.definitions, before.signatures, self.switches.said
+                before.files,
+                before.definitions,
+                before.signatures,
+                before.topics,
+                self.switches.said,
+                self.givens.said,
             )
             self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
         row = MonitorRevisionRow(last.revision + 1, text_of(sources), clock.wall(), who, note)
@@ -758,7 +858,17 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
         for name in self.switches.enforce(checked):
             self._say_switched(name, SHADOW, self.in_force.who, ": it shares variables with one that is")
         self.returns.keep(self._disabled())
+        for text in self.givens.enforce(checked):
+            self._trail.happened(
+                "monitor set",
+                text,
+                severity=Severity.WARNING,
+                category="monitor",
+                resource="",
+                who=self.in_force.who,
+            )
         self.store.save_setting(_SWITCHES, json.dumps(self.switches.said))
+        self.store.save_setting(_GIVEN, json.dumps(self.givens.said))
 
 
 def _moment(seconds: float) -> str:

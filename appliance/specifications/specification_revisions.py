@@ -7,6 +7,7 @@ from typing import NamedTuple
 import msgspec
 
 from appliance.base.actors import DISK
+from appliance.channel.messages import GivenValue
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import (
     CheckedSpecifications,
@@ -35,9 +36,11 @@ class StartingSpecifications(NamedTuple):
 
 
 class StoredSpecifications(Sources, frozen=True):
-    """A stored revision; `switches` are the switches of its monitors at the time when the revision was replaced."""
+    """A stored revision; `switches` are the switches of its monitors, and `given` the values of their constants, at the
+    time when the revision was replaced."""
 
     switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
+    given: dict[str, dict[str, GivenValue]] = {}  # noqa: RUF012  as above
 
 
 def text_of(sources: Sources) -> str:
@@ -90,6 +93,8 @@ async def _folder_or_kept(
     sources, checked = None, None
     try:
         sources = folder.read()
+        if kept is not None:
+            sources = sources.with_topics(sources_of(kept).topics)
         checked = await check(sources, site_keys)
         findings = [*checked.unbuilt.values(), *checked.left_out.values()]
     except SpecificationsRefusedError as error:

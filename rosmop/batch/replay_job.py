@@ -26,12 +26,15 @@ _LONGEST = 4096  # characters of the text of an effect
 class Specifications(msgspec.Struct, frozen=True):
     """Specifications by file name, and message and service definitions by file name (`package/Type.msg`).
 
-    `chosen` is the only monitor to run, with those that share its variables; None for all.
+    `chosen` is the only monitor to run, with those that share its variables; None for all. `topics` and `given` have
+    topics and constants that are given to monitors, by monitor and name; others have the values of the texts.
     """
 
     texts: dict[str, str]
     definitions: dict[str, str]
     chosen: str | None = None
+    topics: dict[str, dict[str, str]] = msgspec.field(default_factory=dict)
+    given: dict[str, dict[str, bool | int | float | str]] = msgspec.field(default_factory=dict)
 
     def known(self, recorded: Definitions) -> Definitions:
         """Return all definitions: of the recording, of ROS, and the given ones; later ones replace earlier ones."""
@@ -40,9 +43,10 @@ class Specifications(msgspec.Struct, frozen=True):
 
     def monitors(self, recorded: Definitions, *, margins: bool = False) -> MonitorSet:
         """Return the monitors, compiled if possible. Raises `SpecificationError`."""
-        compiled = compiled_from(self.texts, self.known(recorded), margins=margins)
+        compiled = compiled_from(self.texts, self.known(recorded), margins=margins, topics=self.topics)
         fast = fast_path_of(compiled) if find_spec("wasmtime") is not None else None
         monitors = MonitorSet.of(compiled, fast=fast)
+        monitors.give(self.given)
         if self.chosen is not None:
             (together,) = compiled.groups([self.chosen])
             monitors.switch({name: name in together for name in monitors.names}, 0)

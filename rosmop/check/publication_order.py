@@ -38,7 +38,8 @@ def _acts_on(code: SpecificationCode, topic: str, functions: Mapping[str, nodes.
     events = [event.function for event in code.events if event.topic == topic and event.part is None]
     handlers = [name for each in code.properties for name in each.handlers.values()] if events else []
     return any(
-        isinstance(node, nodes.Drop | nodes.Stop) or (isinstance(node, nodes.WriteBack) and node.writes)
+        isinstance(node, nodes.Drop | nodes.StopMessage)
+        or (isinstance(node, nodes.WriteBack) and node.writes)
         for name in (*events, *handlers)
         for node in nodes.walk(functions[name])
     )

@@ -8,7 +8,7 @@ from typing import Literal
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.form import nodes
-from rosmop.form.compiled import Comparison, Publication
+from rosmop.form.compiled import Comparison, Given, Publication
 from rosmop.form.findings import Diagnostic, Position, SpecificationError
 from rosmop.form.sites import Site, SiteVariable, Symbols
 from rosmop.runtime.values import ValueCodec
@@ -71,6 +71,8 @@ class SpecificationNames:
     comparisons: dict[tree.BinaryExpression, Comparison] = field(default_factory=dict)
     """The comparisons that are noted."""
     lent: list[ConstantReference] = field(default_factory=list)
+    givens: dict[str, Given] = field(default_factory=dict)
+    """The constants that operators may set."""
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
     """The safe messages, by topic."""
 

@@ -21,7 +21,7 @@ from rosmop.types.resolve import resolve
 
 MOST_PARAMETERS = 6
 
-_ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.Stop, nodes.Publish, nodes.Invoke)
+_ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish, nodes.Invoke)
 
 
 def declare_parameters(
@@ -98,7 +98,7 @@ def _enforces(shared: CompilationContext, functions: Sequence[str]) -> bool:
     while waiting:
         function = shared.functions.get(waiting.pop())
         for node in () if function is None else nodes.walk(function.body):
-            if isinstance(node, nodes.Drop | nodes.Stop | nodes.Publish) or (
+            if isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or (
                 isinstance(node, nodes.WriteBack) and node.writes
             ):
                 return True

@@ -2,7 +2,9 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
+from rosmop.check.givens import Topics
 from rosmop.check.specification import compile_files, findings_of
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Diagnostic, SpecificationError
@@ -17,10 +19,12 @@ def compiled_from(
     *,
     margins: bool = False,
     without_code: Collection[str] = (),
+    topics: Topics = MappingProxyType({}),
 ) -> Compiled:
     """Compile files (name to text) in this order; raises `SpecificationError` with all errors.
 
-    The specifications of files in `without_code` keep only their names, topics and services, and do nothing.
+    `topics` replace the topics given in the files. The specifications of files in `without_code` keep only their names,
+    topics and services, and do nothing.
     """
     files: list[tree.SpecificationFile] = []
     findings: list[Diagnostic] = []
@@ -32,7 +36,7 @@ def compiled_from(
             findings += error.findings
     if findings:
         raise SpecificationError([*findings, *findings_of(files, definitions)])
-    return compile_files(files, definitions, margins=margins)
+    return compile_files(files, definitions, margins=margins, topics=topics)
 
 
 def _without_code(file: tree.SpecificationFile) -> tree.SpecificationFile:

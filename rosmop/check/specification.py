@@ -3,8 +3,10 @@
 Specifications of one set see each other's variables. One pass finds all errors of the whole set.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import TypeVar
 
 from rosmop.check.enforcement import blocking_refused, enforcement, topics_of_remedy, with_remedy
@@ -17,6 +19,14 @@ from rosmop.check.function_bodies import (
     compile_start,
     declare_functions,
     declare_variables,
+)
+from rosmop.check.givens import (
+    Topics,
+    declare_givens,
+    given_topics,
+    read_at_start,
+    with_given,
+    with_topics,
 )
 from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
@@ -45,15 +55,19 @@ IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "
 
 
 def compile_files(
-    files: Sequence[tree.SpecificationFile], definitions: Definitions, *, margins: bool = False
+    files: Sequence[tree.SpecificationFile],
+    definitions: Definitions,
+    *,
+    margins: bool = False,
+    topics: Topics = MappingProxyType({}),
 ) -> Compiled:
     """Compile a set of files; raises `SpecificationError` with all errors.
 
-    `margins`: note comparisons of numbers (`margins.py`).
+    `margins`: note comparisons of numbers (`margins.py`). `topics` replace the topics given in the files.
     """
     shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
-    compiled = _compile_all(shared, pairs)
+    compiled = _compile_all(shared, pairs, topics)
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
@@ -75,13 +89,18 @@ def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definition
     """
     shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
-    _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
+    pairs = [(file, specification) for file in files for specification in file.specifications]
+    _compile_all(shared, pairs, {})
     return list(dict.fromkeys(shared.findings))
 
 
 def _compile_all(
-    shared: CompilationContext, pairs: Sequence[tuple[tree.SpecificationFile, tree.Specification]]
+    shared: CompilationContext,
+    originals: Sequence[tuple[tree.SpecificationFile, tree.Specification]],
+    topics: Topics,
 ) -> list[SpecificationCode]:
+    given = [topics.get(specification.name, {}) for _, specification in originals]
+    pairs = [(file, with_topics(one, own)) for (file, one), own in zip(originals, given, strict=True)]
     names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
     compiled = []
@@ -89,6 +108,11 @@ def _compile_all(
         code = _compile(shared, own, file, specification)
         if code is not None:
             compiled.append(code)
+    for place, code in enumerate(compiled):
+        original = next(one for _, one in originals if one.name == code.name)
+        replaced = given_topics(shared, original, topics.get(code.name, {}))
+        whole = with_given(identity(original), replaced)
+        compiled[place] = dataclasses.replace(code, identity=whole, given_topics=replaced)
     _check_types(shared, compiled)
     shared.findings += bypassing(compiled, shared.publications, shared.functions)
     shared.findings += rival_changes([specification for _, specification in pairs])
@@ -101,6 +125,7 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
     names = SpecificationNames(specification.name, shared.symbols.fresh("c"))
     shared.specifications.append(names)
     declare_parameters(shared, names, specification)
+    declare_givens(shared, names, specification)
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
     declare_ages(shared, names, specification)
@@ -162,6 +187,7 @@ def _compile(
     shared.symbols.begin(specification.name)
     _check_head(shared, specification)
     declare_safes(shared, names, specification)
+    shared.findings += read_at_start(shared, names, specification)
     start = _noted(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():
         _noted(shared, partial(compile_function, shared, names, function))
@@ -181,12 +207,12 @@ def _compile(
     shared.findings += traps(specification)
     if names.parameters:
         shared.findings += kept_slices(names.name, good, known, specification.properties)
-    variables = {variable.name: variable.code for variable in names.variables.values()}
+    variables = {one.name: one.code for one in names.variables.values() if one.name not in names.givens}
     uses = frozenset(names.uses)
     return SpecificationCode(
         specification.name,
         specification.position,
-        identity(specification),
+        b"",  # the caller knows the topics as they are written
         reached(specification, shared.messages.definitions),
         file.name,
         any(modifier.parts == ("hold",) for modifier in specification.modifiers),
@@ -200,6 +226,7 @@ def _compile(
         slicing_of(shared, names, good, known),
         any(modifier.parts == ("begin",) for modifier in specification.modifiers),
         tuple(names.safes.values()),
+        tuple(names.givens.values()),
     )
 
 
@@ -294,7 +321,7 @@ def _property(
         category: {type(part) for part in nodes.walk(shared.functions[name])}
         for category, name in handlers.items()
     }
-    dropping = [category for category, parts in made.items() if parts & {nodes.Drop, nodes.Stop}]
+    dropping = [category for category, parts in made.items() if parts & {nodes.Drop, nodes.StopMessage}]
     if compiled.suppresses:
         at = {handler.category: handler.position for handler in node.handlers}
         shared.findings += [

@@ -271,7 +271,7 @@ def _stop(scope: FunctionScope, node: tree.Statement) -> None:
         raise SpecificationError.at(
             node.position, f"{text} `safe package/Type {{ }} on /topic every 100ms;` before the events"
         )
-    scope.add(nodes.Stop(scope.lines.site, safes))
+    scope.add(nodes.StopMessage(scope.lines.site, safes))
 
 
 def _reset(scope: FunctionScope, node: tree.Statement) -> None:

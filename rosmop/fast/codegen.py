@@ -779,7 +779,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], byte
             nodes.LimitDepth: nodes.Left("calls a recursive function"),
             nodes.Drop: _FunctionCodegen._drop,
             nodes.Reset: _FunctionCodegen._reset,
-            nodes.Stop: nodes.Left("sends the safe message"),
+            nodes.StopMessage: nodes.Left("sends the safe message"),
             nodes.Publish: nodes.Left("publishes a message"),
             nodes.AfterText: _FunctionCodegen._after_text,
             nodes.Count: _FunctionCodegen._count,

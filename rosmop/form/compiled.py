@@ -1,7 +1,9 @@
 """A compiled set of specifications as data: the compiler writes it, and the engine runs it."""
 
+import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from rosmop.form import nodes
 from rosmop.form.connected_groups import channel_of, sharing
@@ -76,6 +78,44 @@ class Publication:
 
 
 @dataclass(frozen=True)
+class Given:
+    """A constant of a specification that operators may set: its names in the text and in the form, its type, unit and
+    default, and its bounds (None: a `bool`).
+    """
+
+    name: str
+    code: str
+    type: value_types.Type
+    unit: str
+    default: bool | int | float
+    bounds: tuple[int | float, int | float] | None
+
+    def holds(self, value: object) -> bool:
+        """Whether a value has the type, and lies within the bounds."""
+        if self.bounds is None or isinstance(value, bool):
+            return self.bounds is None and isinstance(value, bool)
+        fits = isinstance(value, int) or (
+            isinstance(value, float) and isinstance(self.type, value_types.FloatingType)
+        )
+        return fits and self.bounds[0] <= value <= self.bounds[1]  # type: ignore[operator]  # a number
+
+    def held(self, value: Any) -> bool | int | float:
+        """Return a value that it `holds`, as a variable of its type."""
+        if not isinstance(self.type, value_types.FloatingType):
+            return value  # type: ignore[no-any-return]  # a number
+        return float(value) if self.type.bits == 64 else struct.unpack("<f", struct.pack("<f", value))[0]
+
+
+@dataclass(frozen=True)
+class GivenTopic:
+    """A topic of a specification that a load may replace: its name in the text, the topic, and the default."""
+
+    name: str
+    topic: str
+    default: str
+
+
+@dataclass(frozen=True)
 class Slicing:
     """The parameters of slices (name in the text, name in the code, type), and the slices' own variables.
 
@@ -129,6 +169,8 @@ class SpecificationCode:
     begins: bool = False
     """Whether it is declared `begin`: if its state is lost, it restarts instead of holding its topics."""
     safes: tuple[nodes.SafeMessage, ...] = ()
+    givens: tuple[Given, ...] = ()
+    given_topics: tuple[GivenTopic, ...] = ()
 
 
 @dataclass(eq=False)

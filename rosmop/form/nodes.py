@@ -12,10 +12,10 @@ A message is its bytes, counted from 0. A `Spot` is a position in the message: a
 position that an earlier statement named. Reading beyond the end is a fault.
 
 The effects of an action form a list, in order: drop this message (`Drop`, or a `Return` that drops), replace it by
-the safe one (`Stop`), write fields (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart the
-property (`Reset`). Each back end has a table with a row for each kind of expression and statement: an implementation,
-or `Left`. `Charge` and `Allocate` take from the budgets of instructions and bytes, and functions with long values do
-the same. Exceeding a budget is a fault.
+the safe one (`StopMessage`), write fields (`WriteBack`), print a line (`Log`), publish a message (`Publish`), restart
+the property (`Reset`). Each back end has a table with a row for each kind of expression and statement: an
+implementation, or `Left`. `Charge` and `Allocate` take from the budgets of instructions and bytes, and functions with
+long values do the same. Exceeding a budget is a fault.
 """
 
 from collections.abc import Iterator, Mapping
@@ -433,7 +433,7 @@ class SafeMessage(FormNode, frozen=True):
     site: int
 
 
-class Stop(FormNode, frozen=True):
+class StopMessage(FormNode, frozen=True):
     """Replace the message by the safe one of its topic. Without such a message, publish all of `safes`."""
 
     site: int
@@ -581,8 +581,8 @@ class WriteBack(FormNode, frozen=True):
 
 Statement = (
     Evaluate | If | Loop | ForEach | Break | Continue | Select | Return | Leave | Charge | Allocate | LimitDepth | Drop
-    | Stop | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue | Require
-    | Pending | WriteBack
+    | StopMessage | Reset | Publish | AfterText | Count | AfterElements | Skip | NotPast | ReadNumbers | ReadValue
+    | Require | Pending | WriteBack
 )  # fmt: skip
 
 

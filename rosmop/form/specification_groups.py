@@ -46,6 +46,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
     for number in numbers:
         specification = specifications[number]
         variables += specification.variables.values()
+        variables += (given.code for given in specification.givens)
         noted += (name for comparison in specification.comparisons for name in comparison.variables)
         properties += [
             (number, index)

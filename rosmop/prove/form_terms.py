@@ -815,7 +815,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], None
             nodes.LimitDepth: nodes.Left("recursion"),
             nodes.Drop: FormTerms._drop,
             nodes.Reset: nodes.Left("a reset"),
-            nodes.Stop: nodes.Left("the safe message"),
+            nodes.StopMessage: nodes.Left("the safe message"),
             nodes.Publish: nodes.Left("a message to publish"),
             nodes.AfterText: FormTerms._after_text,
             nodes.Count: FormTerms._count,

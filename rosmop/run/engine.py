@@ -55,6 +55,9 @@ from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Buffer, WireMessage
 from roswire.definitions import Definitions
 
+GivenValues = Mapping[str, Mapping[str, bool | int | float | str]]
+"""Values of given constants, by specification and name."""
+
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
 
@@ -181,6 +184,9 @@ class MonitorSet:
         self.on_fault: OnFault = on_fault
         self.patience = patience
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices, holder_of)
+        self.interpreter.variables |= {
+            given.code: given.default for one in compiled.specifications for given in one.givens
+        }
         begin_margins(self._monitors, self.interpreter.variables)
         self.groups = tuple(_groups(compiled, self._monitors))
         self._guards = guards_of(compiled)
@@ -632,6 +638,23 @@ class MonitorSet:
             self._index()
             self._agenda.schedule()
         return tuple(changed)
+
+    def give(self, values: GivenValues) -> None:
+        """Set given constants, by specification and name; the others get their defaults.
+
+        The state stays. Unknown names, and values outside of their ranges, are ignored: whoever sets them checks them.
+        """
+        for part in (self, *self.shadows):
+            for monitor in part._monitors:
+                wanted = values.get(monitor.name, {})
+                present = part.interpreter.variables
+                for given in monitor.code.givens:
+                    value = wanted.get(given.name, given.default)
+                    value = given.held(value if given.holds(value) else given.default)
+                    if present[given.code] != value:
+                        monitor.move_to_python()
+                        monitor.touch()
+                        present[given.code] = value
 
     def resume(self, name: str) -> None:
         """Let a specification that holds its topics pass messages again; raises KeyError."""

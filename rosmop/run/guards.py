@@ -81,7 +81,7 @@ def _places(code: SpecificationCode, compiled: Compiled, acts: set[str]) -> set[
 def _acts(function: nodes.Function) -> bool:
     """Whether a function drops, changes or publishes a message."""
     return any(
-        isinstance(node, nodes.Drop | nodes.Stop | nodes.Publish)
+        isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish)
         or (isinstance(node, nodes.WriteBack) and node.writes)
         for node in nodes.walk(function)
     )

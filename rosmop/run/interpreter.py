@@ -283,7 +283,7 @@ class _Maker:
     def _branch(self, site: int, statements: Sequence[nodes.Statement]) -> _Run:
         """Build a branch. Its condition is noted if the branch drops, changes or publishes a message."""
         block = self.block(statements)
-        if not any(isinstance(node, nodes.Drop | nodes.Stop | nodes.Publish) or self._marks_field(node)
+        if not any(isinstance(node, nodes.Drop | nodes.StopMessage | nodes.Publish) or self._marks_field(node)
                    for node in nodes.walk(tuple(statements))):  # fmt: skip
             return block
         look = self._look(site)
@@ -401,7 +401,7 @@ class _Maker:
 
         return run
 
-    def _stop(self, node: nodes.Stop) -> _Run:
+    def _stop(self, node: nodes.StopMessage) -> _Run:
         context, turn, site = self._context, self._interpreter.turn, node.site
         own = {safe.topic: safe for safe in node.safes}
 
@@ -953,7 +953,7 @@ STATEMENTS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Run]] = Mappi
         nodes.Allocate: _Maker._allocate,
         nodes.LimitDepth: _Maker._limit_depth,
         nodes.Drop: _Maker._drop,
-        nodes.Stop: _Maker._stop,
+        nodes.StopMessage: _Maker._stop,
         nodes.Reset: _Maker._reset,
         nodes.Publish: _Maker._publish,
         nodes.AfterText: _Maker._after_text,

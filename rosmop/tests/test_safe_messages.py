@@ -93,7 +93,7 @@ FAULTY = [
 
 @pytest.mark.parametrize(("text", "data"), FAULTY)
 def test_a_fault_on_a_command_sends_the_safe_message(text: str, data: bytes) -> None:
-    """A division by zero, an endless loop, bytes that are no message: the base never gets silence."""
+    """A division by zero, an endless loop, malformed bytes: the base never gets silence."""
     monitors = load(text)
     found = fields(TWIST, drive(monitors, data))
     assert (found.header.frame_id, found.twist.linear.x, found.twist.angular.z) == ("base", 0, 0.5)

@@ -24,6 +24,11 @@ _ESCAPE = re.compile(r"\\(x[0-9A-Fa-f]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
 _SIMPLE = {"n": 10, "t": 9, "r": 13, "a": 7, "b": 8, "f": 12, "v": 11, "\\": 92, "'": 39, '"': 34, "?": 63}
 _UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "m": 60 * 10**9, "min": 60 * 10**9,
              "h": 3600 * 10**9}  # fmt: skip
+_NUMBER = r"[-+]?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?"
+_GIVEN = re.compile(
+    rf"(?P<value>{_NUMBER}|true|false)(?P<unit>\s*(?!in\s)[A-Za-z%°µ][\w/^*.%°µ-]{{0,30}})?"
+    rf"(?:\s+in\s+(?P<least>{_NUMBER})\s*\.\.\s*(?P<most>{_NUMBER}))?"
+)
 _DURATION = re.compile(r"(\d++(?:\.\d*+)?|\.\d++)\s*+([A-Za-z]*+)\Z")
 MIN_PERIOD_NS = 10**6
 MAX_PERIOD_NS = 10**18
@@ -101,6 +106,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             child for child in children if isinstance(child, Token) and child.type in ("NAME", "MODIFIER")
         ]
         parameters = next((child for child in children if isinstance(child, tuple)), ())
+        givens = next((child for child in children if isinstance(child, list)), [])
         *modifiers, name = names
 
         def items(kind: type[_T]) -> tuple[_T, ...]:
@@ -117,6 +123,7 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             items(tree.EventDefinition),
             items(tree.Property),
             items(tree.SafeDeclaration),
+            tuple(givens),
         )
 
     def function(
@@ -125,6 +132,25 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         if name == "init" and kind.name == ("void",):
             return self.init(meta, parameters, body)
         return tree.FunctionDefinition(self.at(meta), kind, str(name), parameters or (), body)
+
+    def given(self, _: Meta, _word: Any, *items: Any) -> list[Any]:
+        return [*items]
+
+    def given_value(self, meta: Meta, *children: Any) -> tree.GivenValue:
+        *words, name, value = children
+        found = _GIVEN.fullmatch(value.strip())
+        if found is None:
+            text = "write a number, its unit and its range, such as `0.22 m/s in 0..2`, or `true` or `false`"
+            self.refuse(value, text)
+            return tree.GivenValue(self.at(meta), tuple(map(str, words)), str(name), "0", "", None)
+        bounds = None if found["least"] is None else (found["least"], found["most"])
+        kind = tuple(map(str, words))
+        return tree.GivenValue(
+            self.at(meta), kind, str(name), found["value"], (found["unit"] or "").strip(), bounds
+        )
+
+    def given_topic(self, meta: Meta, _word: Any, name: Any, topic: Any) -> tree.GivenTopic:
+        return tree.GivenTopic(self.at(meta), str(name), str(topic))
 
     prototype = _unsaid
 

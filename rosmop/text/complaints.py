@@ -75,6 +75,10 @@ _FORMS = tuple(
         ),
         (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
         (
+            r"\bgiven\s*\{[^{}]*\Z",
+            "a given is `double name = 0.22 m/s in 0..2;`, `bool name = true;` or `topic name = /topic;`",
+        ),
+        (
             r"\bsafe\s[^;{}]*(?:\{[^{}]*\}[^;{}]*)?\Z",
             "a safe message is `safe package/Type { field:5 } on /topic every 100ms;`",
         ),
@@ -126,6 +130,9 @@ _WORDS = {
     "SERVICE": "`service`",
     "EVERY": "`every`",
     "ON": "`on`",
+    "GIVEN": "`given`",
+    "GIVEN_VALUE": "a value such as `0.22 m/s in 0..2`",
+    "TOPIC_WORD": "`topic`",
     "SAFE": "`safe`",
     "STOP": "`STOP;`",
     "EQUAL": "`=`",

@@ -20,7 +20,10 @@ _GRAMMAR = r"""
 file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
 
-specification: NAME+ ["(" [parameters] ")"] "{" item* "}"
+specification: NAME+ ["(" [parameters] ")" [given]] "{" item* "}"
+given: GIVEN "{" (given_value | given_topic)* "}"
+given_value: BUILTIN+ NAME "=" GIVEN_VALUE ";"
+given_topic: TOPIC_WORD NAME "=" TOPIC ";"
 ?item: shared ";" | function | prototype | init | event | property | safe | ";" -> nothing
 
 function: type NAME "(" [parameters] ")" block
@@ -192,6 +195,9 @@ DROP: "DROP"
 STOP.5: /STOP(?=<GAP>*;)/
 RESET: "__RESET"
 PUBLISH: "PUBLISH"
+GIVEN.5: /given(?!\w)/
+TOPIC_WORD.5: /topic(?!\w)/
+GIVEN_VALUE.9: /[^;={}]+/
 SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{)/
 ON.5: /on(?!\w)/
 SERVICE.5: /service(?!\w)/

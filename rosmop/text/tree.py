@@ -440,6 +440,25 @@ class Property(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class GivenValue(SyntaxNode):
+    """`type name = default unit in least..most;`, a constant that operators may set. `bool` has no range."""
+
+    type: tuple[str, ...]
+    name: str
+    default: str
+    unit: str
+    bounds: tuple[str, str] | None
+
+
+@dataclass(frozen=True)
+class GivenTopic(SyntaxNode):
+    """`topic name = /default;`, a name for a topic that a load may replace."""
+
+    name: str
+    topic: str
+
+
+@dataclass(frozen=True)
 class SafeDeclaration(SyntaxNode):
     """`safe type { field:value, … } on topic every period;`."""
 
@@ -463,6 +482,7 @@ class Specification(SyntaxNode):
     events: tuple[EventDefinition, ...]
     properties: tuple[Property, ...]
     safes: tuple[SafeDeclaration, ...] = ()
+    givens: tuple[GivenValue | GivenTopic, ...] = ()
 
 
 @dataclass(frozen=True)

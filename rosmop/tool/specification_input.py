@@ -1,10 +1,11 @@
 """Read specifications and folders of message definitions."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from rosmop.batch.replay_job import Specifications
+from rosmop.check.givens import with_topics
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
 from rosmop.form.findings import Position, SpecificationError
@@ -49,14 +50,15 @@ def read_specifications(program: CommandContext, files: Sequence[Path]) -> dict[
     return texts
 
 
-def topics_of(texts: Mapping[str, str], chosen: str | None) -> dict[str, str]:
-    """Return the topics, with their types, of one specification or (None) of all. Raises `SpecificationError`."""
+def topics_of(specifications: Specifications) -> dict[str, str]:
+    """Return the topics, with their types, of the chosen specification or of all. Raises `SpecificationError`."""
+    chosen, topics = specifications.chosen, specifications.topics
     return {
         event.trigger.topic: event.trigger.type
-        for name, text in texts.items()
+        for name, text in specifications.texts.items()
         for specification in parse(text, name).specifications
         if chosen in (None, specification.name)
-        for event in specification.events
+        for event in with_topics(specification, topics.get(specification.name, {})).events
         if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.part is None
     }
 

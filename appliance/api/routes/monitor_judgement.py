@@ -56,7 +56,7 @@ class Compiler:
 
     def _set(self, loaded: Monitors) -> MonitorSet:
         if self._last is None or self._last[0] != loaded.revision:
-            self._last = (loaded.revision, _compiled(loaded.files or {}, loaded.definitions or {}))
+            self._last = (loaded.revision, _compiled(loaded))
         return self._last[1]
 
     def described(self, loaded: Monitors, name: str) -> Described:
@@ -97,11 +97,11 @@ class Compiler:
         )
 
 
-def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
+def _compiled(loaded: Monitors) -> MonitorSet:
     from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: see the head
     from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
     from roswire.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
     from roswire.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
 
-    known = standard_definitions().extended(Definitions.from_files(definitions))
-    return MonitorSet.of(compiled_from(files, known))
+    known = standard_definitions().extended(Definitions.from_files(loaded.definitions or {}))
+    return MonitorSet.of(compiled_from(loaded.files or {}, known, topics=loaded.topics or {}))

@@ -159,7 +159,14 @@ async def _load(call: OperationCall[admin.MonitorLoad]) -> Tagged[Replaced]:
     return await _try(
         call,
         admin.MonitorTry(
-            new.files, new.definitions, new.signatures, new.expected, new.force, new.shadow, new.hold
+            new.files,
+            new.definitions,
+            new.signatures,
+            new.expected,
+            new.force,
+            new.shadow,
+            new.hold,
+            new.given,
         ),
     )
 

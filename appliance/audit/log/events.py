@@ -63,6 +63,8 @@ EVENTS: dict[str, str] = {
     "monitor in shadow mode": "A monitor gets copies of messages and has no effect; `detail` has who ordered it.",
     "shadow observed": "A monitor in shadow mode would have acted: `detail.would` is drop, change, verdict, fault, log"
     " or publish, or `missed` for a message that it did not get.",
+    "monitor set": "An operator set a constant that is given to a monitor, or its default applies again, because the"
+    " text no longer declares it with this range; `detail` has who ordered it, `values` and `before`.",
     "monitor resumed": "The topics that a monitor held after a restart resume; `detail` has who ordered it.",
     "monitors restarted": "A relay process was restarted: its monitors are in their initial state, and some hold their"
     " topics.",
@@ -167,7 +169,8 @@ SEVERITIES: dict[str, Severity] = {
             "host block ended", "host unblocked",
             "appliance started", "appliance stopped", "bundle in force", "clock not synchronised", "clock synchronised",
             "evidence exported", "forwarding resumed", "handed over", "host awaited", "host awaited no longer",
-            "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
+            "host enrolled", "host renewed", "hosts reloaded", "monitor resumed", "monitor set", "policy loaded",
+            "recording closed",
             "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
             "switchover ordered", "token added", "token revoked", "token rotated", "took over", "topic looked into",
             "tunnel down", "tunnel moved", "tunnel up", "probe passed",

@@ -13,6 +13,20 @@ Tag = Annotated[
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
 
+class GivenState(msgspec.Struct, frozen=True):
+    """A constant or a topic that is given to a monitor."""
+
+    name: str
+    kind: Annotated[str, doc("`int`, `double`, `bool` or `topic`")]
+    value: Annotated[bool | int | float | str, doc("the value in force, in the unit")]
+    unit: Annotated[str, doc("the unit of the values, as the text of the specification has it")]
+    default: Annotated[
+        bool | int | float | str, doc("the value in the text of the specification, in the unit")
+    ]
+    least: Annotated[int | float | None, doc("the least value, in the unit; null: not a number")] = None
+    most: Annotated[int | float | None, doc("the greatest value, in the unit; null: not a number")] = None
+
+
 class MonitorState(msgspec.Struct, frozen=True):
     """A running monitor; counters since it was loaded or its relay began."""
 
@@ -45,6 +59,7 @@ class MonitorState(msgspec.Struct, frozen=True):
         bool, doc("in shadow mode: it gets copies of messages, and its would-be actions are recorded")
     ] = False
     off_until: Annotated[Moment | None, doc("when it is enabled again automatically; null: no end")] = None
+    given: Annotated[list[GivenState], doc("constants and topics that are given to it")] = []
 
 
 class Monitors(msgspec.Struct, frozen=True):
@@ -75,6 +90,20 @@ class Monitors(msgspec.Struct, frozen=True):
     signatures: Annotated[
         dict[str, str] | None, doc("with `texts=1`: the site's signatures, by the same names")
     ] = None
+    topics: Annotated[
+        dict[str, dict[str, str]] | None,
+        doc("with `texts=1`: topics that replace those given in the texts, by monitor and name"),
+    ] = None
+
+
+class GivenSet(msgspec.Struct, frozen=True):
+    """Everything that is given to a monitor, after a change; `changed` names what the change set."""
+
+    name: str
+    changed: list[str]
+    given: Annotated[list[GivenState], doc("constants and topics that are given to it")]
+    revision: int
+    tag: Tag
 
 
 class Tried(msgspec.Struct, frozen=True):

@@ -16,6 +16,25 @@ class StateOwner(msgspec.Struct, frozen=True):
     position: str
 
 
+GivenValue = bool | int | float | str
+"""A value that is given to a monitor; that of a topic is a string."""
+
+
+class GivenDeclared(msgspec.Struct, frozen=True):
+    """A constant (`kind` is `int`, `double` or `bool`) or a `topic` that is given to a monitor.
+
+    `value` is that of the compiled text, which for a topic may differ from the default.
+    """
+
+    name: str
+    kind: str
+    value: GivenValue
+    default: GivenValue
+    unit: str = ""
+    least: int | float | None = None
+    most: int | float | None = None
+
+
 class Contents(msgspec.Struct, frozen=True):
     """The contents of valid specifications: the monitors (name to file), and the topics that they use.
 
@@ -28,6 +47,8 @@ class Contents(msgspec.Struct, frozen=True):
     `unbuilt` has the monitors of files with errors, each with its first error. They do nothing; the relay holds their
     topics. `left_out` has the files whose topics are not known, because they cannot be parsed or a type is not defined,
     each with its first error; nothing holds their topics.
+
+    `givens` has the constants and topics that are given to each monitor.
     """
 
     monitors: dict[str, str] = {}
@@ -45,13 +66,15 @@ class Contents(msgspec.Struct, frozen=True):
     unbuilt: dict[str, str] = {}
     states: dict[str, StateOwner] = {}
     left_out: dict[str, str] = {}
+    givens: dict[str, tuple[GivenDeclared, ...]] = {}
 
 
 class ContentsWanted(Message):
     """Control asks for the contents of specifications (name to text), given these message definitions.
 
     A `dry_run` gets less processor time than an order, and builds the module too. `at_start`: files with errors do not
-    keep the others from being compiled (`Contents.unbuilt`).
+    keep the others from being compiled (`Contents.unbuilt`). `topics` replace topics given in the texts, by monitor and
+    name.
     """
 
     number: int
@@ -59,6 +82,7 @@ class ContentsWanted(Message):
     definitions: dict[str, str]
     dry_run: bool = False
     at_start: bool = False
+    topics: dict[str, dict[str, str]] = msgspec.field(default_factory=dict)
 
 
 class ContentsFound(Message):

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from appliance.channel.messages.compiler import GivenValue
 from appliance.channel.messages.message import Message
 
 
@@ -306,7 +307,8 @@ class SpecificationsStated(Message):
     the relay does not use its own memory.
 
     `unbuilt` has the monitors that do nothing because their files have errors, with the errors. Unless they are
-    declared `begin`, they hold their topics.
+    declared `begin`, they hold their topics. `given` has the values of given constants that differ from the text, by
+    monitor and name.
     """
 
     revision: int
@@ -323,6 +325,7 @@ class SpecificationsStated(Message):
     left: tuple[bytes, ...] = ()
     left_at: int = 0
     unbuilt: dict[str, str] = msgspec.field(default_factory=dict)
+    given: dict[str, dict[str, GivenValue]] = msgspec.field(default_factory=dict)
 
 
 class StateWanted(Message):
@@ -354,6 +357,13 @@ class MonitorSwitched(Message):
 
     name: str
     enabled: bool
+
+
+class MonitorGiven(Message):
+    """Control sets the given constants of a monitor; those that `values` lacks get the default of the text."""
+
+    name: str
+    values: dict[str, GivenValue]
 
 
 class MonitorResumed(Message):
@@ -530,7 +540,7 @@ RelayLink = (
     | UpstreamWanted | UpstreamFound | UpstreamRefused | UpstreamLost | LatchRefused | ConnectionOpened
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
     | StateWanted | StateLeft
-    | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
+    | MonitorSwitched | MonitorGiven | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
 )  # fmt: skip

@@ -11,11 +11,12 @@ from appliance.api.front.moments import in_full
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitor_answers import MonitorState, Replacement, Switched
+from appliance.channel.messages import GivenValue
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.durations import span_given
-from appliance.cli.output import loaded_by, moment, say_json
+from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, printable, say
 
@@ -144,6 +145,12 @@ def load(
     shadow: _Shadow = False,
     force: _Force = False,
     hold: _Hold = False,
+    given: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="MONITOR.NAME=VALUE", help="Constant or topic given to a monitor (repeatable)"
+        ),
+    ] = None,
 ) -> None:
     """Load specifications while the robot runs; files of the same name are replaced.
 
@@ -172,6 +179,7 @@ def load(
         force=force,
         shadow=shadow,
         hold=hold,
+        given=_given_to_monitors(given or []),
     )
     say_replaced(appliance.answer_or_exit(order))
     _say_idle(appliance, sent.files)
@@ -220,6 +228,68 @@ def resume(appliance: Appliance, names: _Names) -> None:
     """
     body = appliance.answer_or_exit(admin.MonitorResume(names))
     say(f"resumed: {', '.join(body.names) or 'none, no topic was held'}")
+
+
+@speaks
+def set_given(
+    appliance: Appliance,
+    name: Annotated[str, typer.Argument(metavar="MONITOR", autocompletion=completion.monitors)],
+    values: Annotated[list[str] | None, typer.Argument(metavar="NAME=VALUE…", show_default=False)] = None,
+) -> None:
+    """Set constants that are given to a monitor while it runs. Without values, print all that is given to it.
+
+    The text of the monitor and its state stay. A value outside of its range is refused. Topics are set by a load.
+
+    Example: rosrv monitor set speed vMax=0.3
+    """
+    if values:
+        wanted: dict[str, GivenValue] = dict(_assigned(value, "NAME=VALUE") for value in values)
+        answer = appliance.answer_or_exit(admin.MonitorSet(name, wanted))
+        given = answer.given
+    else:
+        rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
+        found = [row for row in rows if row.name == name]
+        if not found:
+            known = ", ".join(row.name for row in rows) or "none is loaded"
+            raise usage_error(
+                f"no monitor is named {printable(name)}; there are: {known}", "rosrv monitor set"
+            )
+        given = found[0].given
+    if appliance.as_json:
+        for one in given:
+            say_json(one)
+        return
+    if not given:
+        say(f"nothing is given to {name}; its text has no `given {{ … }}`")
+        return
+    table = table_of("given", "value", "range", "default")
+    for one in given:
+        bounds = "" if one.least is None else f"{one.least:g}..{one.most:g}"
+        table.add_row(one.name, f"{_shown(one.value)} {one.unit}".strip(), bounds, _shown(one.default))
+    say_table(table)
+
+
+def _shown(value: GivenValue) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _assigned(text: str, form: str) -> tuple[str, str]:
+    name, sign, value = text.partition("=")
+    if not sign or not name or not value:
+        raise usage_error(f"{printable(text)}: write {form}", "rosrv monitor")
+    return name, value
+
+
+def _given_to_monitors(given: list[str]) -> dict[str, dict[str, GivenValue]]:
+    """Return the values of `--set`, by monitor and name."""
+    found: dict[str, dict[str, GivenValue]] = {}
+    for text in given:
+        path, value = _assigned(text, "--set MONITOR.NAME=VALUE")
+        monitor, dot, name = path.partition(".")
+        if not dot or not name:
+            raise usage_error(f"{printable(text)}: write --set MONITOR.NAME=VALUE", "rosrv monitor")
+        found.setdefault(monitor, {})[name] = value
+    return found
 
 
 @speaks

@@ -1,6 +1,6 @@
 """`rosrv monitor replay`: run a monitor on recordings and report what it would have done."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
@@ -100,7 +100,7 @@ def replay_monitor(
             raise MONITOR.usage_error("--workers, --on, --resume and --report are for bags and MCAP files")
         span = span_of(since, until)
         recorded = appliance.ask_or_exit(admin.RecordingsWanted())
-        require_recorded(recorded, _topics(specifications.texts, specifications.chosen, patterns))
+        require_recorded(recorded, _topics(specifications, patterns))
         with pieces_of(appliance, recorded, span) as pieces, MONITOR.reports():
             _cover(pieces, span, recorded.in_progress, as_json=appliance.as_json)
             spans = [(piece.name, piece.bag, piece.span) for piece in pieces]
@@ -143,13 +143,20 @@ def _specifications(appliance: Appliance, what: str, folders: Sequence[Path]) ->
     if what not in names:
         known = ", ".join(names) or "no monitor is loaded"
         raise MONITOR.usage_error(f"{what} is neither a file (.rv) nor a loaded monitor ({known})")
-    return Specifications(loaded.files or {}, loaded.definitions or {}, what)
+    given = {
+        row.name: {one.name: one.value for one in row.given if one.kind != "topic"}
+        for row in loaded.monitors
+        if row.given
+    }
+    return Specifications(
+        loaded.files or {}, loaded.definitions or {}, what, topics=loaded.topics or {}, given=given
+    )
 
 
-def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str]) -> dict[str, str]:
+def _topics(specifications: Specifications, patterns: Sequence[str]) -> dict[str, str]:
     """Return the selected topics and their types, for the chosen monitor; if None, for all monitors in the texts."""
     return {
         topic: kind
-        for topic, kind in topics_of(texts, chosen).items()
+        for topic, kind in topics_of(specifications).items()
         if any(fnmatchcase(topic, pattern) for pattern in patterns)
     }

@@ -81,6 +81,7 @@ def _state(monitors: SpecificationManager, name: str) -> answers.MonitorState:
         slices=row.slices,
         slice_limit=row.slice_limit,
         why_held=monitors.rollout.why_held.get(name, ""),
+        given=monitors.givens.states(checked, name),
     )
 
 

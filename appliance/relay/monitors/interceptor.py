@@ -23,7 +23,10 @@ from typing import TYPE_CHECKING
 
 from appliance.base import clock
 from appliance.channel.messages import (
+    GivenValue,
+    MonitorGiven,
     MonitorRow,
+    MonitorSwitched,
     SpecificationsRefused,
     SpecificationsStated,
     StateWanted,
@@ -86,6 +89,7 @@ class Interceptor:
         self.monitors: MonitorSet | None = None
         self._stated: SpecificationsStated | None = None
         self._switches: dict[str, bool] = {}
+        self._given: dict[str, dict[str, GivenValue]] = {}
         self.blocked = ""
         self._awaited: SpecificationsStated | None = None
         self.preparation = Version()
@@ -126,7 +130,7 @@ class Interceptor:
         if isinstance(message, StateWanted):
             self._leave(message)
             return
-        self._switches = dict(message.enabled)
+        self._switches, self._given = dict(message.enabled), dict(message.given)
         if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
                 self._taken(message, [], frozenset())
@@ -151,6 +155,7 @@ class Interceptor:
             return
         result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._shadow_observer.asks)
+        result.give(self._given)
         before, first = self.monitors, self._stated is None or bool(self.blocked)
         if before is None and first:
             self.offset += continued(message, self._keeper, self.now())
@@ -189,6 +194,7 @@ class Interceptor:
             switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
             switched = self.monitors.topics_of(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
+            self.monitors.give(self._given)
             self.keep_all()
         self.schedule()
         self.shadow.schedule()
@@ -208,6 +214,13 @@ class Interceptor:
         self._changed(None if self._stated is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
+    def order(self, message: MonitorSwitched | MonitorGiven) -> None:
+        """Switch a monitor, or set its given constants, between two messages."""
+        if isinstance(message, MonitorSwitched):
+            self.switch(message.name, message.enabled)
+        else:
+            self._give(message.name, message.values)
+
     def switch(self, name: str, enabled: bool) -> None:
         """Enable or disable a monitor; ignore an unknown name."""
         self.invalidate_prepared()
@@ -219,6 +232,13 @@ class Interceptor:
                 self.schedule()
                 self.shadow.schedule()
                 self._changed(self.monitors.topics_of(switched))
+
+    def _give(self, name: str, values: Mapping[str, GivenValue]) -> None:
+        self.invalidate_prepared()
+        self._given[name] = dict(values)
+        if self.monitors is not None:
+            self.monitors.give(self._given)
+            self.keep_all()
 
     def resume(self, name: str) -> frozenset[str]:
         """Make a monitor release its held topics; return the topics."""

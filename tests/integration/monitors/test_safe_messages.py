@@ -56,7 +56,7 @@ def held(appliance: Appliance) -> list[str]:
 
 
 def only_stops(base: Process, since: int) -> None:
-    """Wait for twenty safe messages; fail if another message passes meanwhile."""
+    """Wait for twenty safe messages; fail if another message passes in the meantime."""
     base.wait_for_count(20, event="received", data="stop", since=since, timeout=90)
     assert [one["data"] for one in base.seen(event="received")[-20:]] == ["stop"] * 20
 

@@ -67,6 +67,7 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("PATCH", "/v1/monitors", {"names": ["a"], "shadow": False}),
     ("PATCH", "/v1/monitors", {"names": ["a", "b"], "enabled": True}),
     ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
+    ("PATCH", "/v1/monitors/a/given", {"values": {"vMax": 0.3}}),
     ("POST", "/v1/recordings", {}),
     ("POST", "/v1/recordings", {"before": 30, "after": 2.5, "note": "n"}),
     ("POST", "/v1/recordings/memory", {}),
@@ -116,7 +117,7 @@ LEAST = {
         (
             "reload_policy", "roll_back_policy", "confirm_policy", "topic_messages", "reload_monitors",
             "confirm_monitors", "switch_monitors", "switch_monitor", "record_now", "tell_host_ports", "reload_hosts",
-            "block_host", "unblock_host", "acknowledge_alarm", "silence_alarm",
+            "set_monitor", "block_host", "unblock_host", "acknowledge_alarm", "silence_alarm",
         ),
         "operator",
     ),

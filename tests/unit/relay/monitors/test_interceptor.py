@@ -11,6 +11,7 @@ import pytest
 
 from appliance.channel.messages import (
     GrantInstalled,
+    MonitorGiven,
     MonitorResumed,
     MonitorsCounted,
     MonitorSwitched,
@@ -541,3 +542,35 @@ def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None
         for host in ("10.0.0.1", "10.0.0.8", "10.0.0.9")
     ]
     assert [interceptor.holder_of(number) for number in (*numbers, 999)] == ["10.0.0.1", "", "", ""]
+
+
+def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: Monitored) -> None:
+    """By an order, and by the first or a repeated statement; the state stays."""
+    text = """s() given { int most = 1 in 0..9; } { int n; event e(std::string t) /chatter std_msgs/String '{data:t}' {
+        n++; if (n > most) { t = "late"; } else { t = std::to_string(n); } } }"""
+    files = [("s.rv", text)]
+    world.state(stated(1, files, given={"s": {"most": 2}}))
+    world.until(lambda: world.taken(SpecificationsTaken, 1))
+    publisher, subscriber = world.typed()
+    for told, sent in ((None, "1"), (None, "2"), (None, "late"), (5, "4"), (4, "late")):
+        if told is not None:
+            world.state(MonitorGiven("s", {"most": told}))
+        publisher.send(string("x"))
+        world.gets(subscriber, string(sent))
+    world.state(stated(1, files, given={"s": {"most": 9}}))
+    world.until(lambda: world.taken(SpecificationsTaken, 1))
+    publisher.send(string("x"))
+    world.gets(subscriber, string("6"))
+
+
+def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
+    """At once, with one record for the whole series; a command that equals it passes."""
+    guard = GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
+    world.load(guard)
+    publisher, subscriber = world.typed()
+    publisher.send(string("one"))
+    world.gets(subscriber, string("two"))
+    taken = world.load(guard.replace("longer", "wider"), revision=2)
+    assert taken.held == ["guard"]
+    publisher.send(string("one") + string("stop"))
+    world.gets(subscriber, string("stop"))

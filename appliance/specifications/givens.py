@@ -1,0 +1,166 @@
+"""Check and keep the values that operators gave to monitors: constants while they run, topics at a load. No I/O.
+
+A value stays until its monitor is removed, or until a new text no longer declares it with a range that includes it.
+Then the default of the text applies again.
+"""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from appliance.channel.answers.monitor_answers import GivenState
+from appliance.channel.messages import GivenDeclared, GivenValue
+from appliance.specifications.specification_files import CheckedSpecifications, SpecificationsRefusedError
+
+Given = Mapping[str, Mapping[str, GivenValue]]
+"""Values by monitor and name."""
+
+NO_VALUES: Given = MappingProxyType({})
+
+_TOPIC = "topic"
+
+
+class Givens:
+    """The values that operators gave (`said`), by monitor and name; those of topics belong to a revision's sources."""
+
+    def __init__(self) -> None:
+        self.said: dict[str, dict[str, GivenValue]] = {}
+
+    def in_force(self, checked: CheckedSpecifications) -> dict[str, dict[str, GivenValue]]:
+        """Return the given values of constants that these specifications declare."""
+        found = {
+            monitor: {
+                one.name: values[one.name] for one in declared if one.name in values and _holds(one, values)
+            }
+            for monitor, declared in checked.givens.items()
+            if (values := self.said.get(monitor, {}))
+        }
+        return {monitor: values for monitor, values in found.items() if values}
+
+    def dropped(self, checked: CheckedSpecifications) -> list[str]:
+        """Return a text for each value of a monitor that these specifications do not allow."""
+        kept = self.in_force(checked)
+        return [
+            f"{monitor}: {name}={_shown(value)} no longer applies, because the text does not allow it: the default of"
+            f" the text is in force; rosrv monitor set {monitor} prints it"
+            for monitor, values in self.said.items()
+            for name, value in values.items()
+            if monitor in checked.monitors and name not in kept.get(monitor, {})
+        ]
+
+    def enforce(self, checked: CheckedSpecifications) -> list[str]:
+        """Keep only the values that these specifications allow; return the texts of those `dropped`."""
+        dropped = self.dropped(checked)
+        self.said = self.in_force(checked)
+        return dropped
+
+    def states(self, checked: CheckedSpecifications, monitor: str) -> list[GivenState]:
+        """Return everything that is given to a monitor, with its present value."""
+        said = self.said.get(monitor, {})
+        return [
+            GivenState(
+                one.name, one.kind, said.get(one.name, one.value), one.unit, one.default, one.least, one.most
+            )
+            for one in checked.givens.get(monitor, ())
+        ]
+
+
+def parsed(
+    declared: tuple[GivenDeclared, ...], monitor: str, values: Mapping[str, GivenValue]
+) -> dict[str, GivenValue]:
+    """Return values of constants as their types hold them. Raises `SpecificationsRefusedError` with all errors."""
+    known = {one.name: one for one in declared}
+    found: dict[str, GivenValue] = {}
+    findings = []
+    for name, value in values.items():
+        one = known.get(name)
+        if one is None:
+            names = ", ".join(known) or "nothing is given to it"
+            findings.append(f"{monitor} has no given {name}; there are: {names}")
+        elif one.kind == _TOPIC:
+            text = f"{monitor}: {name} is a topic, which only a load can replace, because the state belongs to a topic"
+            findings.append(f"{text}: rosrv monitor load FILE --set {monitor}.{name}={_shown(value)}")
+        elif (number := _value(one, value)) is None:
+            findings.append(f"{monitor}: {name}={_shown(value)} {_allowed(one)}")
+        else:
+            found[name] = number
+    if findings:
+        raise SpecificationsRefusedError(findings)
+    return found
+
+
+def split(given: Given) -> tuple[dict[str, dict[str, str]], dict[str, dict[str, GivenValue]]]:
+    """Return the topics and the constants among the values of a load: a topic begins with `/`."""
+    topics: dict[str, dict[str, str]] = {}
+    constants: dict[str, dict[str, GivenValue]] = {}
+    for monitor, values in given.items():
+        for name, value in values.items():
+            if isinstance(value, str) and value.startswith("/"):
+                topics.setdefault(monitor, {})[name] = value
+            else:
+                constants.setdefault(monitor, {})[name] = value
+    return topics, constants
+
+
+def require_topics(topics: Mapping[str, Mapping[str, str]], checked: CheckedSpecifications) -> None:
+    """Raise `SpecificationsRefusedError` for each topic that is given to no monitor, or under no such name."""
+    findings = [
+        f"no topic {name} is given to {monitor}, so {topic} replaces none; see rosrv monitor set {monitor}"
+        for monitor, given in topics.items()
+        for name, topic in given.items()
+        if not any(one.kind == _TOPIC and one.name == name for one in checked.givens.get(monitor, ()))
+    ]
+    if findings:
+        raise SpecificationsRefusedError(findings)
+
+
+def _value(declared: GivenDeclared, value: GivenValue) -> GivenValue | None:
+    """Return a value as its type holds it; None if it does not."""
+    if declared.kind == "bool":
+        words = {"true": True, "false": False}
+        found = words.get(value) if isinstance(value, str) else value
+        return found if isinstance(found, bool) else None
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, str):
+        text = value.strip().removesuffix(declared.unit).strip()
+        try:
+            value = int(text)
+        except ValueError:
+            try:
+                value = float(text)
+            except ValueError:
+                return None
+    if not math.isfinite(value) or (declared.kind == "int" and value != int(value)):
+        return None
+    number = int(value) if declared.kind == "int" else float(value)
+    least, most = declared.least, declared.most
+    return number if least is not None and most is not None and least <= number <= most else None
+
+
+def _holds(declared: GivenDeclared, values: Mapping[str, GivenValue]) -> bool:
+    return declared.kind != _TOPIC and _value(declared, values[declared.name]) is not None
+
+
+def _allowed(declared: GivenDeclared) -> str:
+    """Return what a constant takes, as the end of an error."""
+    unit = f" {declared.unit}" if declared.unit else ""
+    if declared.kind == "bool":
+        return "is not true or false"
+    word = "a whole number" if declared.kind == "int" else "a number"
+    return f"is outside of {_shown(declared.least)}..{_shown(declared.most)}{unit}: give {word} in this range"
+
+
+def with_unit(value: GivenValue, unit: str) -> str:
+    """Return a value with its unit."""
+    return f"{_shown(value)} {unit}".strip()
+
+
+def _shown(value: GivenValue | None) -> str:
+    return (
+        str(value).lower()
+        if isinstance(value, bool)
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )

@@ -1,0 +1,148 @@
+"""Compile the givens of a specification: constants that operators set while it runs, and topics that a load replaces.
+
+A constant is a variable of the set that no function assigns, so code and proofs hold for all of its values. It is not
+part of the state. First values and `init` cannot read it, because they would keep the value of the start.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from hashlib import sha256
+from typing import Any
+
+from rosmop.check.assignables import Variable
+from rosmop.check.scope import CompilationContext, SpecificationNames
+from rosmop.check.statements import check_topic
+from rosmop.form.compiled import Given, GivenTopic
+from rosmop.form.findings import Diagnostic, Position, SpecificationError
+from rosmop.runtime.numbers import f32
+from rosmop.text import tree
+from rosmop.types import value_types
+from rosmop.types.messages import shown
+from rosmop.types.resolve import resolve
+
+Topics = Mapping[str, Mapping[str, str]]
+"""The topics that a load gives, by specification and by their names in its text."""
+
+
+def declare_givens(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> None:
+    """Add the constants that are given to a specification to its names."""
+    for node in specification.givens:
+        if not isinstance(node, tree.GivenValue):
+            continue
+        try:
+            given = _given(shared, names, node)
+        except SpecificationError as error:
+            shared.findings += error.findings
+            names.misdeclared.add(node.name)
+            continue
+        names.givens[node.name] = given
+        shared.declare(
+            names, Variable(node.name, given.type, given.code, node.position, shared=True, constant=True)
+        )
+
+
+def _given(shared: CompilationContext, names: SpecificationNames, node: tree.GivenValue) -> Given:
+    kind = resolve(tree.TypeName(node.position, node.type), shared.messages)
+    code = shared.symbols.fresh("g")
+    if node.name in names.variables:
+        raise SpecificationError.at(node.position, f"{shown(node.name)} is declared twice")
+    if isinstance(kind, value_types.BoolType):
+        if node.bounds is not None or node.unit or node.default not in ("true", "false"):
+            raise SpecificationError.at(node.position, f"write `bool {node.name} = true;` or `false`")
+        return Given(node.name, code, kind, "", node.default == "true", None)
+    if node.bounds is None or node.default in ("true", "false"):
+        text = f"{shown(node.name)} needs a range; write for example `{node.name} = 1 in 0..2`"
+        raise SpecificationError.at(node.position, text)
+    default, least, most = (_number(kind, text, node.position) for text in (node.default, *node.bounds))
+    given = Given(node.name, code, kind, node.unit, default, (least, most))
+    if not given.holds(default):
+        text = f"the default {node.default} of {shown(node.name)} is outside of its range"
+        raise SpecificationError.at(node.position, f"{text} {node.bounds[0]}..{node.bounds[1]}")
+    return given
+
+
+def _number(kind: value_types.Type, text: str, position: Position) -> int | float:
+    value = float(text)
+    if isinstance(kind, value_types.FloatingType):
+        held = value if kind.bits == 64 else f32(value)
+        if held - held == 0:
+            return held
+    elif (
+        isinstance(kind, value_types.IntegerType) and kind.least <= value <= kind.most and value.is_integer()
+    ):
+        return int(value)
+    raise SpecificationError.at(position, f"{kind} cannot hold {text}")
+
+
+def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> tree.Specification:
+    """Return a specification with topics in the place of their given names."""
+    topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.GivenTopic)}
+    topics |= {name: topic for name, topic in given.items() if name in topics}
+    renamed: tree.Specification = _renamed(specification, topics) if topics else specification
+    return renamed
+
+
+def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
+    if isinstance(node, tuple):
+        return tuple(_renamed(part, topics) for part in node)
+    if not isinstance(node, tree.SyntaxNode) or isinstance(node, tree.GivenTopic):
+        return node
+    changed: dict[str, Any] = {}
+    for field in fields(node):
+        part = getattr(node, field.name)
+        if field.name == "topic":
+            changed[field.name] = topics.get(part, part)
+        elif isinstance(part, tuple | tree.SyntaxNode):
+            changed[field.name] = _renamed(part, topics)
+    return replace(node, **changed)
+
+
+def given_topics(
+    shared: CompilationContext, specification: tree.Specification, given: Mapping[str, str]
+) -> tuple[GivenTopic, ...]:
+    """Return the topics of a specification that a load may replace, and report invalid ones."""
+    found: dict[str, GivenTopic] = {}
+    for node in specification.givens:
+        if isinstance(node, tree.GivenTopic):
+            topic = given.get(node.name, node.topic)
+            try:
+                check_topic(topic, node.position)
+            except SpecificationError as error:
+                shared.findings += error.findings
+            if node.name in found:
+                text = f"the topic {shown(node.name)} is given twice"
+                shared.findings.append(Diagnostic(node.position, "error", text))
+            found[node.name] = GivenTopic(node.name, topic, node.topic)
+    return tuple(found.values())
+
+
+def with_given(identity: bytes, topics: tuple[GivenTopic, ...]) -> bytes:
+    """Return the identity of a specification: its state belongs to its text and to the topics that replace defaults."""
+    changed = [(one.name, one.topic) for one in topics if one.topic != one.default]
+    return sha256(identity + repr(changed).encode()).digest() if changed else identity
+
+
+def read_at_start(
+    shared: CompilationContext, names: SpecificationNames, specification: tree.Specification
+) -> Iterator[Diagnostic]:
+    """Yield an error for each first value, and for `init`, that reads a given constant, also in called functions."""
+
+    def is_given(name: str) -> bool:
+        if name in names.variables:
+            return name in names.givens
+        return any(name in other.givens for other in shared.owners.get(name, ()))
+
+    for start in (*specification.declarations, *specification.inits):
+        waiting: list[tree.SyntaxNode] = [start]
+        seen: set[str] = set()
+        while waiting:
+            for node in tree.walk(waiting.pop()):
+                name = node.parts[0] if isinstance(node, tree.Name) and len(node.parts) == 1 else ""
+                if name in names.functions and name not in seen:
+                    waiting.append(names.functions[name].node)
+                elif name not in seen and is_given(name):
+                    text = f"{shown(name)} may change while {names.name} runs, and a value of the start would not"
+                    yield Diagnostic(start.position, "error", f"{text}; use {shown(name)} where it is needed")
+                seen.add(name)
