@@ -1,5 +1,6 @@
 """The collector's console in a real browser: log in, robots, search; no script, no text of a robot as markup."""
 
+import datetime
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 from rosrv_fleet.enrolment import Robot
 
+from tests.support.certificates import self_signed
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program
 from tests.support.waiting import eventually
@@ -275,12 +277,14 @@ def _axe(page: Page) -> list[str]:
 def test_hundreds_of_robots_are_usable(site: FleetSite) -> None:
     """With 250 robots, those with problems come first, a filter finds some, and each page has a hundred."""
     assert site.data is not None
-    certificate = site.server.certificate.read_text()
-    long_ago, now = 1, time.time_ns()
+    certificate, now = site.server.certificate.read_text(), time.time_ns()
+    today = datetime.datetime.now(datetime.UTC)
+    ending = site.folder / "ending.pem"
+    self_signed(ending, "127.0.0.1", today, today + datetime.timedelta(days=2))
     for number in range(250):
-        added = long_ago if number == 200 else now
+        used = ending.read_text() if number == 200 else certificate
         robot = Robot(
-            name=f"arm{number:03}", key=f"{number:064x}", certificate=certificate, added=added,
+            name=f"arm{number:03}", key=f"{number:064x}", certificate=used, added=now,
             group=f"site-{number % 2}/arms",
         )  # fmt: skip
         (site.data / "robots" / f"{robot.name}.json").write_bytes(msgspec.json.encode(robot))

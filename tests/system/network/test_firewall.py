@@ -426,10 +426,10 @@ def test_the_firewall_needs_only_few_capabilities(
 
 
 def test_without_any_back_end_there_is_no_firewall(protected: Host, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without nft and libiptc, installing fails and names the packages."""
+    """Without nft and iptc, installing fails and names the packages."""
     monkeypatch.setenv("PATH", "/nonexistent")
     monkeypatch.setitem(sys.modules, "iptc", None)
-    with pytest.raises(FirewallError, match=r"apt install nftables.*apt install iptables"):
+    with pytest.raises(FirewallError, match=r"apt install nftables.*package python-iptables"):
         Firewall(protected.namespace).install(settings(11312))
 
 
