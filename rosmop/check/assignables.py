@@ -23,6 +23,8 @@ class Variable:
     constant: bool = False
     known: bool | int | float | None = None
     """The value of a `const` number that is a literal; None for other variables."""
+    table: bytes | None = None
+    """The elements of a `const` array of numbers that are known, as in a message."""
     flag: str | None = None
     alias: "Value | None" = None
     copied: bool = False

@@ -72,7 +72,7 @@ def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ..
         first, values = order.arguments(scope, [scope.value_of(argument) for argument in node.arguments])
         at = (node.position, scope.site(node))
         return order.after(first, cursors.algorithm(scope, parts[-1], values, at))
-    library = find_function(parts)
+    library = find_function(parts, is_library=scope.names.is_library)
     if library is not None:
         first, values = order.arguments(scope, [scope.value_of(argument) for argument in node.arguments])
         return order.after(first, library(Arguments(scope, parts, values, node.position, scope.site(node))))

@@ -154,7 +154,10 @@ def read(variable: Variable, node: tree.SyntaxNode) -> Value:
     if variable.alias is not None:
         alias = variable.alias
         return Value(alias.form, node.position, VariableLvalue(variable), owned=False)
-    place, value = VariableLvalue(variable), nodes.Read(variable.type, variable.code)
+    place = VariableLvalue(variable)
+    if variable.table is not None:
+        return Value(nodes.Literal(variable.type, variable.table), node.position, place, owned=False)
+    value = nodes.Read(variable.type, variable.code)
     return Value(value, node.position, place, owned=False, constant=variable.known)
 
 

@@ -1,14 +1,16 @@
 """Compile helper functions, `init`, first values and handlers."""
 
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
+from typing import TypeVar
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
 from rosmop.check.event_ages import NEVER, ages_of
+from rosmop.check.library import ELEMENTARY, FREE
 from rosmop.check.loops import charge
 from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
 from rosmop.check.slicing import check_own
-from rosmop.check.statements import initial, known, write
+from rosmop.check.statements import initial, known, table, write
 from rosmop.form import nodes
 from rosmop.form.findings import SpecificationError
 from rosmop.text import tree
@@ -16,6 +18,7 @@ from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
+_T = TypeVar("_T")
 _TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
 
 
@@ -64,20 +67,25 @@ def _shared_variable(
         declarator.position,
         shared=True,
         constant=declaration.type.constant,
-        known=_known(scope, declaration, declarator, kind),
+        known=_known(scope, declaration, declarator, kind, known),
+        table=_known(scope, declaration, declarator, kind, table),
         sliced=bool(names.parameters) and not (declaration.type.static or declaration.type.constant),
     )
 
 
 def _known(
-    scope: FunctionScope, declaration: tree.Declaration, declarator: tree.Declarator, kind: value_types.Type
-) -> bool | int | float | None:
+    scope: FunctionScope,
+    declaration: tree.Declaration,
+    declarator: tree.Declarator,
+    kind: value_types.Type,
+    value_of: Callable[[FunctionScope, tree.TypeName, tree.Declarator, value_types.Type], _T | None],
+) -> _T | None:
     """Return the value of a constant, or None if the value is not known yet.
 
     Compiling the constant reports its errors.
     """
     try:
-        return known(scope, declaration.type, declarator, kind)
+        return value_of(scope, declaration.type, declarator, kind)
     except SpecificationError:
         return None
 
@@ -118,9 +126,9 @@ def _constants(
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
         scope.evaluate(nodes.Assign(parameter.type, parameter.code, nodes.Zero(parameter.type)))
-    for variable in ages_of(names):
-        scope.written.add(variable.code)
-        scope.evaluate(nodes.Assign(variable.type, variable.code, NEVER))
+    for age in ages_of(names):
+        scope.written.add(age.code)
+        scope.evaluate(nodes.Assign(age.type, age.code, NEVER))
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)
@@ -259,15 +267,27 @@ def _free_names(function: tree.FunctionDefinition) -> set[str]:
     } - own
 
 
+def compile_library(shared: CompilationContext, names: SpecificationNames) -> None:
+    """Write the functions of the library that a specification calls, and those that they call."""
+    inside = SpecificationNames(names.name, names.context, instances=names.instances, is_library=True)
+    written = 0
+    while written < len(names.instances):
+        function = [*names.instances.values()][written]
+        compile_function(shared, inside, function)
+        written += 1
+
+
 def compile_function(shared: CompilationContext, names: SpecificationNames, function: HelperFunction) -> None:
-    """Write a helper function."""
+    """Write a helper function, or a function of the library."""
     scope = FunctionScope(shared, names, "function")
+    scope.notes = scope.notes and not names.is_library
     scope.drop_refused = "a function has no message; return a `bool` and drop in the action"
     scope.result, scope.references, scope.recursive = function.result, function.references, function.recursive
     for variable in function.parameters:
         scope.declare(variable)
     with scope.at(function.node):
-        charge(scope, function.node.body)
+        if not (names.is_library and function.name in FREE):
+            charge(scope, function.node.body)
         if function.recursive:
             scope.add(nodes.LimitDepth(scope.lines.site, function.name))
         write(scope, function.node.body)
@@ -277,7 +297,8 @@ def compile_function(shared: CompilationContext, names: SpecificationNames, func
         scope.add(nodes.Return(scope.lines.site, value, handed))
     function.changes, function.calls = frozenset(scope.changes_shared), frozenset(scope.calls)
     parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
-    shared.define(scope.function(function.code, tuple(parameters)))
+    same_as = f"h_{function.name}" if names.is_library and function.name in ELEMENTARY else ""
+    shared.define(scope.function(function.code, tuple(parameters), same_as=same_as))
 
 
 def compile_handler(

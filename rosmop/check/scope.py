@@ -75,6 +75,10 @@ class SpecificationNames:
     """The constants that operators may set."""
     safes: dict[str, nodes.SafeMessage] = field(default_factory=dict)
     """The safe messages, by topic."""
+    instances: dict[tuple[object, ...], HelperFunction] = field(default_factory=dict)
+    """The functions of the library that are called (`library.py`), by name and types."""
+    is_library: bool = False
+    """Whether these are the names that functions of the library see."""
 
     def changed_by(self, name: str) -> frozenset[str]:
         """Return the code's names of the shared variables that a function, or one that it calls, assigns."""
@@ -317,11 +321,13 @@ class FunctionScope:
             self.lines.found = outer
 
     def function(
-        self, name: str, parameters: tuple[str, ...], *, happens: int | None = None
+        self, name: str, parameters: tuple[str, ...], *, happens: int | None = None, same_as: str = ""
     ) -> nodes.Function:
         """Return the function as written so far."""
         shared = tuple(sorted(self.written))
-        return nodes.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
+        return nodes.Function(
+            name, self.context, parameters, tuple(self.lines.found), shared, happens, same_as
+        )
 
     def _variables(self, node: tree.SyntaxNode) -> Iterator[SiteVariable]:
         seen: set[str] = set()

@@ -21,7 +21,7 @@ from rosmop.types.resolve import resolve
 
 MOST_PARAMETERS = 6
 
-_ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish, nodes.Invoke)
+_ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.StopMessage, nodes.Publish)
 
 
 def declare_parameters(
@@ -128,7 +128,9 @@ def acts(function: nodes.Function, shared: CompilationContext) -> bool:
     if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(
-        isinstance(node, _ACTS) or (isinstance(node, nodes.WriteBack) and bool(node.writes))
+        isinstance(node, _ACTS)
+        or (isinstance(node, nodes.WriteBack) and bool(node.writes))
+        or (isinstance(node, nodes.Invoke) and not node.function.startswith(nodes.PURE))
         for node in nodes.walk(function.body)
     )
 

@@ -16,6 +16,7 @@ from rosmop.check.expressions import value_of
 from rosmop.check.function_bodies import (
     compile_function,
     compile_handler,
+    compile_library,
     compile_start,
     declare_functions,
     declare_variables,
@@ -198,6 +199,7 @@ def _compile(
     check_parameters(shared, names, specification)
     good = tuple(event for event in events if event is not None)
     properties = [_property(shared, names, specification, node) for node in specification.properties]
+    compile_library(shared, names)
     shared.findings += _seen_changes(names)
     if start is None or len(good) < len(events) or None in properties:
         return None

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
+from rosmop.check import library
 from rosmop.check.assignables import Value
 from rosmop.check.assignments import require_original, store
 from rosmop.check.conversion import convert, number, require_number
@@ -57,11 +58,13 @@ class Arguments:
 Function = Callable[[Arguments], Value]
 
 
-def find_function(parts: tuple[str, ...]) -> Function | None:
-    """Return the library function of this name, with or without `std::`."""
+def find_function(parts: tuple[str, ...], *, is_library: bool = False) -> Function | None:
+    """Return the library function of this name, with or without `std::`. `is_library`: it is called by another one."""
     if parts[0] == "std" and len(parts) == 2:
         parts = parts[1:]
-    return LIBRARY.get(parts[0]) if len(parts) == 1 else None
+    if len(parts) != 1:
+        return None
+    return LIBRARY.get(parts[0]) or (INTERNAL.get(parts[0]) if is_library else None)
 
 
 def _math(name: str, count: int) -> Function:
@@ -75,6 +78,19 @@ def _math(name: str, count: int) -> Function:
         return call.value(value_types.DOUBLE, f"h_{name}", *doubles)
 
     return function
+
+
+def _elementary(name: str) -> Function:
+    """Return the compiler of a function that the library has for doubles."""
+    function = _math(name, numbers.MATH[name][0])
+
+    def of_doubles(call: Arguments) -> Value:
+        value = function(call)
+        if value.type == value_types.FLOAT:
+            return value
+        return call.result(library.invoke(call.scope, name, call.values))
+
+    return of_doubles
 
 
 def _math_of_floats(name: str, count: int) -> Function:
@@ -146,6 +162,57 @@ def _question(name: str) -> Function:
         return call.value(value_types.BOOL, f"h_{name}", call.values[0].form)
 
     return function
+
+
+def _finite(call: Arguments) -> Value:
+    """Compile `isfinite` of a number, or of all numbers in a message or vector."""
+    call.count(1)
+    if isinstance(call.values[0].type, value_types.RecordType | value_types.VectorType):
+        return call.result(library.all_finite(call.scope, call.values[0]))
+    return _question("isfinite")(call)
+
+
+def _of_library(name: str, *wanted: str) -> Function:
+    """Return the compiler of a function of the library. `wanted` describes each argument, as in `_FITS`."""
+
+    def function(call: Arguments) -> Value:
+        call.count(len(wanted))
+        for value, kind in zip(call.values, wanted, strict=True):
+            if not _FITS[kind](value.type):
+                raise SpecificationError.at(
+                    value.position, f"`{call.name}` needs {kind} here; this is {value.type}"
+                )
+            if kind == _POLYGON:
+                library.check_polygon(value)
+        return call.result(library.invoke(call.scope, name, call.values))
+
+    return function
+
+
+_NUMBER, _POLYGON, _NAMES = "a number", "the corners of a polygon, a list of numbers,", "a list of strings"
+_QUATERNION, _TEXT = "a geometry_msgs/Quaternion", "a string"
+_FITS: Mapping[str, Callable[[value_types.Type], bool]] = MappingProxyType(
+    {
+        _NUMBER: value_types.is_number,
+        _POLYGON: library.is_polygon,
+        _NAMES: library.is_names,
+        _QUATERNION: library.is_quaternion,
+        _TEXT: lambda kind: isinstance(kind, value_types.StringType),
+    }
+)
+
+
+def _nearest(call: Arguments) -> Value:
+    """Compile `nearest(ranges, from, to)`."""
+    call.count(3)
+    if not library.is_polygon(call.values[0].type):
+        raise SpecificationError.at(
+            call.values[0].position, f"`nearest` needs a list of numbers here; this is {call.values[0].type}"
+        )
+    for value in call.values[1:]:
+        require_number(value, "`nearest`")
+    limits = (number(value.form, value_types.LONG) for value in call.values[1:])
+    return call.value(value_types.DOUBLE, "l_nearest", call.values[0].form, *limits)
 
 
 def _to_string(call: Arguments) -> Value:
@@ -258,6 +325,7 @@ def _printed(
 LIBRARY: Mapping[str, Function] = MappingProxyType(
     {
         **{name: _math(name, count) for name, (count, _) in numbers.MATH.items()},
+        **{name: _elementary(name) for name in library.ELEMENTARY},
         "abs": _absolute,
         "labs": _absolute_of_long,
         "llabs": _absolute_of_long,
@@ -269,7 +337,15 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
         "signbit": _question("signbit"),
         "isnan": _question("isnan"),
         "isinf": _question("isinf"),
-        "isfinite": _question("isfinite"),
+        "isfinite": _finite,
+        "clamp": _of_library("clamp", _NUMBER, _NUMBER, _NUMBER),
+        "inside": _of_library("inside", _NUMBER, _NUMBER, _POLYGON),
+        "distance": _of_library("distance", _NUMBER, _NUMBER, _POLYGON),
+        "yaw": _of_library("yaw", _QUATERNION),
+        "metres_east": _of_library("metres_east", _NUMBER, _NUMBER, _NUMBER, _NUMBER),
+        "metres_north": _of_library("metres_north", _NUMBER, _NUMBER, _NUMBER, _NUMBER),
+        "index": _of_library("index", _NAMES, _TEXT),
+        "nearest": _nearest,
         "to_string": _to_string,
         "stoi": _parser(value_types.INT),
         "stol": _parser(value_types.LONG),
@@ -290,6 +366,19 @@ LIBRARY: Mapping[str, Function] = MappingProxyType(
         "snprintf": _prints_at_most,
     }
 )
+
+INTERNAL: Mapping[str, Function] = MappingProxyType(
+    {
+        "turned": _of_library("turned", _NUMBER, _NUMBER),
+        "sin_of_c": lambda call: call.value(
+            value_types.DOUBLE, "h_sin_of_a_large_angle", call.values[0].form
+        ),
+        "cos_of_c": lambda call: call.value(
+            value_types.DOUBLE, "h_cos_of_a_large_angle", call.values[0].form
+        ),
+    }
+)
+"""Functions that only functions of the library call. Modules leave messages with angles that need the C library."""
 
 _LIMITED: Mapping[str, value_types.IntegerType] = MappingProxyType(
     {

@@ -3,19 +3,22 @@
 After an error, compilation continues with the next statement, so that one check finds as many errors as possible.
 """
 
+import struct
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from rosmop.check import call_expressions, loops
 from rosmop.check.assignments import write_store
-from rosmop.check.conversion import condition, convert
+from rosmop.check.conversion import condition, convert, number
 from rosmop.check.expressions import assignment
 from rosmop.check.initializers import converted, elements
 from rosmop.check.scope import FunctionScope
 from rosmop.form import nodes
 from rosmop.form.findings import Position, SpecificationError
+from rosmop.run.interpreter import constant_of
 from rosmop.runtime import numbers
+from rosmop.runtime.values import struct_code
 from rosmop.text import tree
 from rosmop.types import value_types
 from rosmop.types.messages import shown
@@ -24,6 +27,9 @@ from roswire import names
 
 LARGE = 4096
 """The size in bytes from which a local variable is charged at its declaration."""
+
+MOST_TABLE = 64 << 10
+"""The maximum number of bytes of a `const` array whose elements are part of the code."""
 
 
 def write(scope: FunctionScope, node: tree.Statement) -> None:
@@ -60,7 +66,9 @@ def _declare(scope: FunctionScope, node: tree.Declaration) -> None:
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
         variable.copied = _is_copy(scope, declarator, kind)
         variable.known = known(scope, node.type, declarator, kind)
-        scope.evaluate(nodes.Assign(kind, variable.code, value))
+        variable.table = table(scope, node.type, declarator, kind)
+        if variable.table is None:
+            scope.evaluate(nodes.Assign(kind, variable.code, value))
 
 
 def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
@@ -68,6 +76,27 @@ def _is_copy(scope: FunctionScope, declarator: tree.Declarator, kind: value_type
     if kind != value_types.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
     return isinstance(scope.value_of(declarator.value).type, value_types.CharactersType)
+
+
+def table(
+    scope: FunctionScope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
+) -> bytes | None:
+    """Return the elements of a `const` array of constant numbers, as in a message; None for other variables."""
+    given = declarator.value
+    if not (
+        name.constant and isinstance(kind, value_types.VectorType) and isinstance(given, tree.InitializerList)
+    ):
+        return None
+    code, numbers_of = struct_code(kind.element) or "", list[float]()
+    for item in given.items:
+        value = None if isinstance(item, tree.InitializerList) else scope.value_of(item)
+        if value is None or not isinstance(value.constant, int | float) or len(code) != 1:
+            return None
+        literal = nodes.Literal(value.type, value.constant)
+        numbers_of.append(constant_of(number(literal, kind.element)))
+    numbers_of += [0] * ((kind.length or 0) - len(numbers_of))
+    raw = struct.pack(f"<{len(numbers_of)}{code}", *numbers_of)
+    return raw if len(raw) <= MOST_TABLE else None
 
 
 def known(

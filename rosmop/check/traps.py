@@ -95,7 +95,7 @@ def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
                     yield Diagnostic(
                         bound.position,
                         "warning",
-                        f"{text}; negate the opposite comparison (`!(x <= 1)`), or use `isnan`",
+                        f"{text}; use `clamp`, negate the opposite comparison (`!(x <= 1)`), or use `isnan`",
                     )
             case tree.CallExpression(callee=tree.Name(parts=parts)) if parts in _MIN_MAX:
                 for name in sorted(numbers & {_name(argument) for argument in node.arguments}):

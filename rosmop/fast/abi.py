@@ -1,6 +1,6 @@
 """The interface between a module and its runner: addresses in its memory, results of its calls, and data about it.
 
-A variable of the set is 8 bytes at its address: a number, or the address and length of a string
+A variable of the set is 8 bytes at its address: a number, or the address and length of a string or an array of numbers
 (`strings_codegen.py`).
 """
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from rosmop.fast.deferred_output import OutputLine
 from rosmop.form.compiled import Compiled
+from rosmop.runtime.values import struct_code, struct_size
 from rosmop.types import value_types
 from rosmop.types.messages import MessageTypes
 from rosmop.types.value_types import Type
@@ -23,8 +24,25 @@ on.
 MOST_KEPT = 1024
 """The maximum number of bytes of a string that a variable of the module keeps."""
 
+MOST_KEPT_ARRAY = 16 << 10
+"""The same of an array of numbers."""
+
 BEYOND = 0xFFFFFFFF
-"""Replaces the length of a string that is longer than `MOST_KEPT`."""
+"""Replaces the length of a string or array that is longer."""
+
+
+def kept_size(kind: Type) -> int:
+    """Return the size of each element of a string, or of an array of numbers; 0 for values of other types."""
+    if isinstance(kind, value_types.StringType):
+        return 1
+    code = struct_code(kind.element) if isinstance(kind, value_types.VectorType) else None
+    return struct_size(code) if code is not None and len(code) == 1 else 0
+
+
+def most_kept(kind: Type) -> int:
+    """Return the maximum number of elements of a string or array that a variable of the module keeps."""
+    return MOST_KEPT if isinstance(kind, value_types.StringType) else MOST_KEPT_ARRAY // kept_size(kind)
+
 
 AREA = 512 << 10
 """The bytes of frames in one batch; one read takes the same number."""
@@ -57,15 +75,15 @@ class Cells:
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Address and type of each variable, in the order of addresses."""
     texts: dict[int, int] = field(default_factory=dict)
-    """By the address of a variable: where its string is stored while the number (i32) at `generation` is 0."""
+    """By the address of a variable: where its elements are stored while the number (i32) at `generation` is 0."""
     generation: int = 0
     settle: int = 0
-    """The number of the function that copies strings to these addresses."""
+    """The number of the function that copies strings and arrays to these addresses."""
 
     @property
     def kept(self) -> Sequence[int]:
-        """Return the addresses of the variables that are strings."""
-        return [at for at, kind in self.variables.values() if isinstance(kind, value_types.StringType)]
+        """Return the addresses of the variables that are strings or arrays."""
+        return [at for at, kind in self.variables.values() if kept_size(kind)]
 
 
 @dataclass(frozen=True)

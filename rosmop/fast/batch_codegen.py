@@ -116,6 +116,7 @@ from rosmop.run.explain import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
 from rosmop.run.outcomes import NO_NUMBER, SEQ
 from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.values import ValueCodec
+from rosmop.types import value_types
 
 EFFECT = 4
 """The address where the address of the last effect is stored."""
@@ -311,6 +312,10 @@ class TopicCodegen:
         assigned = sorted(
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
+        if any(written.changes_elements for written in functions) and any(
+            isinstance(cells.variables[name][1], value_types.VectorType) for name in assigned
+        ):
+            raise NotCompiledError("keeps an array, and changes an element of one")
         addresses = [cells.variables[name][0] for name in assigned]
         self._settles = not set(addresses).isdisjoint(cells.kept)
         self._undo = tuple((address, writer.take(8)) for address in addresses)

@@ -23,10 +23,11 @@ call. `batch_codegen.py` writes the loop over the frames that were received toge
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from types import MappingProxyType
 from typing import Any
 
-from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells
+from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells, kept_size
 from rosmop.fast.arithmetic import to_floating
 from rosmop.fast.codegen_access import loaded, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, OutputLine, is_text
@@ -80,6 +81,7 @@ from rosmop.fast.wasm import (
     I64_SUB,
     I64_TRUNC_SAT_F64_S,
     RETURN,
+    SELECT,
     UNREACHABLE,
     br,
     call,
@@ -120,8 +122,9 @@ class WasmFunction:
     """A function of the module: types, code, the variables that it assigns, its writes to fields, and whether it drops.
 
     `brief`: it has no loops. `passes`: conditions may end it early for some messages. `says`: it may print lines.
-    `early`: it may write to the first bytes of the message, where a header is. `references` pairs each reference
-    parameter with the address where the function stores its value before it returns.
+    `early`: it may write to the first bytes of the message, where a header is. `changes_elements`: it may change an
+    element of an array. `references` pairs each reference parameter with the address where the function stores its
+    value before it returns.
     """
 
     number: int
@@ -135,6 +138,7 @@ class WasmFunction:
     passes: bool
     says: bool
     early: bool
+    changes_elements: bool
     references: tuple[tuple[str, int], ...] = ()
 
 
@@ -192,7 +196,7 @@ class ModuleCodegen(MemoryLayout):
         """Add a function that the intermediate form does not contain; its result has 32 bits."""
         written = WasmFunction(
             len(self.written), parameters, I32, code, frozenset(), 0,
-            drops=False, brief=True, passes=True, says=False, early=False,
+            drops=False, brief=True, passes=True, says=False, early=False, changes_elements=False,
         )  # fmt: skip
         self.written.append(written)
         return written
@@ -223,6 +227,7 @@ class _FunctionCodegen(StringCodegen):
         self._drops = False
         self._says = False
         self._early = False
+        self._changes_elements = False
         self._bits: tuple[tuple[str, int], ...] = ()
         """The bits of the result besides `HAPPENED`: local variables, and the shift of each."""
         if answers:
@@ -250,6 +255,7 @@ class _FunctionCodegen(StringCodegen):
             self._depends,
             self._says,
             self._early,
+            self._changes_elements,
             tuple(self._references.items()),
         )
 
@@ -396,6 +402,9 @@ class _FunctionCodegen(StringCodegen):
         code = self._when(self._get("dropped"), lambda: self._leave(nodes.Leave(node.site, True)))
         for write in sorted(node.writes, key=lambda write: write.end is not None):
             self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
+            self._changes_elements = self._changes_elements or any(
+                isinstance(part, int) for part in write.path[1:]
+            )
             code += self._when(self._get(write.flag), partial(self._put_field, write, node.site))
         return code
 
@@ -463,7 +472,8 @@ class _FunctionCodegen(StringCodegen):
         return load(machine, self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: nodes.Assign) -> bytes:
-        if isinstance(node.type, value_types.StringType):
+        is_kept = node.name in self._writer.shared and kept_size(node.type)
+        if isinstance(node.type, value_types.StringType) or is_kept:
             return self._assigned_text(node)
         if isinstance(node.type, value_types.VectorType | value_types.RecordType):
             return self._named_in_place(node)
@@ -571,6 +581,43 @@ class _FunctionCodegen(StringCodegen):
         self._brief = False
         code += self._times(left, summed)
         return code + self._get(total, machine_type(node.type))
+
+    def _nearest(self, node: nodes.Call) -> bytes:
+        """Scan the elements between two indices, or those from the first to the end and from the start to the last."""
+        vector, number = node.arguments[0], len(self._locals)
+        first, last, least = (f"{what} {number}" for what in ("first", "last", "least"))
+        code, place, count = self._elements(vector)
+        with self._apart(vector):
+            for name, limit in zip((first, last), node.arguments[1:], strict=True):
+                code += self._value(limit) + self._set(name, I64)
+        for name in (first, last):
+            value = self._get(name, I64)
+            code += value + constant(I64, 0) + value + constant(I64, 0) + compare(I64, ">") + SELECT
+            code += self._set(name, I64)
+            code += value + count + value + count + compare(I64, "<") + SELECT + self._set(name, I64)
+        code += constant(F64, inf) + self._set(least, F64)
+        begin, end, zero = self._get(first, I64), self._get(last, I64), constant(I64, 0)
+        wraps = begin + end + compare(I64, ">")
+        straight = self._scanned(vector, place, (begin, end), least)
+        around = self._scanned(vector, place, (begin, count), least)
+        around += self._scanned(vector, place, (zero, end), least)
+        return code + self._when(wraps, lambda: around, lambda: straight) + self._get(least, F64)
+
+    def _scanned(
+        self, vector: nodes.Expression, place: bytes, limits: tuple[bytes, bytes], least: str
+    ) -> bytes:
+        """Lower a local variable to the smallest element between two indices."""
+        kind, size = self._writer.element(vector.type)
+        at, left, each = (f"{what} {len(self._locals)}" for what in ("element", "left", "each"))
+        code = place + limits[0] + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD + self._set(at)
+        code += limits[1] + limits[0] + I64_SUB + self._set(left, I64) + self._spend(self._get(left, I64))
+        value = loaded(self._get(at), 0, kind)
+        value += to_floating(machine_type(kind), F64, signed=is_signed(kind)) + self._set(each, F64)
+        value += self._get(each, F64) + self._get(least, F64) + self._get(each, F64) + self._get(least, F64)
+        value += compare(F64, "<") + SELECT + self._set(least, F64)
+        value += self._get(at) + constant(I32, size) + I32_ADD + self._set(at)
+        self._brief = False
+        return code + self._times(left, value)
 
     def _call(self, node: nodes.Call) -> bytes:
         special = _SPECIAL.get(node.function)
@@ -750,6 +797,7 @@ _SPECIAL: Mapping[str, Callable[[_FunctionCodegen, nodes.Call], bytes]] = Mappin
         ),
         "a_part": _FunctionCodegen._with_part,
         "l_element": _FunctionCodegen._element_at,
+        "l_nearest": _FunctionCodegen._nearest,
     }
 )
 _OF_COUNTS = {"l_len": b"", "l_empty": I64_EQZ, "l_last": constant(I64, 1) + I64_SUB}

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from rosmop.fast.abi import FIRST, Cells
+from rosmop.fast.abi import FIRST, Cells, kept_size
 from rosmop.fast.deferred_output import OutputLine
 from rosmop.fast.wasm import F32, F64, I32, I64
 from rosmop.form import nodes
@@ -90,7 +90,7 @@ class MemoryLayout:
     def variable(self, name: str, kind: Type) -> int:
         """Return the address of a variable of the set."""
         cells = self.shared[name]
-        if not isinstance(kind, value_types.StringType):
+        if not kept_size(kind):
             machine_type(kind)
         place = cells.base + 8 * (cells.properties + len(cells.variables))
         return cells.variables.setdefault(name, (place, kind))[0]

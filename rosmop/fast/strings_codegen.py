@@ -1,15 +1,16 @@
-"""Generate code for strings: constants, strings of the message, and strings in variables of the set.
+"""Generate code for strings and arrays of numbers: constants, those of the message, and variables of the set.
 
-A variable is 8 bytes: the address and the length of its string (4 bytes each). While a batch is processed, the string
-may be in a message, in a constant, or in the former memory of another variable. So assignments copy nothing. At the end
-of a batch all strings are copied together (`settling`). Each variable has two buffers, which batches use in turn,
-because lines of output may still read the strings of the last batch.
+A variable is 8 bytes: the address and the length of its string or array (4 bytes each). While a batch is processed, it
+may be in a message, in a constant, or in the former memory of another variable. So assignments copy nothing. A topic
+that keeps an array is not compiled if it changes an element of one. At the end of a batch all are copied together
+(`settling`). Each variable has two buffers, which batches use in turn, because lines of output may still read the
+strings of the last batch.
 
-Strings longer than `MOST_KEPT` are not kept. The message that brings such a string is left to the interpreter, and the
+Values longer than `most_kept` are not kept. The message that brings such a value is left to the interpreter, and the
 variable is marked `BEYOND`. Messages that read this variable are also left to the interpreter.
 """
 
-from rosmop.fast.abi import MOST_KEPT, Cells
+from rosmop.fast.abi import Cells, kept_size, most_kept
 from rosmop.fast.codegen_access import MessageAccess
 from rosmop.fast.memory_layout import MemoryLayout, NotCompiledError
 from rosmop.fast.wasm import (
@@ -68,24 +69,29 @@ class StringCodegen(MessageAccess):
     """Writes code that reads and keeps strings."""
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
+        if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
+            at = self._layout.variable(node.name, node.type)
+            code = load(I32, at) + constant(I32, 0) + i64_load32_u(at + 4)
+            return self._noted(code, most_kept(node.type))
+        if isinstance(node, nodes.Literal | nodes.Zero) and kept_size(node.type):
+            return self._constant_elements(node)
         if not isinstance(node.type, value_types.StringType):
             return super()._elements(node)
-        if isinstance(node, nodes.Literal | nodes.Zero):
-            raw = node.value if isinstance(node, nodes.Literal) else b""
-            assert isinstance(raw, bytes)  # noqa: S101  a constant of strings
-            self._layout.strings.add(raw)
-            return b"", constant(I32, self._layout.constant(raw)), constant(I64, len(raw))
         if isinstance(node, nodes.Assign):
             code = self._assigned_text(node)
             first, place, count = self._elements(nodes.Read(node.type, node.name))
             return code + first, place, count
         if isinstance(node, nodes.Conditional):
             return self._chosen(node)
-        if isinstance(node, nodes.Read) and node.name in self._layout.shared:
-            at = self._layout.variable(node.name, node.type)
-            code = load(I32, at) + constant(I32, 0) + i64_load32_u(at + 4)
-            return self._noted(code, MOST_KEPT)
         return super()._elements(node)
+
+    def _constant_elements(self, node: nodes.Literal | nodes.Zero) -> tuple[bytes, bytes, bytes]:
+        size = kept_size(node.type)
+        length = node.type.length if isinstance(node.type, value_types.VectorType) else None
+        raw = node.value if isinstance(node, nodes.Literal) else bytes(size * (length or 0))
+        assert isinstance(raw, bytes)  # noqa: S101  a constant of strings or arrays
+        self._layout.strings.add(raw)
+        return b"", constant(I32, self._layout.constant(raw)), constant(I64, len(raw) // size)
 
     def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
         """Pop address and length into local variables; a length above `most` leaves the message to the interpreter."""
@@ -110,14 +116,14 @@ class StringCodegen(MessageAccess):
         return code, self._get(place), self._get(count, I64)
 
     def _assigned_text(self, node: nodes.Assign) -> bytes:
-        """Assign a string to a variable."""
+        """Assign a string, or an array of numbers, to a variable."""
         first, place, count = self._elements(node.value)
         cells = self._layout.shared.get(node.name)
         if cells is None:
             code = first + place + count + self._set(f"count of {node.name}", I64)
             return code + self._set(f"place of {node.name}")
         at = self._layout.variable(node.name, node.type)
-        code, place, count = self._noted(first + place + count, MOST_KEPT)
+        code, place, count = self._noted(first + place + count, most_kept(node.type))
         self._assigned.add(node.name)
         return code + store(I32, at, place) + store(I32, at + 4, count + I32_WRAP_I64)
 
@@ -197,22 +203,24 @@ def mismatch() -> bytes:
 
 
 def settling(layout: MemoryLayout, cells: Cells) -> bytes:
-    """Write a function that copies the strings of all variables to one of their two buffers, in turn.
+    """Write a function that copies the strings and arrays of all variables to one of their two buffers, in turn.
 
     The number of the current buffer is stored last. If the function is stopped, it runs again after the current message
     is undone. It returns 0 (i32).
     """
     cells.generation = layout.take(8)
-    cells.texts = {at: layout.take(2 * MOST_KEPT) for at in cells.kept}
+    kept = {at: kind for at, kind in cells.variables.values() if kept_size(kind)}
+    rooms = {at: most_kept(kind) * kept_size(kind) for at, kind in kept.items()}
+    cells.texts = {at: layout.take(2 * room) for at, room in rooms.items()}
     other, target = local_get(0), local_get(1)
     flip = load(I32, cells.generation) + I32_EQZ + local_set(0)
     code = []
     for address, begin in cells.texts.items():
-        count = load(I32, address + 4)
+        count, kind = load(I32, address + 4), kept[address]
         code += [
-            count, constant(I32, MOST_KEPT), I32_LE_U, IF, NOTHING,
-            other, constant(I32, MOST_KEPT), I32_MUL, constant(I32, begin), I32_ADD + local_set(1),
-            target, load(I32, address), count, MEMORY_COPY,
+            count, constant(I32, most_kept(kind)), I32_LE_U, IF, NOTHING,
+            other, constant(I32, rooms[address]), I32_MUL, constant(I32, begin), I32_ADD + local_set(1),
+            target, load(I32, address), count, constant(I32, kept_size(kind)), I32_MUL, MEMORY_COPY,
             store(I32, address, target),
             END,
         ]  # fmt: skip

@@ -25,7 +25,6 @@ from rosmop.fast.abi import (
     BEYOND,
     LEFT,
     LOUD,
-    MOST_KEPT,
     POSITION,
     REST,
     SOONER,
@@ -34,6 +33,8 @@ from rosmop.fast.abi import (
     UNDO,
     Cells,
     CompiledModule,
+    kept_size,
+    most_kept,
 )
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm_instance import WasmInstance, WasmTrap, failure
@@ -105,9 +106,9 @@ class ModuleState:
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
         )
         self._strings = [
-            (place, cells.texts[address])
+            (place, cells.texts[address], kind)
             for place, (address, kind) in enumerate(variables.values())
-            if isinstance(kind, value_types.StringType)
+            if kept_size(kind)
         ]
         codes = "".join(_cell(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
@@ -142,8 +143,8 @@ class ModuleState:
         values = [self._values[name] for name in self._names]
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
-        for place, buffer in self._strings:
-            values[place] = _entered(self._memory, values[place], buffer)
+        for place, buffer, kind in self._strings:
+            values[place] = _entered(self._memory, values[place], buffer, kind)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
@@ -209,9 +210,9 @@ class ModuleState:
             run: Any = running.run
             run.since, run.now = _CLOCK.unpack_from(self._memory, address)
         found = dict(zip(self._names, values[len(self._running) :], strict=True))
-        for place, _ in self._strings:
+        for place, _, kind in self._strings:
             name = self._names[place]
-            found[name] = _left(self._memory, found[name], self._values[name])
+            found[name] = _left(self._memory, found[name], self._values[name], kind)
         self._values.update(found)
 
 
@@ -221,26 +222,33 @@ def packed(prepared: BatchOptions) -> bytes:
     return _PREPARED.pack(sender, prepared.told, prepared.enabled, prepared.counted)
 
 
-def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
-    """Write a string to memory; return its address, with the length from bit 32 on."""
-    if len(value) > MOST_KEPT:
+def _entered(memory: memoryview, value: Any, buffer: int, kind: Type) -> int:
+    """Write a string or array to memory; return its address, with the length from bit 32 on."""
+    if len(value) > most_kept(kind):
         return BEYOND << 32
-    memory[buffer : buffer + len(value)] = value
+    if isinstance(kind, value_types.VectorType):
+        struct.pack_into(f"<{len(value)}{struct_code(kind.element)}", memory, buffer, *value)
+    else:
+        memory[buffer : buffer + len(value)] = value
     return buffer | len(value) << 32
 
 
-def _left(memory: memoryview, word: int, before: bytes) -> bytes:
-    """Read the string whose address and length are in `word`.
+def _left(memory: memoryview, word: int, before: Any, kind: Type) -> Any:
+    """Read the string or array whose address and length are in `word`.
 
-    Return `before` if the module does not keep the string.
+    Return `before` if the module does not keep it.
     """
     at, count = word & _ADDRESS, word >> 32
-    return before if count == BEYOND else bytes(memory[at : at + count])
+    if count == BEYOND:
+        return before
+    if isinstance(kind, value_types.VectorType):
+        return list(struct.unpack_from(f"<{count}{struct_code(kind.element)}", memory, at))
+    return bytes(memory[at : at + count])
 
 
 def _cell(kind: Type) -> str:
     """Return the `struct` code of a variable in the module's memory, 8 bytes."""
-    if isinstance(kind, value_types.StringType):
+    if kept_size(kind):
         return "Q"
     if isinstance(kind, value_types.BoolType):
         return "?7x"

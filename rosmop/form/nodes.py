@@ -41,7 +41,7 @@ class FormNode(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_li
 
 
 class Literal(FormNode, frozen=True):
-    """A constant.
+    """A constant. An array of numbers is given by its bytes in a message.
 
     Its type is void for None and for the name of a part of a time, which are not values of the language.
     """
@@ -602,7 +602,7 @@ class Function(FormNode, frozen=True):
     the statement with the number `happens` on.
 
     `context` names the specification whose budget is charged. `shared` are the shared variables that the function
-    assigns.
+    assigns. `same_as` is a function of `runtime/builtin_functions.py` with the same results, which is faster in Python.
     """
 
     name: str
@@ -611,6 +611,7 @@ class Function(FormNode, frozen=True):
     body: tuple[Statement, ...]
     shared: tuple[str, ...] = ()
     happens: int | None = None
+    same_as: str = ""
 
 
 # Programs
@@ -708,10 +709,15 @@ def moved(root: Any, sites: Mapping[int, int]) -> Any:
     return type(root)(*(sites[part] if name == _SITE else moved(part, sites) for name, part in parts))
 
 
+PURE = "lib"
+"""The names of functions without effects begin with this prefix."""
+
+
 def acts(root: Expression) -> bool:
     """Whether evaluating the expression has an effect."""
     return any(
-        isinstance(node, Assign | Invoke | Log | Throttle)
+        isinstance(node, Assign | Log | Throttle)
+        or (isinstance(node, Invoke) and not node.function.startswith(PURE))
         or (
             isinstance(node, Call) and (node.type == value_types.VOID or node.function in ("a_put", "a_slot"))
         )

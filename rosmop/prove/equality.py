@@ -20,7 +20,7 @@ from typing import Any
 
 import z3
 
-from rosmop.fast.abi import AREA
+from rosmop.fast.abi import AREA, kept_size
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
@@ -212,7 +212,7 @@ class Validation:
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, value_types.StringType):
+                if kept_size(kind):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, value_types.TimeType | value_types.DurationType):

@@ -417,7 +417,7 @@ class FormTerms:
         if node.value is None:
             return None
         if isinstance(node.value, bytes | str):
-            raise UnknownError("a constant string")
+            raise UnknownError("a constant string or array")
         if isinstance(node.type, value_types.FloatingType):
             return floating(node.value, node.type.bits)
         return self._whole_number(int(node.value), node.type)
@@ -654,8 +654,10 @@ class FormTerms:
 
     def _call(self, node: nodes.Call, state: State) -> Any:
         name, arguments = node.function, node.arguments
-        if name in ("a_part",):
+        if name == "a_part":
             return self._with_part(node, state)
+        if name == "l_nearest":
+            raise NotProvedError("not loop-free")
         values = [self._value(argument, state) for argument in arguments]
         kind = arguments[0].type if arguments else value_types.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):

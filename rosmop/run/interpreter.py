@@ -596,7 +596,10 @@ class _Maker:
         return made
 
     def _literal(self, node: nodes.Literal) -> _Value:
-        constant = node.value
+        constant: Any = node.value
+        if isinstance(node.type, value_types.VectorType):
+            unpacked = struct.iter_unpack(f"<{struct_code(node.type.element)}", constant)
+            constant = [value for (value,) in unpacked]
         return lambda _: constant
 
     def _read(self, node: nodes.Read) -> _Value:
@@ -799,7 +802,11 @@ class _Maker:
     def _invoke(self, node: nodes.Invoke) -> _Value:
         interpreter, name, depth = self._interpreter, node.function, node.depth
         arguments = [self.value(argument) for argument in node.arguments]
-        parameters = interpreter._functions[name].parameters
+        function = interpreter._functions[name]
+        parameters = function.parameters
+        if function.same_as:
+            called = FUNCTIONS[function.same_as]
+            return lambda v: called(*[argument(v) for argument in arguments])
 
         def invoke(v: Variables) -> Any:
             given = [argument(v) for argument in arguments]

@@ -10,7 +10,7 @@ import operator
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from rosmop.runtime import formatting, numbers, strings, times, vectors
+from rosmop.runtime import elementary, formatting, numbers, strings, times, vectors
 
 Function = Callable[..., object]
 
@@ -31,6 +31,8 @@ FUNCTIONS: Mapping[str, Function] = MappingProxyType(
         **{f"h_{name}f": function for name, function in numbers.FLOAT_MATH.items()},
         "h_min": min,
         "h_max": max,
+        "h_sin_of_a_large_angle": elementary.sin,
+        "h_cos_of_a_large_angle": elementary.cos,
         "h_signbit": numbers.signbit,
         "h_isnan": math.isnan,
         "h_isinf": math.isinf,
@@ -65,6 +67,7 @@ FUNCTIONS: Mapping[str, Function] = MappingProxyType(
         "l_filled": vectors.filled,
         "l_clear": list.clear,
         "l_len": len,
+        "l_nearest": vectors.nearest,
         # Times
         "m_is_zero": operator.not_,
         "m_nsec": lambda value: value % times.BILLION,

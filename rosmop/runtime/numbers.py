@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from fractions import Fraction
 
+from rosmop.runtime import elementary
 from rosmop.runtime.action_context import FaultError
 
 _F32 = struct.Struct("<f")
@@ -191,13 +192,13 @@ def _hyperbolic_sine(value: float) -> float:
 MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "sqrt": (1, _total(math.sqrt)),
     "cbrt": (1, math.cbrt),
-    "sin": (1, _total(math.sin)),
-    "cos": (1, _total(math.cos)),
+    "sin": (1, elementary.sin),
+    "cos": (1, elementary.cos),
     "tan": (1, _total(math.tan)),
     "asin": (1, _total(math.asin)),
     "acos": (1, _total(math.acos)),
     "atan": (1, math.atan),
-    "atan2": (2, math.atan2),
+    "atan2": (2, elementary.atan2),
     "sinh": (1, _hyperbolic_sine),
     "cosh": (1, _total(math.cosh)),
     "tanh": (1, math.tanh),
@@ -215,7 +216,7 @@ MATH: dict[str, tuple[int, Callable[..., float]]] = {
     "pow": (2, power),
     "fmod": (2, _total(math.fmod)),
     "remainder": (2, _total(math.remainder)),
-    "hypot": (2, math.hypot),
+    "hypot": (2, elementary.hypot),
     "floor": (1, floor),
     "ceil": (1, ceil),
     "round": (1, round_half_away),

@@ -3,6 +3,7 @@
 `width` is the size of an element in C++, in bytes. It counts towards the memory limit.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -198,6 +199,21 @@ def reverse(context: Context, values: Values, first: int, last: int, site: int) 
     _check_span(values, first, last, site)
     context.spend((last - first) // 4, site)
     values[first:last] = values[first:last][::-1]
+
+
+def nearest(context: Context, values: Values, first: int, last: int, site: int) -> float:
+    """Return the smallest number from `first` to before `last`, infinity without one; NaN is ignored.
+
+    If `first` is after `last`, the elements go on at the beginning.
+    """
+    first, last = (min(max(limit, 0), len(values)) for limit in (first, last))
+    least = math.inf
+    for begin, end in [(first, last)] if first <= last else [(first, len(values)), (0, last)]:
+        context.spend(end - begin, site)
+        for at in range(begin, end, PART):
+            context.turn.check()
+            least = min((value for value in values[at : min(at + PART, end)] if value < least), default=least)
+    return float(least)
 
 
 def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add

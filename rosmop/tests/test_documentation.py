@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from rosmop.check.library import FREE, TEXT, functions
 from rosmop.check.loops import MAX_NESTED
 from rosmop.check.members import TIME_METHODS
 from rosmop.check.sources import compiled_from
@@ -29,8 +30,18 @@ def test_the_example_loads() -> None:
 def test_the_example_of_a_property_loads() -> None:
     """Each example property of the page is valid."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
-    text = CODE[2]
+    text = CODE[3]
     assert load(f"s() {{ {events} {text} }}").monitors[0].properties
+
+
+def test_the_code_of_library_functions_is_on_the_page() -> None:
+    """The page has each function that it describes by code, exactly as it runs, without the comments."""
+    code = re.sub(r" +// .*", "", CODE[2]).strip().split("\n")
+    text = "\n".join(code)
+    named = set(re.findall(r"^\w+ (\w+)\(", text, re.MULTILINE))
+    assert named == set(functions()) - FREE - {"isfinite_all"}
+    functions_of = re.split(r"^(?=\w+ \w+\()", text, flags=re.MULTILINE)
+    assert [one for one in functions_of if one not in TEXT] == []
 
 
 def in_specification(members: str, action: str = "") -> str:
@@ -48,8 +59,8 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
     [
         CODE[0],
         f"s() {{ {CODE[1]} }}",
-        in_specification(CODE[2]),
-        CODE[3],
+        in_specification(CODE[3]),
+        CODE[4],
         in_specification(HELPER, "v = half(v);"),
     ],
 )

@@ -31,7 +31,7 @@ SHIPPED = {
         "obstacleAvoidance.drive": IN_PYTHON,
     },
     "safe_triggering": {"safeTrigger.checkPosition": "not loop-free", "safeTrigger.safeTrigger": EQUAL},
-    "safe_zone": {"safeZone.odometry": IN_PYTHON, "safeZone.gps": IN_PYTHON, "safeZone.drive": EQUAL},
+    "safe_zone": {"safeZone.odometry": EQUAL, "safeZone.gps": EQUAL, "safeZone.drive": EQUAL},
 }  # fmt: skip
 
 
@@ -78,6 +78,9 @@ PROVED = {
     ),
     "a string": """s() { int n = 0;
         event e(std::string f) /stamped own/Stamped '{frame:f}' when (f == "base_link") { n += f.size(); } }""",
+    "functions of the library, and the age of an event": event(
+        "if (age(e) < 1 || !seen(e)) { y = clamp(hypot(sin(y), cos(n)), -n, n); }", "double y", "x:y", "double n = 0;"
+    ),
     "what is left": event(
         "n++; if (y > 3) { told.linear.x = y; PUBLISH(/told, geometry_msgs/Twist, told); }",
         "double y", "x:y", "geometry_msgs::Twist told; int n = 0;",
@@ -105,7 +108,7 @@ UNPROVED = {
     "uses a constant string, or one that is kept": event(
         'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
     ),
-    IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
+    IN_PYTHON: event("y = exp(y);", "double y", "x:y"),
 }
 
 
