@@ -18,6 +18,8 @@ _DEFAULT = re.compile(r"[\[,]\s*+default\s++[A-Za-z_]")
 _WITHOUT_UNIT = re.compile(
     r"\b((?:within|timeout)\s+(\d+(?:\.\d+)?))(?![\d.]|\s*[num]?s\b|\s*(?:m|h|min|us)\b)"
 )
+_BOUND_WITHOUT_UNIT = re.compile(r"[\[,]\s*((\d+(?:\.\d+)?))(?=\s*[,\]])")
+"""A bound of time of `mtl`, such as that of `once[0,500]`."""
 _WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*+")
 
 
@@ -34,9 +36,12 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Diagn
         handler = f"`@{compiled.categories[-1]} {{ … }}`"
         text = f"this property has no effect without a handler; write {handler} after it"
         findings.append(Diagnostic(node.position, "warning", text))
-    for bound in _WITHOUT_UNIT.finditer(compiled.formula):
+    without = [*_WITHOUT_UNIT.finditer(compiled.formula)]
+    if compiled.logic == "mtl":
+        without += (bound for bound in _BOUND_WITHOUT_UNIT.finditer(compiled.formula) if float(bound[1]))
+    for bound in without:
         text = f"`{bound[1]}` has no unit, so it is {bound[2]} s; write `{bound[2]}s` or `{bound[2]}ms`"
-        findings.append(replace(compiled.source.finding(bound.start(), text), severity="warning"))
+        findings.append(replace(compiled.source.finding(bound.start(1), text), severity="warning"))
     for fact in analyse(compiled, [category for category in handlers if category in compiled.categories]):
         position = handlers.get(fact.category) if fact.kind == "never runs" else node.position
         trace = f" (shortest trace: {' '.join(fact.trace)})" if fact.trace else ""

@@ -9,6 +9,7 @@ from rosmop.types.messages import shown
 
 _FLOATING = frozenset({("double",), ("float",)})
 _MIN_MAX = frozenset({("std", "min"), ("std", "max"), ("min",), ("max",)})
+_ABSOLUTE = frozenset({"abs", "fabs", "fabsf"})
 _TESTS_OF_NAN = frozenset({"isnan", "isfinite", "isinf"})
 _UNORDERED = frozenset({"<", "<=", ">", ">="})
 
@@ -17,6 +18,10 @@ def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
     """Yield warnings about the events of a specification."""
     tests = {node.parts[-1] for node in tree.walk(specification) if isinstance(node, tree.Name)}
     for event in specification.events:
+        if isinstance(event.trigger, tree.TimerTrigger) and not event.trigger.has_unit:
+            period = f"{event.trigger.period_ns / 1e9:g}"
+            text = f"`every` without a unit is {period} s; write `{period}s` or `{period}ms`"
+            yield Diagnostic(event.trigger.position, "warning", text)
         yield from _always_dropped(event)
         yield from _lost_changes(event)
         if not tests & _TESTS_OF_NAN:
@@ -81,26 +86,64 @@ def _assigned(statement: tree.ExpressionStatement) -> str:
 def _passed_nan(event: tree.EventDefinition) -> Iterator[Diagnostic]:
     """Warn of a bound that NaN passes: each comparison with it is false, and `std::min` may return it."""
     numbers = {one.name for one in event.parameters if one.type.name in _FLOATING}
+    if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.when is not None:
+        yield from _bounds(event.trigger.when, event.action, numbers)
     for node in tree.walk(event.action):
         match node:
-            case tree.IfStatement(
-                condition=tree.BinaryExpression(operator=operator) as bound, yes=yes, no=None
-            ):
-                found = numbers & {_name(bound.left), _name(bound.right)}
-                if operator in _UNORDERED and found and (_ends(yes) or found & _assigned_in(yes)):
-                    (name,) = list(found)[:1]
-                    text = (
-                        f"NaN passes this bound of {shown(name)}, because each comparison with NaN is false"
-                    )
-                    yield Diagnostic(
-                        bound.position,
-                        "warning",
-                        f"{text}; use `clamp`, negate the opposite comparison (`!(x <= 1)`), or use `isnan`",
-                    )
+            case tree.IfStatement(condition=condition, yes=yes, no=None):
+                yield from _bounds(condition, yes, numbers)
+            case tree.Assignment(
+                target=tree.Name(parts=(name,)),
+                value=tree.ConditionalExpression(condition=condition, no=tree.Name(parts=(other,))),
+            ) if name == other and name in numbers:
+                yield from (_nan_passes(name, bound) for bound in _unordered(condition, {name}))
             case tree.CallExpression(callee=tree.Name(parts=parts)) if parts in _MIN_MAX:
                 for name in sorted(numbers & {_name(argument) for argument in node.arguments}):
                     text = f"`{parts[-1]}` passes NaN in {shown(name)} on, or takes it for the other bound"
                     yield Diagnostic(node.position, "warning", f"{text}; test it with `isnan` before")
+
+
+def _bounds(
+    condition: tree.Expression, yes: tree.Statement, numbers: frozenset[str] | set[str]
+) -> Iterator[Diagnostic]:
+    """Yield warnings about comparisons that drop a message or change a field, but not for NaN."""
+    changed = numbers if _ends(yes) else numbers & _assigned_in(yes)
+    for bound in _unordered(condition, changed):
+        name = next(name for name in sorted(changed) if name in {_operand(bound.left), _operand(bound.right)})
+        yield _nan_passes(name, bound)
+
+
+def _unordered(
+    condition: tree.Expression, names: frozenset[str] | set[str]
+) -> Iterator[tree.BinaryExpression]:
+    """Yield the comparisons of these variables that decide a condition, unless it has a negation, which finds NaN."""
+    parts = [node for node in tree.walk(condition) if isinstance(node, tree.Expression)]
+    if any(isinstance(node, tree.UnaryExpression) and node.operator == "!" for node in parts):
+        return
+    waiting = [condition]
+    while waiting:
+        match waiting.pop():
+            case tree.BinaryExpression(operator="||" | "&&", left=left, right=right):
+                waiting += [right, left]
+            case tree.BinaryExpression(operator=operator) as bound if operator in _UNORDERED:
+                if names & {_operand(bound.left), _operand(bound.right)}:
+                    yield bound
+
+
+def _nan_passes(name: str, bound: tree.BinaryExpression) -> Diagnostic:
+    text = f"NaN passes this bound of {shown(name)}, because each comparison with NaN is false; use `clamp`,"
+    text += " negate the opposite comparison (`!(x <= 1)`), or use `isnan`"
+    return Diagnostic(bound.position, "warning", text)
+
+
+def _operand(node: tree.Expression) -> str:
+    """Return the variable whose value or absolute value is compared; empty for another expression."""
+    match node:
+        case tree.CallExpression(callee=tree.Name(parts=parts), arguments=(argument,)) if (
+            parts[-1] in _ABSOLUTE
+        ):
+            return _name(argument)
+    return _name(node)
 
 
 def _name(node: tree.Expression) -> str:

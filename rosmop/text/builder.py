@@ -203,7 +203,8 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return self.trigger(meta, topic, kind, *rest, part=str(part))
 
     def timer(self, meta: Meta, _every: Any, duration: Any) -> tree.TimerTrigger:
-        return tree.TimerTrigger(self.at(meta), self._period_ns(duration))
+        has_unit = duration.strip()[-1:].isalpha()
+        return tree.TimerTrigger(self.at(meta), self._period_ns(duration), has_unit=has_unit)
 
     def _period_ns(self, duration: Token) -> int:
         try:

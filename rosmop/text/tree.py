@@ -388,9 +388,10 @@ class MessageTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class TimerTrigger(SyntaxNode):
-    """The trigger of a timer: its period in nanoseconds."""
+    """The trigger of a timer: its period in nanoseconds, and whether the text has its unit."""
 
     period_ns: int
+    has_unit: bool = field(default=True, compare=False)
 
 
 @dataclass(frozen=True)
