@@ -565,7 +565,9 @@ def test_given_constants_are_set_between_two_messages_and_on_a_new_relay(world: 
 
 def test_a_safe_message_is_sent_while_a_monitor_holds_its_topic(world: Monitored) -> None:
     """At once, with one record for the whole series; a command that equals it passes."""
-    guard = GUARD.strip().replace("int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen')
+    guard = GUARD.strip().replace(
+        "int seen", 'safe std_msgs/String {data:"stop"} on /chatter every 1s; int seen'
+    )
     world.load(guard)
     publisher, subscriber = world.typed()
     publisher.send(string("one"))
