@@ -31,7 +31,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.configuration.settings import RecorderRules
-from appliance.supervisor.rings import RecorderRings
+from appliance.features.recorder.rings import RecorderRings
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
 from tests.support.stated import stated
 from tests.support.waiting import eventually

@@ -13,12 +13,12 @@ from appliance.api.front.route_roles import Investigator, Reader, problem_of
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, in_thread, peer_of
-from appliance.api.recording_routes import OneId
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
 from appliance.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
 from appliance.evidence.page import Names
+from appliance.features.recorder.recording_routes import OneId
 
 _ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {
     404: {"description": "There is no such recording, or the log has no record of that time."}

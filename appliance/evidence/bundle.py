@@ -40,8 +40,8 @@ from appliance.channel.admin import (
     RecordingFetch,
     Trouble,
 )
-from appliance.channel.answers.recording_answers import Recording
 from appliance.evidence.page import Names, Page
+from appliance.features.recorder.recording_answers import Recording
 from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from appliance.audit.log.record_format import printable, rfc3339
-from appliance.channel.answers.recording_answers import Recording
+from appliance.features.recorder.recording_answers import Recording
 
 _MOST_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")

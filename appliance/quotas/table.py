@@ -270,8 +270,8 @@ RECORDER_MEMORY = QuotaRow(
     alarm="the recording lists what is missing",
     setting="recorder.memory (half of it for a host, a quarter for a topic)",
     shown_by=(
-        "unit/recorder/test_ring.py::test_a_flood_displaces_only_itself",
-        "unit/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
+        "unit/features/recorder/test_ring.py::test_a_flood_displaces_only_itself",
+        "unit/features/recorder/test_ring.py::test_many_topics_of_a_host_displace_only_its_own",
     ),
 )
 RECORDER_DISK = QuotaRow(
@@ -285,11 +285,11 @@ RECORDER_DISK = QuotaRow(
     alarm="`recording removed`, `recording missed`; `detail.not_recorded` of the record",
     setting="recorder.disk (an eighth of it for one recording)",
     shown_by=(
-        "unit/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
-        "unit/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
-        "unit/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
-        "unit/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
-        "unit/recorder/test_recorder.py::test_a_flood_of_triggers_does_not_fill_the_disk",
+        "unit/features/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own_recordings",
+        "unit/features/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
+        "unit/features/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
+        "unit/features/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
+        "unit/features/recorder/test_recorder.py::test_a_flood_of_triggers_does_not_fill_the_disk",
     ),
 )
 DRY_RUNS = QuotaRow(

@@ -13,6 +13,7 @@ import socket
 from collections.abc import Iterator, Mapping
 
 from appliance.channel import messages
+from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
@@ -31,7 +32,6 @@ from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
 from appliance.relay.monitors.observation_points import ObservationPoint
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
-from appliance.relay.recorder_ring import RecorderRing
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
 from appliance.relay.topic_taps import TopicTaps

@@ -14,11 +14,11 @@ from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
+from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.relay.data_plane import DataPlane
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.state_keeper import StateKeeper
 from appliance.relay.monitors.state_memory import mapped
-from appliance.relay.recorder_ring import RecorderRing
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.transport.loop_channel import LoopLink
 from appliance.relay.transport.sockets import congestion_control

@@ -153,7 +153,7 @@ ROLES = (
         ),
     ),
     _ours(
-        "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
+        "recorder", "rosrv-recorder", "recordings", "appliance.features.recorder.process:main",
         ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
         network=False,
         sandbox=lambda facts: SandboxPlan(allowlist=True, reads=(str(facts.part("control")),)),

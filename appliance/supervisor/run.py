@@ -13,6 +13,7 @@ import structlog
 
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
+from appliance.features.recorder.rings import RecorderRings
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import StandbyAccess
 from appliance.network.firewall.iptables import load_modules
@@ -25,7 +26,6 @@ from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import drop_unused_capabilities, raise_file_limit, raise_priority
 from appliance.supervisor.restore_mark import refuse_half_restored
-from appliance.supervisor.rings import RecorderRings
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.roles import LEASE_NICE
 from appliance.supervisor.sandbox.private_view import (

@@ -30,6 +30,7 @@ import structlog
 
 from appliance.base import clock
 from appliance.channel import messages
+from appliance.features.recorder.rings import RecorderRings
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
@@ -50,7 +51,6 @@ from appliance.supervisor.process_handle import (
     link_processes,
 )
 from appliance.supervisor.process_slot import ProcessSlot
-from appliance.supervisor.rings import RecorderRings
 from appliance.supervisor.role import Facts, Role
 from appliance.supervisor.shutdown import end_all
 from appliance.supervisor.users import account_of

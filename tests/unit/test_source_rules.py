@@ -280,14 +280,14 @@ WALL_CLOCK = {
         "cli/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
         "control/assembly/host_blocks.py", "control/passive.py",
         "control/assembly/policies.py", "control/operators/queries.py", "control/replication.py",
-        "control/recording_orders.py", "evidence/bundle.py",
+        "features/recorder/recording_orders.py", "evidence/bundle.py",
         "features/doors/door_node.py", "features/syslog/log_forwarder.py",
         "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
-        "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
-        "relay/recorder_ring.py",
+        "features/recorder/recorder.py", "features/recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
+        "features/recorder/recorder_ring.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
-        "supervisor/rings.py", "supervisor/supervisor.py",
+        "features/recorder/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
@@ -307,8 +307,8 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "channel/alarms.py", "audit/search/filter_options.py", "cli/evidence_verbs.py",
-        "cli/monitor/offline.py", "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
-        "cli/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
+        "cli/monitor/offline.py", "features/recorder/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
+        "features/recorder/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""

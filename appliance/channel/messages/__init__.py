@@ -18,7 +18,7 @@ from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lease_link import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *
-from appliance.channel.messages.recorder_link import *
 from appliance.channel.messages.relay_link import *
 from appliance.channel.messages.signer_link import *
 from appliance.channel.messages.tunnels import *
+from appliance.features.recorder.recorder_link import *

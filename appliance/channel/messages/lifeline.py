@@ -6,9 +6,9 @@ import msgspec
 
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.messages.message import Message
-from appliance.channel.messages.recorder_link import RingGiven
 from appliance.channel.messages.signer_link import SignatureMade, SignatureWanted
 from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
+from appliance.features.recorder.recorder_link import RingGiven
 
 
 class Ping(Message):

@@ -9,11 +9,11 @@ import typer
 
 from appliance.audit.log.record_format import rfc3339
 from appliance.channel import admin
-from appliance.channel.answers.recording_answers import OpenRecording
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.monitor.monitor_program import MONITOR
-from appliance.cli.monitor.recorder_input import Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import say_json
+from appliance.features.recorder.recorder_input import Piece, Span, gaps, pieces_of, require_recorded, span_of
+from appliance.features.recorder.recording_answers import OpenRecording
 from rosmop.batch.replay_job import Specifications
 from rosmop.form.findings import SpecificationError
 from rosmop.tool.batch_session import RecordingsOptions, batch_session

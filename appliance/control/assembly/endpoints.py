@@ -8,7 +8,7 @@ from appliance.channel import messages
 from appliance.control.assembly.core import Core
 from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
 from appliance.control.assembly.listener_limits import value_limits
-from appliance.control.recording_orders import RecordingOrders
+from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.node_api import NodeApiClient

@@ -21,13 +21,13 @@ from appliance.control.assembly.robot import robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.replication import Pair, Replication, make_replication
+from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.graph.registry import Registry
 from appliance.master.reconcile.enactor import Enforcement
 from appliance.quotas.pool import QuotaClass
-from appliance.recorder.recording_plan import RecordingPlan
 from appliance.rpc.server import listen
 from appliance.specifications.compiler_link import SpecificationCompiler
 from appliance.store.state_file import StateStore

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
+from appliance.features.recorder.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.host_sets import EVERYONE
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy

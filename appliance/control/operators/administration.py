@@ -18,7 +18,7 @@ from appliance.control.lease_client import HandOverError
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import RequestMethod
 from appliance.control.operators.token_orders import TokenRefusedError
-from appliance.control.recording_orders import RecorderAwayError
+from appliance.features.recorder.recording_orders import RecorderAwayError
 from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,

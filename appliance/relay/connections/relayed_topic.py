@@ -29,12 +29,12 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from appliance.channel.messages import LatchRefused, TopicTraffic
-from appliance.recorder.ring import RingStream
+from appliance.features.recorder.recorder_ring import ExcludedStream, RecorderRing
+from appliance.features.recorder.ring import RingStream
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.latched_message import LatchedMessage
 from appliance.relay.connections.served_subscribers import ServedSubscribers, TopicSubscriber
 from appliance.relay.connections.startup_replay import APPEARED, StartupReplay
-from appliance.relay.recorder_ring import ExcludedStream, RecorderRing
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.memory import HostMemory
 from appliance.relay.transport.pump import SUBSCRIBERS, ModuleCall, Traffic, Version

@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.recording_answers import OpenRecording, Recording, Recordings, Trigger
+from appliance.features.recorder.recording_answers import OpenRecording, Recording, Recordings, Trigger
 from appliance.network.scan import ScanResult
 from rosmop.tests.acting import message
 from tests.support.answers import example

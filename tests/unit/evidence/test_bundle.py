@@ -28,10 +28,10 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.clock import wall_ns
-from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import bundle_verifier
 from appliance.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
+from appliance.features.recorder.recording_answers import RecordedTopic, Trigger
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN

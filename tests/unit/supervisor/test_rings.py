@@ -7,8 +7,8 @@ import pytest
 from pydantic import ByteSize
 
 from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.rings import RecorderRings
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.rings import RecorderRings
 
 MIB = 1 << 20
 

@@ -10,9 +10,9 @@ from appliance.audit.log.ids import IdSource
 from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.recording_plan import RecordingPlan
 from appliance.quotas.pool import QuotaClass
 from appliance.quotas.table import AUDIT_BYTES
-from appliance.recorder.recording_plan import RecordingPlan
 from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, Recordings
 
 GUEST, UNKNOWN = "10.0.0.66", "10.9.9.9"

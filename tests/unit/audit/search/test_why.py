@@ -2,7 +2,7 @@
 
 from appliance.audit.log.record import AuditRecord, RuleReference, Severity
 from appliance.audit.search.why import lines_of
-from appliance.recorder.triggers import _BY_EVENT
+from appliance.features.recorder.triggers import _BY_EVENT
 
 
 def test_a_verdict_is_explained() -> None:

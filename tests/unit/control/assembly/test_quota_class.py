@@ -4,8 +4,8 @@ import ipaddress
 from dataclasses import replace
 
 from appliance.audit.log.budget import Budget
-from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
+from appliance.features.recorder.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import QuotaClass
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.relayed_topic import RelayedTopic, Upstream
-from appliance.relay.recorder_ring import RecorderRing
 from appliance.relay.transport.frames import Batch
 from appliance.relay.transport.rate_limit import SharedRateLimit
 from tests.support.relay_memory import share

@@ -1,0 +1,75 @@
+"""Convert a bag to MCAP, piece by piece, for tools that cannot read bags.
+
+Messages are copied unchanged (profile `ros1`), in order of time, to uncompressed chunks with indexes.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from io import BytesIO
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from appliance.features.recorder.bag_reader import BagReader
+
+_LONGEST = 1 << 32
+_OF_SENDER = ("md5sum", "callerid", "host", "latching")
+
+
+def as_mcap(bag: Path) -> Iterator[bytes]:
+    """Yield the pieces of an MCAP file with a bag's messages; the bag may be removed during the iteration.
+
+    Raises `OSError`, and `ValueError` for an invalid bag; either may also come during the iteration.
+    """
+    opened = ExitStack()
+    return _pieces(opened, opened.enter_context(BagReader.of(bag)))
+
+
+class _Pieces(BytesIO):
+    """The bytes that were written since the last `take`; `tell` counts all bytes of the file."""
+
+    _taken = 0
+
+    def tell(self) -> int:
+        return self._taken + super().tell()
+
+    def take(self) -> bytes:
+        piece = self.getvalue()
+        self._taken += len(piece)
+        self.seek(0)
+        self.truncate()
+        return piece
+
+
+def _pieces(opened: ExitStack, reader: BagReader) -> Iterator[bytes]:
+    with opened:
+        output = _Pieces()
+        writer = Writer(output, compression=CompressionType.NONE, enable_crcs=False)
+        writer.start("ros1", "rosrv")
+        schemas: dict[tuple[str, str], int] = {}
+        channels: dict[int, int] = {}
+        counts: Counter[int] = Counter()
+        for place, connection in reader.messages(reader.connections.keys()):
+            if connection not in channels:
+                channels[connection] = _channel(writer, reader.connections[connection], schemas)
+            time, data = place.time, reader.body(place, _LONGEST)[1]
+            writer.add_message(channels[connection], time, data, time, counts[connection] & 0xFFFFFFFF)
+            counts[connection] += 1
+            if piece := output.take():
+                yield piece
+        writer.finish()  # type: ignore[no-untyped-call]  # the library does not annotate it
+        yield output.take()
+
+
+def _channel(writer: Writer, header: Mapping[str, str], schemas: dict[tuple[str, str], int]) -> int:
+    """Describe a connection; return the number of its channel."""
+    name, text = header["type"], header["message_definition"]
+    if (name, text) not in schemas:
+        schemas[name, text] = writer.register_schema(_text(name), "ros1msg", _text(text).encode())
+    sender = {"latching": "0"} | {key: _text(header[key]) for key in _OF_SENDER if key in header}
+    return writer.register_channel(_text(header["topic"]), "ros1", schemas[name, text], sender)
+
+
+def _text(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()

@@ -1,0 +1,90 @@
+"""Run the recorder process: its lifeline, its link to control, and a thread that does the work.
+
+The process has no network. It reads the relays' memory and the audit log, and writes recordings. The recorder outlives
+control; without control, its reports wait in the recording store.
+"""
+
+import asyncio
+import mmap
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+from appliance.base.age_clock import AgeClock
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.recorder.recorder import Recorder
+from appliance.features.recorder.recording_store import RecordingStore
+
+_DAY = 86_400.0
+
+
+def main(lifeline_fd: int, config: Path) -> None:
+    """Record until the supervisor ends it."""
+    asyncio.run(_Process(load_resolved(config), lifeline_fd).run())
+
+
+class _Process:
+    """Connects the supervisor, control and the recorder's work."""
+
+    def __init__(self, settings: Settings, lifeline_fd: int) -> None:
+        self._settings = settings
+        self._child = Child(
+            Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline),
+            messages.RecorderLink,
+            said=self._hear,
+            linked=lambda: self._hear(messages.RecordingsAsked()),
+            ring_given=self._ring_given,
+        )
+        self._rings: dict[int, memoryview] = {}
+        self._memory = 0
+        self._said: list[Any] = []
+        self._wake = asyncio.Event()
+
+    async def run(self) -> None:
+        self._child.attach(messages.Ready())
+        ended = asyncio.ensure_future(self._child.ended.wait())
+        recorder: Recorder | None = None
+        while not ended.done():
+            if len(self._rings) == self._settings.relays:
+                if recorder is None:
+                    recorder = await asyncio.to_thread(self._make_recorder)
+                said, self._said = self._said, []
+                for message in await asyncio.to_thread(recorder.step, said):
+                    self._child.tell(message)
+            woken = asyncio.ensure_future(self._wake.wait())
+            pause = recorder.pause if recorder is not None else None
+            await asyncio.wait((ended, woken), timeout=pause, return_when=asyncio.FIRST_COMPLETED)
+            woken.cancel()
+            self._wake.clear()
+        if recorder is not None:
+            recorder.close()
+
+    def _make_recorder(self) -> Recorder:
+        settings, rules = self._settings, self._settings.recorder
+        return Recorder(
+            rules,
+            RecordingStore(
+                Path.cwd(),
+                disk=int(rules.disk),
+                seconds=None if rules.days is None else rules.days * _DAY,
+                clock=AgeClock(Path.cwd() / "age"),
+            ),
+            settings.state / "control" / "audit.db",
+            [ring for _index, ring in sorted(self._rings.items())],
+            memory=self._memory,
+            reserve=int(settings.audit.reserve_bytes),
+        )
+
+    def _hear(self, message: Any) -> None:
+        self._said.append(message)
+        self._wake.set()
+
+    def _ring_given(self, given: messages.RingGiven, descriptor: int) -> None:
+        self._rings[given.index] = memoryview(mmap.mmap(descriptor, 0, prot=mmap.PROT_READ))
+        self._memory = max(self._memory, given.since)
+        os.close(descriptor)
+        self._wake.set()

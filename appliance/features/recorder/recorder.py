@@ -1,0 +1,404 @@
+"""Follow the audit log, and make a recording of the relays' memory when a record is a trigger.
+
+`step` does all work that is due and returns the messages for control. This module never waits and uses no socket.
+
+Invariants:
+
+1. Each host has one recording at a time (`recording_plan`). A trigger during the recording extends it, up to `longest`;
+   a later trigger begins another recording. Control plans the recording, and the trigger's audit record names it.
+2. Recordings never exceed their part of the disk, and never use space that is reserved for the audit log.
+3. After a crash, the next recorder finishes each recording: completely if the memory still exists, otherwise as far as
+   it was written. The recording's description reports what is missing.
+"""
+
+import shutil
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.audit.log.ids import IdSource
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import Follower, export, search
+from appliance.base import clock
+from appliance.channel import messages
+from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
+from appliance.features.recorder.recording_answers import Recording, Trigger
+from appliance.features.recorder.recording_plan import KEPT, HourlyLimit, recording_owner, span
+from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
+from appliance.features.recorder.triggers import trigger_of
+
+SETTLE_SECONDS = 0.5
+"""The wait after a recording's end for messages and audit records that arrive late."""
+
+_IDLE_SECONDS, _BUSY_SECONDS = 0.5, 0.25
+_PAGES = 20  # pages of the log in one step
+_MOST_RECORDS = 200_000  # records of the log in one recording
+_SECOND = 1_000_000_000
+_TELL_AGAIN = 600 * _SECOND
+_MOST_TOLD = 4096
+_log = structlog.get_logger()
+
+
+class Recorder:
+    """The flight recorder: records `rings` (created at the time `memory`) when the audit log at `log` has a trigger.
+
+    Times are nanoseconds since the epoch; `reserve` bytes of the disk stay free.
+    """
+
+    def __init__(
+        self,
+        rules: RecorderRules,
+        store: RecordingStore,
+        log: Path,
+        rings: Sequence[memoryview],
+        *,
+        memory: int,
+        reserve: int,
+        clock: Callable[[], int] = clock.wall_ns,
+    ) -> None:
+        self._rules = rules
+        self._store = store
+        self._log = log
+        self._rings = rings
+        self._memory = memory
+        self._reserve = reserve
+        self._clock = clock
+        self._ids = IdSource(clock=clock)
+        self._limit = HourlyLimit(rules.per_hour, store.recordings)
+        self._follower: Follower | None = None
+        self._making: list[RecordingInProgress] = []
+        self._revisions = messages.RevisionsStated(0, 0)
+        self._asked_for: set[str] = set()  # ids of recordings that wait for the revisions in force
+        self._told: dict[tuple[str, str], int] = {}  # when a trigger without a recording was last reported
+        self._answers: list[messages.Message] = []
+        self._take_up()
+
+    def step(self, said: Iterable[Any] = ()) -> list[messages.Message]:
+        """Carry out control's messages, follow the log, and continue recordings; return the messages for control."""
+        for message in said:
+            try:
+                self._obey(message)
+            except OSError as error:
+                _log.error("control's request failed", order=type(message).__name__, reason=str(error))
+        try:
+            for trigger, planned in self._new_triggers():
+                self._triggered(trigger, planned)
+        except LogUnreadableError as error:
+            _log.error("cannot read the audit log; retrying", reason=str(error))
+        for making in tuple(self._making):
+            try:
+                self._go_on(making)
+            except OSError as error:
+                self._give_up(making, error)
+        self._remove_outdated()
+        answers, self._answers = self._answers, []
+        return answers
+
+    def close(self) -> None:
+        """Leave unfinished recordings to the next recorder."""
+        for making in self._making:
+            making.leave()
+
+    @property
+    def pause(self) -> float:
+        """Return the seconds until the next step is due."""
+        return _BUSY_SECONDS if self._making else _IDLE_SECONDS
+
+    # --- messages of control ------------------------------------------------------------------------------
+
+    def _obey(self, message: Any) -> None:
+        match message:
+            case messages.RecordingsAsked():
+                making = [making.opened for making in self._making]
+                self._answers.append(messages.RecordingsStated(list(self._store.recordings), making))
+                self._answers += [messages.RecordingClosed(found) for found in self._store.unnoted()]
+                self._answers += [messages.RecordingRemoved(0, *removed) for removed in self._store.removed()]
+                self._answers.append(messages.RevisionsWanted())
+            case messages.RevisionsStated():
+                self._revisions = message
+            case messages.RecordingNoted(recording_id):
+                self._store.note(recording_id)
+            case messages.RecordingRequested():
+                self._order(message)
+            case messages.MemoryWanted():
+                self._record_temporarily(message)
+            case messages.RecordingRemovalWanted(number, recording_id, who):
+                self._remove(number, recording_id, who)
+
+    def _order(self, wanted: messages.RecordingRequested) -> None:
+        making, why_not = self._record(wanted.trigger, wanted.before, wanted.after)
+        if making is None:
+            self._answers.append(messages.RecordingRefused(wanted.number, why_not))
+            if wanted.trigger.what == "service":  # a node may ignore the refusal, so it is also recorded
+                self._missed(wanted.trigger, why_not)
+        else:
+            progress = making.progress
+            self._answers.append(
+                messages.RecordingStarted(wanted.number, progress.id, progress.ends, progress.began)
+            )
+
+    def _record_temporarily(self, wanted: messages.MemoryWanted) -> None:
+        now = self._clock()
+        since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
+        until = min(wanted.until, now)
+        if since > until:
+            reason = f"the memory has the last {self._rules.before:g} seconds, and none of that period"
+            self._answers.append(messages.RecordingRefused(wanted.number, reason, unknown=True))
+            return
+        if self._store.free < 2 * self._reserve + self._store.largest:
+            self._answers.append(messages.RecordingRefused(wanted.number, "the disk is nearly full"))
+            return
+        progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
+        try:
+            if not self._store.has_temporary_room(now):
+                reason = f"{MOST_TEMPORARY} requests came within seconds: try again in half a minute"
+                self._answers.append(messages.RecordingRefused(wanted.number, reason))
+                return
+            self._store.mark_temporary(progress.id)
+            temporary = self._in_progress(progress)
+            try:
+                temporary.step()
+                recording = temporary.finish((), self._revisions)
+            finally:
+                temporary.leave()
+            self._store.publish_temporary(recording)
+        except OSError as error:
+            self._store.discard_part(progress.id)
+            self._answers.append(messages.RecordingRefused(wanted.number, str(error)))
+        else:
+            self._answers.append(messages.MemoryLent(wanted.number, recording))
+
+    def _remove(self, number: int, recording_id: str, who: str) -> None:
+        recording = self._store.find(recording_id)
+        if recording is None:
+            refused = messages.RecordingRefused(
+                number, f"recording {recording_id} does not exist", unknown=True
+            )
+            self._answers.append(refused)
+            return
+        try:
+            self._store.remove(recording, who, "")
+        except OSError as error:
+            self._answers.append(messages.RecordingRefused(number, str(error)))
+        else:
+            self._answers.append(messages.RecordingRemoved(number, recording, who, ""))
+
+    # --- triggers -----------------------------------------------------------------------------------------
+
+    def _new_triggers(self) -> list[tuple[Trigger, str]]:
+        """Return the new triggers, each with the id of the recording that control has planned (empty: none)."""
+        follower = self._follower or self._begin_to_follow()
+        found: list[tuple[Trigger, str]] = []
+        for _page in range(_PAGES):
+            entries = follower.poll()
+            if not entries:
+                break
+            for record in (entry.record for entry in entries):
+                trigger = trigger_of(record, self._rules.triggers)
+                if trigger is None:
+                    continue
+                if "not_recorded" in record.detail:
+                    self._missed(trigger, str(record.detail["not_recorded"]))
+                else:
+                    found.append((trigger, str(record.detail.get("recording", ""))))
+        return found
+
+    def _begin_to_follow(self) -> Follower:
+        """Follow the log from the start of the memory: an earlier recorder may not have read the log since then."""
+        since = max(self._memory, self._clock() - int(self._rules.before * _SECOND))
+        first = search(self._log, Filter(since=since), "0", 1, newest_first=False).entries
+        self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
+        return self._follower
+
+    def _triggered(self, trigger: Trigger, planned: str) -> None:
+        if planned and self._store.knows(planned):
+            kept = self._store.find(planned)
+            if kept is not None and trigger.time > kept.ended:
+                self._missed(
+                    trigger, f"recording {planned} had ended: {kept.why_not or 'its time expired'}", planned
+                )
+            return
+        if any(
+            recording_owner(kept.charged_to) == recording_owner(trigger.charged_to)
+            and kept.began <= trigger.time <= kept.ended
+            for kept in self._store.recordings
+        ):
+            return
+        making, why_not = self._record(trigger, planned=planned)
+        if making is None:
+            self._missed(trigger, why_not, planned)
+
+    def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
+        """Report that a trigger made no recording; if none was planned, repeat the report only every ten minutes."""
+        now, kind = self._clock(), (trigger.charged_to, trigger.what)
+        if (
+            planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
+        ):  # `abs`, because the clock may have been set back
+            if len(self._told) > _MOST_TOLD:
+                self._told.clear()
+            self._told[kind] = now
+            self._answers.append(messages.RecordingMissed(trigger, why, planned))
+
+    def _record(
+        self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
+    ) -> tuple[RecordingInProgress | None, str]:
+        """Extend or begin a recording for a trigger; return it, or None and the reason."""
+        charged_to, now = trigger.charged_to, trigger.time
+        for making in tuple(self._making):
+            progress = making.progress
+            if recording_owner(progress.charged_to) == recording_owner(charged_to):
+                if now <= progress.ends:
+                    _prolong(progress, trigger, after)
+                    return making, ""
+                try:
+                    self._close(making)
+                except OSError as error:
+                    self._give_up(making, error)
+        if self._store.free < 2 * self._reserve + self._store.largest:
+            return None, "the disk is nearly full"
+        if (
+            not planned
+            and trigger.what != "order"
+            and not self._limit.take(charged_to, trigger.what, self._clock())
+        ):
+            return None, self._limit.refusal(charged_to)
+        why_not = self._make_room(charged_to)
+        if why_not:
+            return None, why_not
+        own = [
+            kept.ended
+            for kept in self._store.recordings
+            if recording_owner(kept.charged_to) == recording_owner(charged_to)
+        ]
+        ended = max(own, default=0)
+        times = span(self._rules, now, ended, before, after)
+        began = (
+            max(self._memory, times.began) if self._memory <= now else times.began
+        )  # otherwise the clock was set back since
+        latest = began + int(self._rules.longest * _SECOND)
+        progress = Progress(
+            planned or self._ids.next(), self._memory, began, min(times.ends, latest), [trigger],
+            charged_to=charged_to, hold=times.hold, latest=latest,
+        )  # fmt: skip
+        try:
+            making = self._in_progress(progress)
+        except OSError as error:
+            self._store.discard_part(progress.id)
+            return None, str(error)
+        self._making.append(making)
+        self._answers += [messages.RecordingOpened(making.opened), messages.RevisionsWanted()]
+        _log.info("a recording begins", recording=progress.id, trigger=trigger.what, charged_to=charged_to)
+        return making, ""
+
+    def _in_progress(self, progress: Progress) -> RecordingInProgress:
+        folder = self._store.part(progress.id)
+        return RecordingInProgress(folder, progress, self._rings, largest=self._store.largest)
+
+    # --- the recording ------------------------------------------------------------------------------------
+
+    def _go_on(self, making: RecordingInProgress) -> None:
+        now, progress = self._clock(), making.progress
+        if now < progress.began:
+            progress.why_not = "the clock was set back during the recording"
+            now = progress.began
+        if now <= progress.ends:
+            making.step()
+        elif progress.id not in self._asked_for:
+            self._asked_for.add(progress.id)
+            self._answers.append(messages.RevisionsWanted())
+        if self._store.free < self._reserve:
+            progress.why_not = "the disk was nearly full"
+        if progress.why_not:
+            progress.ends = min(now, progress.ends)
+        if progress.why_not or now >= progress.ends + int(SETTLE_SECONDS * _SECOND):
+            self._close(making)
+
+    def _close(self, making: RecordingInProgress) -> None:
+        making.step()
+        self._finish(making)
+
+    def _finish(self, making: RecordingInProgress) -> None:
+        progress = making.progress
+        within = Filter(since=progress.began, until=progress.ends + 1)
+        try:
+            records = list(islice(export(self._log, within), _MOST_RECORDS))
+        except LogUnreadableError as error:
+            records = []
+            progress.why_not = progress.why_not or f"the audit log could not be read: {error}"
+        recording = making.finish(records, self._revisions)
+        self._forget(making)
+        self._store.keep(recording)
+        self._answers.append(messages.RecordingClosed(recording))
+        _log.info("a recording is closed", recording=recording.id, size=recording.size)
+
+    def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
+        _log.error("a recording cannot be written", reason=str(error))
+        making.leave()
+        progress = making.progress
+        self._store.discard_part(progress.id)
+        self._forget(making)
+        self._answers.append(messages.RecordingMissed(progress.triggers[0], str(error), progress.id))
+
+    def _forget(self, making: RecordingInProgress) -> None:
+        self._making = [other for other in self._making if other is not making]
+        self._asked_for.discard(making.progress.id)
+
+    def _take_up(self) -> None:
+        """Continue or finish the recordings that an earlier recorder began; discard those without readable progress."""
+        for folder in self._store.parts():
+            try:
+                progress = load_progress(folder)
+            except (OSError, ValueError):
+                _log.warning("an unfinished recording is removed", folder=folder.name)
+                shutil.rmtree(folder)
+                continue
+            try:
+                if progress.memory == self._memory:
+                    self._making.append(self._in_progress(progress))
+                    _log.warning("an unfinished recording continues", recording=progress.id)
+                    continue
+                progress.why_not = "the appliance stopped during the recording"
+                _log.warning("an unfinished recording is closed without its end", recording=progress.id)
+                self._finish(RecordingInProgress(folder, progress, (), largest=self._store.largest))
+            except OSError as error:
+                _log.error("it cannot be closed; the next start retries", reason=str(error))
+
+    def _remove_outdated(self) -> None:
+        try:
+            for recording, reason in self._store.outdated(self._clock()):
+                self._remove_for(recording, reason)
+        except OSError as error:
+            _log.error("a recording cannot be removed", reason=str(error))
+
+    def _make_room(self, charged_to: str) -> str:
+        """Remove recordings until a new one of this host fits; return the reason if it cannot, else an empty string."""
+        while True:
+            try:
+                found, why = self._store.in_the_way(
+                    charged_to, [making.progress.charged_to for making in self._making]
+                )
+                if found is None:
+                    return why
+                self._remove_for(found, why)
+            except OSError as error:
+                return str(error)
+
+    def _remove_for(self, recording: Recording, reason: str) -> None:
+        self._store.remove(recording, "", reason)
+        self._answers.append(messages.RecordingRemoved(0, recording, "", reason))
+
+
+def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
+    """Add a trigger to a recording in progress, and extend the recording."""
+    hold = progress.hold if after is None else int(after * _SECOND)
+    progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
+    if trigger.charged_to in KEPT and progress.charged_to not in KEPT:
+        progress.charged_to = trigger.charged_to  # from now on not removed in favour of a host's recording
+    known = any(trigger.record == other.record for other in progress.triggers)
+    if not known and len(progress.triggers) < MOST_TRIGGERS:
+        progress.triggers.append(trigger)

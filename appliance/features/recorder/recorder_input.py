@@ -1,0 +1,133 @@
+"""Read a period from the running appliance's flight recorder: its recordings and its memory."""
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.base import clock
+from appliance.base.timestamps import parse_timestamp
+from appliance.channel import admin
+from appliance.cli.connection.admin_client import NotRunningError
+from appliance.cli.connection.target import Appliance
+from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.features.recorder.record_verbs import bag_of
+from appliance.features.recorder.recording_answers import Recording, Recordings
+from rosmop.tool.terminal import refused
+
+_SECOND = 1_000_000_000
+
+
+class Span(NamedTuple):
+    """A period in nanoseconds since the epoch, both ends included."""
+
+    since: int
+    until: int
+
+    def __str__(self) -> str:
+        seconds = (self.until - self.since) / _SECOND
+        return f"{rfc3339(self.since)} to {rfc3339(self.until)} ({seconds:.1f} s)"
+
+
+class Piece(NamedTuple):
+    """A bag of the recorder, its name, and the period to read from the bag. Periods of pieces do not overlap."""
+
+    name: str
+    bag: Path
+    span: Span
+    why_not: str
+    """Why the bag is incomplete; empty if it is complete."""
+
+
+def span_of(since: str | None, until: str | None) -> Span:
+    """Return the period of --since and --until. Exits with status 2 if it is invalid."""
+    now = clock.wall_ns()
+    try:
+        span = Span(
+            0 if since is None else parse_timestamp(since, now),
+            now if until is None else min(now, parse_timestamp(until, now)),
+        )
+    except ValueError as error:
+        raise MONITOR.usage_error(str(error)) from None
+    if span.since >= span.until:
+        raise MONITOR.usage_error("--since must be before --until")
+    return span
+
+
+def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
+    """Exit with status 2 if one of these topics (name to type) is never recorded."""
+    for topic, kind in topics.items():
+        if not any(fnmatchcase(topic, glob) for glob in known.topics):
+            raise MONITOR.usage_error(
+                f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}"
+            )
+        out = next((glob for glob in known.never for name in (topic, kind) if fnmatchcase(name, glob)), None)
+        if out is not None:
+            raise MONITOR.usage_error(f"{topic} ({kind}) is not recorded: recorder.never has {out}")
+
+
+@contextmanager
+def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
+    """Fetch the recordings of a period and the recorder's memory, oldest first. The audit log records it.
+
+    The files stay open in the block, so that a recording that is removed remains readable.
+    Exits with status 1 if nothing was recorded or the appliance rejects the request.
+    """
+    found: list[tuple[Span, Recording]] = []
+    for row in sorted(known.recordings, key=lambda row: row.began):
+        since = max(row.began, found[-1][0].until + 1 if found else span.since)
+        until = min(row.ended, span.until)
+        if since <= until:
+            found.append((Span(since, until), row))
+    memory = clock.wall_ns() - int(known.before * _SECOND)
+    missing = [gap for gap in gaps([part for part, _row in found], span) if gap.until > memory]
+    lent = _lent(appliance, Span(missing[0].since, span.until)) if missing else None
+    if lent is not None:
+        parts = (Span(max(gap.since, lent.began), min(gap.until, lent.ended)) for gap in missing)
+        found += [(part, lent) for part in parts if part.since <= part.until]
+    pieces: list[Piece] = []
+    with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder, ExitStack() as opened:
+        bags: dict[str, Path] = {}
+        for part, row in sorted(found, key=lambda entry: entry[0]):
+            if row.id not in bags:
+                bag = bag_of(appliance, row.id, Path(folder) / row.id)
+                try:
+                    file = opened.enter_context(bag.open("rb"))
+                except OSError as error:
+                    raise MONITOR.usage_error(f"the bag of {row.id} was removed: {error.strerror}") from None
+                bags[row.id] = Path(f"/proc/self/fd/{file.fileno()}")
+            pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
+        if not pieces:
+            text = f"there are no recordings of {span}: {_available(known.recordings)}"
+            raise refused([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
+        yield pieces
+
+
+def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
+    """Yield the periods of the span that the ordered parts do not cover."""
+    at = span.since
+    for part in parts:
+        if part.since > at:
+            yield Span(at, part.since - 1)
+        at = max(at, part.until + 1)
+    if span.until >= at:
+        yield Span(at, span.until)
+
+
+def _lent(appliance: Appliance, span: Span) -> Recording | None:
+    """Return the recorder's memory of a period as a recording, or None. Exits with status 1 for a rejected request."""
+    try:
+        answer = appliance.ask(admin.RecordingOfMemory(*span))
+    except NotRunningError as error:
+        raise MONITOR.usage_error(str(error)) from None
+    return None if answer.trouble == "unknown" else appliance.body_or_exit(answer)
+
+
+def _available(recordings: Sequence[Recording]) -> str:
+    if not recordings:
+        return "there are no recordings"
+    first, last = min(row.began for row in recordings), max(row.ended for row in recordings)
+    return f"the recordings cover {rfc3339(first)} to {rfc3339(last)}"

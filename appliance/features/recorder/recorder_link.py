@@ -1,0 +1,145 @@
+"""The recorder's links: the supervisor gives relays and recorder shared memory, and control <-> recorder."""
+
+from typing import ClassVar
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
+
+
+class RingGiven(Message):
+    """The supervisor gives relay `index` and the recorder shared memory. The relay stores received messages there.
+
+    The memory was made at `since` (nanoseconds since the epoch). The relay keeps the last `seconds` of each topic whose
+    name matches a glob of `topics`, unless its name or type matches a glob of `never`. `sums` lists the known md5sums
+    of types that match a glob of `never`. A topic that claims such a type must have its md5sum.
+    """
+
+    descriptors: ClassVar[int] = 1
+    index: int
+    since: int
+    seconds: float
+    topics: list[str]
+    never: list[str]
+    sums: dict[str, str] = msgspec.field(default_factory=dict)
+
+
+class RecordingsAsked(Message):
+    """Control asks for the list of recordings, and for a new report of each recording that it has not noted."""
+
+
+class RecordingsStated(Message):
+    """The recorder lists all kept recordings, oldest first, and those that it is making."""
+
+    recordings: list[Recording]
+    in_progress: list[OpenRecording] = msgspec.field(default_factory=list)
+
+
+class RecordingOpened(Message):
+    """The recorder began a recording."""
+
+    recording: OpenRecording
+
+
+class RevisionsWanted(Message):
+    """The recorder asks for the revisions in force."""
+
+
+class RevisionsStated(Message):
+    """Control states the revisions of policy and specifications in force."""
+
+    policy: int
+    monitors: int
+
+
+class RecordingClosed(Message):
+    """A recording is complete. The recorder repeats this report until control has noted it."""
+
+    recording: Recording
+
+
+class RecordingNoted(Message):
+    """Control has made an audit record of a recording, or of its removal."""
+
+    id: str
+
+
+class RecordingRequested(Message):
+    """Control asks for a recording from `before` seconds before the trigger to `after` seconds after it."""
+
+    number: int
+    trigger: Trigger
+    before: float
+    after: float
+
+
+class RecordingStarted(Message):
+    """The recorder began the recording `id` for request `number`. It covers `began` to `ends` (ns) or later."""
+
+    number: int
+    id: str
+    ends: int
+    began: int = 0
+
+
+class RecordingRemovalWanted(Message):
+    """Control asks to remove a recording for `who`."""
+
+    number: int
+    id: str
+    who: str
+
+
+class RecordingRemoved(Message):
+    """A recording was removed by order `number` of `who`, or because of `reason`.
+
+    The recorder repeats this report until control has noted it.
+    """
+
+    number: int
+    recording: Recording
+    who: str
+    reason: str
+
+
+class MemoryWanted(Message):
+    """Control asks for a temporary recording of the data in memory from `since` to `until` (ns)."""
+
+    number: int
+    trigger: Trigger
+    since: int
+    until: int
+
+
+class MemoryLent(Message):
+    """The data of request `number` can be read as `recording`. It expires, or is removed for later ones."""
+
+    number: int
+    recording: Recording
+
+
+class RecordingRefused(Message):
+    """Request `number` was refused; `unknown`: there is no such recording."""
+
+    number: int
+    reason: str
+    unknown: bool = False
+
+
+class RecordingMissed(Message):
+    """A trigger made no recording, for this reason. The recorder sends only some of these reports.
+
+    `planned` is the recording that the trigger's audit record promised, if any.
+    """
+
+    trigger: Trigger
+    reason: str
+    planned: str = ""
+
+
+RecorderLink = (
+    RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingOpened | RecordingClosed
+    | RecordingNoted | RecordingRequested | RecordingStarted | RecordingRemovalWanted | RecordingRemoved
+    | RecordingRefused | RecordingMissed | MemoryWanted | MemoryLent
+)  # fmt: skip

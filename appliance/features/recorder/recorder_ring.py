@@ -1,0 +1,71 @@
+"""Write messages for the flight recorder into memory that the supervisor holds."""
+
+import mmap
+import os
+from collections.abc import Callable, Mapping
+
+from appliance.base import clock
+from appliance.channel.messages import RingGiven
+from appliance.features.recorder.excluded_topics import fits, left_out_because
+from appliance.features.recorder.ring import LEFT_OUT, RingStream, RingWriter
+from appliance.quotas.table import RECORDER_MEMORY
+
+_TOPIC_SHARE = 0.25
+_STEP = 100_000_000  # nanoseconds
+_NOTHING = memoryview(b"")
+
+
+class RecorderRing:
+    """Writes to the given memory, behind the data of the previous process; takes over the descriptor.
+
+    A recorded message has the time at which monitors judged it, by their clock `now`, so that a replay judges it at the
+    same time. If the machine's clock is set, later messages have times by the new setting.
+    """
+
+    def __init__(self, given: RingGiven, descriptor: int, now: Callable[[], int]) -> None:
+        bounds = RECORDER_MEMORY.bounds
+        # Map its pages at once: otherwise the first message on each page causes a page fault.
+        memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+        self._topics, self._never, self._sums = given.topics, given.never, given.sums
+        self._now, self._set = now, 0
+        self._ring = RingWriter(
+            memoryview(memory),
+            topic_share=_TOPIC_SHARE,
+            host_share=bounds.host / bounds.whole,
+            seconds=given.seconds,
+            clock=self._clock,
+        )
+        os.close(descriptor)
+
+    def _clock(self, judged: int) -> int:
+        now = self._now()
+        ahead = clock.wall_ns() - now - self._set
+        if abs(ahead) > _STEP:
+            self._set += ahead
+        return (judged or now) + self._set
+
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> "RingStream | ExcludedStream | None":
+        """Begin to record a publisher's messages; return None if its topic is not recorded or the memory is full."""
+        if not fits(self._topics, topic):
+            return None
+        why = left_out_because(self._never, self._sums, topic, header)
+        if not why:
+            return self._ring.open(topic, host, {"message_definition": "", **header})
+        marked = self._ring.open(topic, host, {**header, "message_definition": "", LEFT_OUT: why})
+        return None if marked is None else ExcludedStream(marked)
+
+
+class ExcludedStream:
+    """A publisher's stream in which only the times of messages are recorded."""
+
+    keeps = False
+
+    def __init__(self, marked: RingStream) -> None:
+        self._marked = marked
+
+    def write(self, _frames: memoryview, _messages: int, first: int, judged: int = 0) -> None:
+        """Write a mark with the time instead of these frames."""
+        self._marked.write(_NOTHING, 0, first, judged)
+
+    def close(self) -> None:
+        self._marked.close()

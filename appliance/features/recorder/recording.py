@@ -1,0 +1,292 @@
+"""Write a recording from the memory of the relays to a bag, step by step.
+
+1. After each step, the file `progress` stores the bag's length and all data needed to continue; the file is replaced
+   atomically. A new recorder cuts the bag at that length and continues: the memory still holds the unwritten messages.
+2. Missing messages are reported: as a count by topic if the numbers of messages have a gap, otherwise in words.
+3. A bag has at most `largest` bytes, not counting the audit records.
+4. The headers of its connections have at most `_MOST_HEADERS` bytes, because publishers choose their content.
+"""
+
+import hashlib
+import os
+import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit.log.record import Severity
+from appliance.audit.log.record_format import LogEntry, as_json
+from appliance.base.atomic_files import write_whole
+from appliance.channel.messages import RevisionsStated
+from appliance.features.recorder.bag_writer import BagMessage, BagWriter
+from appliance.features.recorder.excluded_topics import NAMED
+from appliance.features.recorder.recording_answers import (
+    OPERATORS,
+    LeftOutTopic,
+    OpenRecording,
+    RecordedTopic,
+    Recording,
+    Trigger,
+)
+from appliance.features.recorder.recording_store import ABOUT, BAG, PROGRESS
+from appliance.features.recorder.ring import LEFT_OUT
+from appliance.features.recorder.ring_reader import MOST_MESSAGES, ReadPosition, RingReader, StreamFrames
+from roswire.log_message import ERROR, INFO, TYPE, WARN, log_message
+from roswire.standard import standard_definitions
+
+RECORDS, LOG = "/rosrv/records", "/rosrv/log"
+MOST_TRIGGERS = 200
+_CHUNK = 1 << 20
+_MOST_NAMED = 10
+_MOST_LEFT_OUT = 100
+_MOST_HEADERS = 8 << 20
+_LENGTH = struct.Struct("<I")
+_LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
+
+
+class TopicCount(msgspec.Struct):
+    """The numbers of written and missed messages of one topic with one type."""
+
+    topic: str
+    type: str
+    md5sum: str
+    messages: int = 0
+    bytes: int = 0
+    missed: int = 0
+
+
+class Progress(msgspec.Struct):
+    """The progress of a recording; times are nanoseconds since the epoch.
+
+    `memory` is the time when the rings were created. `size` is the length of the bag, `connections` are the headers in
+    it. For each ring, `places` has the position in each stream, and `following` the number of each stream's next
+    message. `not_there` has the counts of messages and streams that the ring had lost when the recording began.
+    """
+
+    id: str
+    memory: int
+    began: int
+    ends: int
+    triggers: list[Trigger]
+    size: int = 0
+    connections: list[dict[str, str]] = []
+    places: list[dict[int, ReadPosition]] = []
+    following: list[dict[int, int]] = []
+    not_there: list[tuple[int, int]] = []
+    topics: list[TopicCount] = []
+    torn: list[str] = []
+    unconnected: int = 0
+    """The number of messages left out because their connections' headers exceed `_MOST_HEADERS`."""
+    why_not: str = ""
+    """Why the recording ended early, or is incomplete."""
+    charged_to: str = OPERATORS
+    hold: int = 0
+    """Nanoseconds by which the recording continues after a trigger."""
+    latest: int = 0
+    """The latest time at which the recording may end."""
+    left_out: list[LeftOutTopic] = []
+    claims: int = 0
+    """The number of topics that were left out because of their publishers' claims."""
+
+
+def load_progress(folder: Path) -> Progress:
+    """Return the progress of the recording in `folder`. Raises `OSError` and `ValueError`."""
+    return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
+
+
+class RecordingInProgress:
+    """A recording of `rings` that is written to `folder` and continues from `progress`."""
+
+    def __init__(
+        self, folder: Path, progress: Progress, rings: Sequence[memoryview], *, largest: int
+    ) -> None:
+        """Open or create the bag. Raises `OSError`."""
+        folder.mkdir(mode=0o750, exist_ok=True)
+        folder.chmod(0o750)
+        self.progress = progress
+        self._folder = folder
+        self._largest = largest
+        self._bag = BagWriter(folder / BAG, dict(enumerate(progress.connections)), progress.size)
+        if self._bag.lost:
+            progress.why_not = progress.why_not or "the disk lost the last data written"
+        self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
+        self._headers = sum(map(_length, progress.connections))
+        self._left_out = set(progress.left_out)
+        self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}
+        places = progress.places or [{} for _ring in rings]
+        self._readers = [RingReader(ring, dict(read)) for ring, read in zip(rings, places, strict=False)]
+        if not progress.following:
+            progress.following = [{} for _ring in rings]
+            progress.not_there = [reader.not_there for reader in self._readers]
+
+    @property
+    def opened(self) -> OpenRecording:
+        """The recording as far as it is known before its end."""
+        progress = self.progress
+        return OpenRecording(progress.id, progress.began, progress.ends, progress.triggers[0])
+
+    def step(self) -> None:
+        """Write the new messages up to the recording's end. Raises `OSError`."""
+        progress = self.progress
+        for number, reader in enumerate(self._readers):
+            for found in reader.read(progress.began, progress.ends):
+                self._take(found, progress.following[number])
+        progress.places = [reader.places for reader in self._readers]
+        new = self._folder / f"{PROGRESS}.new"
+        new.write_bytes(msgspec.msgpack.encode(progress))
+        new.replace(self._folder / PROGRESS)
+
+    def _take(self, found: StreamFrames, following: dict[int, int]) -> None:
+        progress, header = self.progress, found.header
+        if LEFT_OUT in header:
+            self._leave_out(header, seen=bool(found.batches))
+            return
+        if found.torn and found.stream not in following and header["topic"] not in progress.torn:
+            progress.torn.append(header["topic"])
+        if not found.batches:
+            return
+        if _key(header) not in self._numbers and self._headers + _length(header) > _MOST_HEADERS:
+            progress.unconnected += sum(len(batch.frames) for batch in found.batches)
+            return
+        connection = self._connection(header)
+        row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
+        if row is None:
+            row = self._topics[kind] = TopicCount(*kind)
+            progress.topics.append(row)
+        waiting: list[BagMessage] = []
+        size = 0
+        for batch in found.batches:
+            gap = max(0, batch.first - following.get(found.stream, batch.first))
+            row.missed = min(row.missed + gap, MOST_MESSAGES)
+            following[found.stream] = batch.first + len(batch.frames)
+            if progress.size + size + self._headers > self._largest:
+                progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
+                row.missed += len(batch.frames)
+                continue
+            for frame in batch.frames:
+                waiting.append(BagMessage(connection, batch.time, frame))
+                size += len(frame)
+            row.messages += len(batch.frames)
+            if size > _CHUNK:
+                progress.size = self._bag.write(waiting)
+                row.bytes, waiting, size = row.bytes + size, [], 0
+        progress.size = self._bag.write(waiting)
+        row.bytes += size
+
+    def _leave_out(self, header: dict[str, str], *, seen: bool) -> None:
+        """Note, once, a publisher whose messages are not recorded, if it sent any."""
+        progress = self.progress
+        row = LeftOutTopic(header["topic"], header["type"], header.get("host", ""), header[LEFT_OUT])
+        if seen and row not in self._left_out:
+            self._left_out.add(row)
+            progress.claims += row.why != NAMED
+            if len(progress.left_out) < _MOST_LEFT_OUT:
+                progress.left_out.append(row)
+
+    def _connection(self, header: dict[str, str]) -> int:
+        number = self._numbers.get(_key(header))
+        if number is None:
+            number = self._numbers[_key(header)] = self._bag.connect(header)
+            self.progress.connections.append(dict(header))
+            self._headers += _length(header)
+        return number
+
+    def leave(self) -> None:
+        """Stop, and keep the files for the next recorder."""
+        self._bag.leave()
+
+    def finish(self, records: Iterable[LogEntry], revisions: RevisionsStated) -> Recording:
+        """Close the bag with its audit records, write the description to disk and return it. Raises `OSError`."""
+        progress = self.progress
+        self._write_records(records)
+        self._bag.close()
+        bag = self._folder / BAG
+        with bag.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            os.fchmod(file.fileno(), 0o640)
+            os.fsync(file.fileno())
+        why_not = self._missing()
+        recording = Recording(
+            id=progress.id,
+            began=progress.began,
+            ended=progress.ends,
+            triggers=progress.triggers,
+            topics=[RecordedTopic(**msgspec.structs.asdict(row)) for row in progress.topics],
+            policy=revisions.policy,
+            monitors=revisions.monitors,
+            size=bag.stat().st_size,
+            sha256=sha256,
+            complete=not why_not,
+            why_not=why_not,
+            left_out=progress.left_out,
+            charged_to=progress.charged_to,
+        )
+        about = msgspec.json.format(msgspec.json.encode(recording)) + b"\n"
+        write_whole(self._folder / ABOUT, about, 0o640)
+        return recording
+
+    def _missing(self) -> str:
+        """Return which messages are missing in the bag, and why; empty if it is complete."""
+        progress = self.progress
+        reasons = [progress.why_not] if progress.why_not else []
+        missed = sum(row.missed for row in progress.topics)
+        if missed:
+            reasons.append(f"{missed} messages did not fit (see topics)")
+        if progress.unconnected:
+            reasons.append(f"{progress.unconnected} messages of too many different connections")
+        if progress.claims:
+            claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MOST_NAMED]
+            named = ", ".join(claims) + (" and others" if progress.claims > len(claims) else "")
+            reasons.append(f"left out because of the publisher's type (recorder.never): {named}")
+        if progress.torn:
+            named = ", ".join(progress.torn[:_MOST_NAMED]) + (
+                " and others" if progress.torn[_MOST_NAMED:] else ""
+            )
+            reasons.append(f"the beginning was no longer in recorder.memory: {named}")
+        for reader, (missed_before, refused_before) in zip(self._readers, progress.not_there, strict=False):
+            missed_now, refused_now = reader.not_there
+            if missed_now > missed_before:
+                reasons.append(f"{missed_now - missed_before} messages were too long for recorder.memory")
+            if refused_now > refused_before:
+                reasons.append(f"{refused_now - refused_before} connections did not fit in recorder.memory")
+        return "; ".join(reasons)
+
+    def _write_records(self, records: Iterable[LogEntry]) -> None:
+        """Write audit records, each as JSON and as a log message for rqt_console."""
+        definitions = standard_definitions()
+        numbers = {
+            topic: self._connection({
+                "topic": topic,
+                "type": kind,
+                "md5sum": definitions.md5sum(kind),
+                "message_definition": definitions.full_text(kind),
+                "callerid": "/rosrv",
+                "latching": "0",
+            })
+            for topic, kind in ((RECORDS, "std_msgs/String"), (LOG, TYPE))
+        }  # fmt: skip
+        waiting: list[BagMessage] = []
+        for entry in records:
+            record = entry.record
+            line = as_json(entry).encode()
+            waiting.append(BagMessage(numbers[RECORDS], record.time, _LENGTH.pack(len(line)) + line))
+            text = f"{record.event}: {record.reason}" if record.reason else record.event
+            level = _LEVELS.get(record.severity, INFO)
+            file, function = record.resource or "", record.caller_id or ""
+            said = log_message(
+                entry.sequence, record.time, level, "/rosrv", text, file=file, function=function
+            )
+            waiting.append(BagMessage(numbers[LOG], record.time, said))
+            if len(waiting) >= _CHUNK >> 9:
+                self._bag.write(waiting)
+                waiting = []
+        self._bag.write(waiting)
+
+
+def _length(header: dict[str, str]) -> int:
+    return sum(len(name) + len(value.encode()) for name, value in header.items())
+
+
+def _key(header: dict[str, str]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted(header.items()))

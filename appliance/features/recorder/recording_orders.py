@@ -1,0 +1,295 @@
+"""Pass operators' orders to the flight recorder. Record these orders and the recorder's reports in the audit log."""
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, TypeVar
+
+from msgspec.structs import replace
+
+from appliance.audit.log.record_format import rfc3339
+from appliance.base import clock
+from appliance.channel import admin, messages
+from appliance.channel.answers.status import RecorderState
+from appliance.channel.channel import ChannelClosedError, ChannelFullError
+from appliance.channel.link import Link
+from appliance.configuration.settings import RecorderRules
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.recorder.recording_answers import (
+    OPERATORS,
+    OpenRecording,
+    Recording,
+    RecordingBegun,
+    Recordings,
+    Trigger,
+    TriggerKind,
+)
+from appliance.features.recorder.recording_plan import RecordingPlan
+from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.telemetry.audit_trail import AuditTrail
+
+_PATIENCE_SECONDS = 10.0
+_LONGEST_NOTE = 300
+_MOST_TOPICS = 20
+_LONGEST_NAME = 500
+_M = TypeVar("_M", messages.RecordingStarted, messages.RecordingRemoved, messages.MemoryLent)
+
+
+class RecorderAwayError(Exception):
+    """The recorder is not running, or cannot carry out the order."""
+
+
+class RecordingOrders:
+    """The link to the recorder. Its methods raise `RecorderAwayError`, `UnknownThingError` and `SenselessError`.
+
+    `in_force()` returns the revisions of policy and specifications in force. `plan` finds the recording that covers an
+    event.
+    """
+
+    def __init__(
+        self,
+        rules: RecorderRules,
+        trail: AuditTrail,
+        in_force: Callable[[], messages.RevisionsStated],
+        plan: RecordingPlan,
+    ) -> None:
+        self._rules = rules
+        self._plan = plan
+        self._trail = trail
+        self._in_force = in_force
+        self.link = Link(self._heard)
+        self._kept: dict[str, Recording] = {}
+        self._lent: dict[str, Recording] = {}  # temporary recordings of the data in memory
+        self._open: dict[str, OpenRecording] = {}
+        self._notes: set[asyncio.Future[None]] = set()
+
+    def state(self) -> RecorderState | None:
+        """Return the state for `rosrv status` and the metrics; None if the recorder is off."""
+        if not self._rules.enabled:
+            return None
+        sizes = [recording.size for recording in self._kept.values()]
+        return RecorderState(self.link.channel is not None, len(sizes), sum(sizes), len(self._open))
+
+    # --- what operators ask -------------------------------------------------------------------------------
+
+    async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
+        """Return the kept recordings, oldest first."""
+        self._require()
+        rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
+        in_progress = [
+            replace(recording, ends=self._plan.end_of(recording.id) or recording.ends)
+            for recording in self._open.values()
+        ]
+        return Recordings(kept, list(rules.topics), list(rules.never), rules.before, in_progress)
+
+    async def recording(self, request: admin.RecordingWanted) -> Recording:
+        self._require()
+        return self._find(request.id)
+
+    async def now(self, request: admin.RecordNow, who: str) -> RecordingBegun:
+        """Begin a recording now, without a trigger."""
+        self._require()
+        before = self._rules.before if request.before is None else request.before
+        after = self._rules.after if request.after is None else request.after
+        if not 0 <= before <= self._rules.longest or not 0 < after <= self._rules.longest:
+            raise SenselessError(
+                f"before must be 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
+            )
+        text = f"{who}: {request.note}" if request.note else who
+        begun = await self._begin("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
+        return RecordingBegun(begun.id, begun.ends)
+
+    async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
+        """Begin a recording for a node's service call. Answer with its id, or the reason if none was begun."""
+        try:
+            self._require()
+            text = f"{call.caller_id} of {call.host} called {call.service}"
+            span = self._rules.before, self._rules.after
+            caller = {
+                "host": call.host,
+                "caller_id": call.caller_id,
+                "category": "call",
+                "resource": call.service,
+            }
+            reason = f"by a call of {call.service}"
+            begun = await self._begin("service", reason, text, call.caller_id, span, **caller)
+        except (RecorderAwayError, UnknownThingError) as error:
+            return messages.OwnServiceAnswered(call.number, False, str(error))
+        return messages.OwnServiceAnswered(call.number, True, begun.id)
+
+    async def _begin(
+        self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
+    ) -> messages.RecordingStarted:
+        """Record who ordered a recording, then begin it. `span` is the number of seconds before and after now."""
+        before, after = span
+        record = self._trail.happened(
+            "recording ordered", reason, who=who, before=before, after=after, **caller
+        )
+        charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
+        trigger = Trigger(clock.wall_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
+        begun = await self._ask(
+            lambda number: messages.RecordingRequested(number, trigger, before, after),
+            messages.RecordingStarted,
+        )
+        self._plan.opened(charged_to, begun.id, begun.began, begun.ends)
+        return begun
+
+    async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
+        """Record who fetches a recording. The api reads its messages from the disk."""
+        return await self._given_out(request.id, "recording fetched", f"by {who}", who)
+
+    async def read(self, request: admin.RecordingRead, who: str) -> Recording:
+        """Record who reads messages of a recording. Repetitions within a few seconds are only counted."""
+        topics = request.topics
+        if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
+            raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
+        reason = f"messages of {', '.join(topics) or 'all topics'}, by {who}"
+        return await self._given_out(request.id, "recording read", reason, who, reads=True, topics=topics)
+
+    async def _given_out(
+        self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any
+    ) -> Recording:
+        """Record who gets the messages of a recording, wait until the record is on disk, and return the recording."""
+        self._require()
+        recording = self._find(recording_id)
+        self._trail.happened(
+            event,
+            reason,
+            resource=recording.id,
+            reads=reads,
+            recording=recording.id,
+            sha256=recording.sha256,
+            who=who,
+            **detail,
+        )
+        failure = await self._trail.durable()
+        if failure is not None:
+            raise RecorderAwayError(f"nothing can be fetched while the order cannot be recorded: {failure}")
+        return recording
+
+    async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
+        """Make a temporary recording of the messages in memory."""
+        self._require()
+        now = clock.wall_ns()
+        since, until = request.since or 0, now if request.until is None else request.until
+        record = self._trail.happened(
+            "recording ordered",
+            f"from the messages in memory, temporary, by {who}",
+            who=who,
+            before=min(self._rules.before, max(0, now - since) / 1e9),
+            after=0.0,
+        )
+        trigger = Trigger(now, "order", record, f"{who}: from the messages in memory", OPERATORS)
+        lent = await self._ask(
+            lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
+        )
+        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_TEMPORARY:])
+        return lent.recording
+
+    async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
+        self._require()
+        removed = await self._ask(
+            lambda number: messages.RecordingRemovalWanted(number, request.id, who), messages.RecordingRemoved
+        )
+        return removed.recording
+
+    def _require(self) -> None:
+        if not self._rules.enabled:
+            raise UnknownThingError(
+                "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
+            )
+        if self.link.channel is None:
+            raise RecorderAwayError("the flight recorder is not running now")
+
+    def _find(self, recording_id: str) -> Recording:
+        known = self._kept | self._lent
+        if (ends := self._plan.end_of(recording_id)) is not None:
+            raise UnknownThingError(
+                f"recording {recording_id} is still being made: ask again after {rfc3339(ends)}, or later if"
+                " further triggers make it longer"
+            )
+        if recording_id not in known:
+            raise UnknownThingError(f"there is no recording {recording_id[:40]}")
+        return known[recording_id]
+
+    async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
+        """Send an order with a new number, and return the recorder's answer. The answer must be of this kind."""
+        try:
+            answer: _M | messages.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
+        except ChannelClosedError:
+            raise RecorderAwayError("the flight recorder ended before it answered") from None
+        except TimeoutError:
+            raise RecorderAwayError("the flight recorder did not answer") from None
+        if isinstance(answer, messages.RecordingRefused):
+            raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
+        assert isinstance(answer, kind)  # noqa: S101  the only other answer to such an order
+        return answer
+
+    # --- what the recorder says ---------------------------------------------------------------------------
+
+    def _heard(self, message: object) -> None:
+        match message:
+            case messages.RecordingsStated(recordings, in_progress):
+                self._kept = {recording.id: recording for recording in recordings}
+                self._open = {recording.id: recording for recording in in_progress}
+                self._plan.stated(recordings, in_progress)
+            case messages.RecordingOpened(recording):
+                self._open[recording.id] = recording
+            case messages.RevisionsWanted():
+                self.link.send(self._in_force())
+            case messages.RecordingClosed(recording):
+                self._open.pop(recording.id, None)
+                self._plan.closed(recording)
+                self._closed(recording)
+                self._note(recording.id)
+            case messages.RecordingMissed(trigger, reason, planned):
+                self._open.pop(planned, None)
+                about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
+                if planned:
+                    about["recording"] = planned
+                    self._plan.missed(trigger.charged_to, planned, reason, clock.wall_ns())
+                self._trail.happened("recording missed", reason, more=about)
+            case messages.RecordingRemoved(_number, recording, who, reason):
+                self._kept.pop(recording.id, None)
+                self._trail.happened(
+                    "recording removed",
+                    reason or f"by {who}",
+                    recording=recording.id,
+                    sha256=recording.sha256,
+                    who=who or "recorder",
+                )
+                self._note(recording.id)
+                self.link.answered(message.number, message)
+            case (
+                messages.RecordingStarted(number)
+                | messages.MemoryLent(number)
+                | messages.RecordingRefused(number)
+            ):
+                self.link.answered(number, message)
+
+    def _note(self, recording_id: str) -> None:
+        """Once the audit record of the recorder's report is on disk, notify the recorder."""
+
+        async def note() -> None:
+            if await self._trail.durable() is None:
+                with suppress(ChannelFullError):
+                    self.link.send(messages.RecordingNoted(recording_id))
+
+        task = asyncio.ensure_future(note())
+        self._notes.add(task)
+        task.add_done_callback(self._notes.discard)
+
+    def _closed(self, recording: Recording) -> None:
+        self._kept[recording.id] = recording
+        self._trail.happened(
+            "recording closed",
+            "complete" if recording.complete else f"not complete: {recording.why_not}",
+            recording=recording.id,
+            sha256=recording.sha256,
+            size=recording.size,
+            began=recording.began,
+            ended=recording.ended,
+            complete=recording.complete,
+            charged_to=recording.charged_to,
+            triggers=[f"{trigger.what} {trigger.record}" for trigger in recording.triggers],
+        )

@@ -1,0 +1,206 @@
+"""Plan which recording an *act* (an audited event that triggers recordings) begins or extends, and who is charged. No
+I/O.
+
+Times are nanoseconds since the epoch.
+
+The control process makes the plan together with the audit record of the act. So the record names the recording, or the
+reason why there is none. The recorder reads the log and carries out the plan. A recording is charged to the cause of
+its first trigger: `ROBOT`, a host or network as the policy names it, `UNKNOWN` for all other hosts together,
+`OPERATORS` for orders, or `APPLIANCE` for an act without a host (such as a monitor's timer).
+
+Invariants:
+
+1. Each host has at most one open recording; the robot, operators and the appliance share one (`recording_owner`). An
+   act during a recording extends it, up to `longest`.
+2. Each host may begin `per_hour` recordings an hour for each kind of trigger.
+3. Recordings of one host do not overlap, unless an order requests one. A recording that would overlap begins at the end
+   of the previous one, and lasts for the length of the memory after an act. Therefore recurring acts after the first
+   one share a recording.
+4. All other hosts together have at most `_MOST_AT_ONCE` open recordings.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+from appliance.audit.log.record import Severity
+from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.recording_answers import (
+    APPLIANCE,
+    OPERATORS,
+    ROBOT,
+    OpenRecording,
+    Recording,
+    TriggerKind,
+)
+from appliance.features.recorder.triggers import kinds_of
+
+KEPT = frozenset({ROBOT, OPERATORS})
+"""Recordings charged to these are never removed for another host's recording."""
+
+_OURS = KEPT | {APPLIANCE}
+_MOST_AT_ONCE = 2
+_SECOND = 1_000_000_000
+_HOUR = 3600 * _SECOND
+_MOST_HOSTS = 4096  # hosts whose last recording's end is remembered
+
+
+def recording_owner(charged_to: str) -> str:
+    """Return the owner of the open recording for an act; the robot, operators and the appliance are one owner."""
+    return ROBOT if charged_to in _OURS else charged_to
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingSpan:
+    """The period of a recording; an act extends it to `hold` nanoseconds after the act, but never beyond `latest`."""
+
+    began: int
+    ends: int
+    hold: int
+    latest: int
+
+    def prolonged(self, now: int) -> int:
+        """Return the end after an act at `now`."""
+        return max(self.ends, min(now + self.hold, self.latest))
+
+
+def span(
+    rules: RecorderRules, now: int, ended: int, before: float | None = None, after: float | None = None
+) -> RecordingSpan:
+    """Return the period of a recording for an act at `now`; the host's last recording ended at `ended`.
+
+    `before` and `after` are the seconds of an order; an order's period may overlap the last recording.
+    """
+    began = now - int((rules.before if before is None else before) * _SECOND)
+    hold = int((rules.after if after is None else after) * _SECOND)
+    if before is None and began < ended <= now:
+        began, hold = ended, max(hold, int(rules.before * _SECOND))
+    latest = began + int(rules.longest * _SECOND)
+    return RecordingSpan(began, min(now + hold, latest), hold, latest)
+
+
+class HourlyLimit:
+    """A limit of `most` recordings an hour for each host and kind of trigger."""
+
+    def __init__(self, most: int, kept: Iterable[Recording]) -> None:
+        """Count the recordings in `kept`, so that a restart does not reset the limit."""
+        self._most = most
+        self._begun: dict[tuple[str, str], deque[int]] = {}
+        for recording in kept:
+            for trigger in recording.triggers[:1]:
+                self._begun.setdefault((recording.charged_to, trigger.what), deque()).append(trigger.time)
+
+    def take(self, charged_to: str, what: TriggerKind, now: int) -> bool:
+        """Count a recording that begins now; return False if the limit does not permit it."""
+        for key, begun in list(self._begun.items()) if len(self._begun) > _MOST_HOSTS else []:
+            if begun[-1] + _HOUR <= now:
+                del self._begun[key]
+        begun = self._begun.setdefault((charged_to, what), deque())
+        while begun and not begun[0] <= now < begun[0] + _HOUR:  # drops later times: the clock was set back
+            begun.popleft()
+        if len(begun) >= self._most:
+            return False
+        begun.append(now)
+        return True
+
+    def refusal(self, charged_to: str) -> str:
+        """Return why `take` returned False."""
+        return (
+            f"{charged_to} already started {self._most} recordings of this kind this hour (recorder.per_hour)"
+        )
+
+
+class RecordingPlan:
+    """The plan: for each audit record that is a trigger, the recording, or the reason why there is none.
+
+    `charged_to(host)` returns the name that is charged for a host's acts; `new_id` returns an id for a recording.
+    """
+
+    def __init__(
+        self, rules: RecorderRules, charged_to: Callable[[str], str], new_id: Callable[[], str]
+    ) -> None:
+        self._rules = rules
+        self.charged_to = charged_to
+        self._new_id = new_id
+        self._limit = HourlyLimit(rules.per_hour, ())
+        self._open: dict[str, tuple[str, RecordingSpan]] = {}
+        self._ended: dict[str, int] = {}
+        self._obstacle = ("", 0)
+
+    def detail(
+        self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
+    ) -> dict[str, str]:
+        """Return the fields about recordings for an event's audit record; empty if it is not a trigger."""
+        wanted = [kind for kind in kinds_of(event, decision, severity) if kind in self._rules.triggers]
+        if not wanted:
+            return {}
+        if not self._rules.enabled:
+            return {"not_recorded": "the flight recorder is off (recorder.enabled)"}
+        charged_to = self.charged_to(host) if host else APPLIANCE
+        recording_id, why_not = self._take(wanted[0], charged_to, now)
+        return (
+            {"recording": recording_id, "charged_to": charged_to}
+            if recording_id
+            else {"not_recorded": why_not}
+        )
+
+    def _take(self, what: TriggerKind, charged_to: str, now: int) -> tuple[str, str]:
+        """Return the id of an act's recording, or an empty id and the reason."""
+        own = recording_owner(charged_to)
+        found = self._open.get(own)
+        if found is not None and found[1].began <= now <= found[1].ends:
+            recording_id, open_span = found
+            self._open[own] = recording_id, replace(open_span, ends=open_span.prolonged(now))
+            return recording_id, ""
+        why_not, until = self._obstacle
+        if now < until:
+            return "", why_not
+        others = [name for name, (_id, other) in self._open.items() if name != ROBOT and now <= other.ends]
+        if own != ROBOT and len(others) >= _MOST_AT_ONCE:
+            return "", f"{_MOST_AT_ONCE} recordings of other hosts are in progress"
+        if not self._limit.take(charged_to, what, now):
+            return "", self._limit.refusal(charged_to)
+        ended = found[1].ends if found is not None else self._ended.get(own, 0)
+        self._open[own] = self._new_id(), span(self._rules, now, ended)
+        return self._open[own][0], ""
+
+    # --- messages of the recorder ---
+
+    def stated(self, recordings: Iterable[Recording], in_progress: Iterable[OpenRecording]) -> None:
+        """Take the recorder's recordings into account, also after a restart of control."""
+        kept = list(recordings)
+        self._limit = HourlyLimit(self._rules.per_hour, kept)
+        for recording in kept:
+            self.closed(recording)
+        for making in in_progress:
+            if recording_owner(making.trigger.charged_to) not in self._open:
+                self.opened(making.trigger.charged_to, making.id, making.began, making.ends)
+
+    def end_of(self, recording_id: str) -> int | None:
+        """Return when an open recording ends; None if the recording is not open."""
+        return next((open_span.ends for name, open_span in self._open.values() if name == recording_id), None)
+
+    def opened(self, charged_to: str, recording_id: str, began: int, ends: int) -> None:
+        """Note a recording that the recorder began or extended for an order or a call."""
+        latest = began + int(self._rules.longest * _SECOND)
+        self._open[recording_owner(charged_to)] = (
+            recording_id,
+            RecordingSpan(began, ends, int(self._rules.after * _SECOND), latest),
+        )
+
+    def closed(self, recording: Recording) -> None:
+        """Note the end of a recording."""
+        own = recording_owner(recording.charged_to)
+        self._close(own, recording.id)
+        self._ended[own] = max(recording.ended, self._ended.pop(own, 0))
+        if len(self._ended) > _MOST_HOSTS:
+            del self._ended[next(iter(self._ended))]
+
+    def missed(self, charged_to: str, recording_id: str, why: str, now: int) -> None:
+        """Note a recording that the recorder could not make; for the next minute, acts get the same reason."""
+        self._close(recording_owner(charged_to), recording_id)
+        self._obstacle = why, now + 60 * _SECOND
+
+    def _close(self, own: str, recording_id: str) -> None:
+        if own in self._open and self._open[own][0] == recording_id:
+            del self._open[own]

@@ -1,0 +1,256 @@
+"""Store recordings (`ID/recording.bag` and `ID/recording.json`) and unfinished recordings (`.ID.part/`).
+
+A removed recording stays as `.ID.gone/`, without its bag, until its removal is in the audit log. `.ID.rest/` is
+garbage.
+
+Invariants:
+
+1. A folder is renamed to its recording's id only when its whole content is on disk, so a folder with that name is
+   complete.
+2. All recordings together never exceed `disk` bytes: before a recording begins, room for the largest possible one is
+   made. Each host other than the robot has at most a quarter of `disk`, and all of them together three quarters. Their
+   recordings never replace recordings of the robot or of operators, for whom half of `disk` is always available. The
+   first to be removed is the oldest recording of the kind of trigger that uses the most bytes. The number of
+   recordings, and the bytes of their descriptions (`_MOST_DESCRIBED`), are also limited, because the control process
+   gets all descriptions in one message.
+3. The file `noted` in a folder marks a recording that is in the audit log. Other recordings are reported again.
+4. The file `lent` in a folder marks a temporary recording, which does not count in `disk`. At most `MOST_TEMPORARY` of
+   them exist, each for up to `TEMPORARY_SECONDS`. A further temporary recording replaces the oldest, unless the oldest
+   is so new that its reader may not have opened it yet (`_OPENING_SECONDS`). A new recorder removes all temporary
+   recordings.
+5. Whenever the recorder dies, a recording either still exists, or its removal is reported: the folder is renamed
+   atomically before anything in it is removed.
+"""
+
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from appliance.features.recorder.recording_answers import Recording
+from appliance.features.recorder.recording_plan import KEPT
+
+BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
+MOST_KEPT = 500
+TEMPORARY_SECONDS = 600
+MOST_TEMPORARY = 4
+_OPENING_SECONDS = 30
+_MOST_DESCRIBED = 32 << 20
+_NOTED, _TEMPORARY, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
+_ID = re.compile(r"[0-9a-f]{20}")
+_PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
+_LARGEST = 8  # one recording may have this fraction of `disk`: an eighth
+_SECOND = 1_000_000_000
+_log = structlog.get_logger()
+
+
+class RecordingStore:
+    """The recordings in `folder`: at most `disk` bytes, each removed after `seconds` of `clock` (None: never)."""
+
+    def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
+        self._folder = folder
+        self._disk = disk
+        self._seconds = seconds
+        self._clock = clock
+        for mark in folder.glob(f"*/{_TEMPORARY}"):
+            self._discard(mark.parent)
+        for rest in self._named(_REST):
+            shutil.rmtree(rest)
+        for gone in self._named(_GONE):
+            (gone / BAG).unlink(missing_ok=True)
+        self._temporary: list[Recording] = []
+        self.recordings = sorted(self._read(), key=lambda recording: recording.id)
+        self._described = {found.id: self._length(found) for found in self.recordings}
+        self._since = {found.id: self._kept_since(found) for found in self.recordings}
+
+    def _read(self) -> Iterator[Recording]:
+        for path in self._folder.iterdir():
+            if _ID.fullmatch(path.name):
+                try:
+                    yield msgspec.json.decode((path / ABOUT).read_bytes(), type=Recording)
+                except (OSError, ValueError) as error:
+                    _log.error("a recording cannot be read", recording=path.name, error=str(error))
+
+    def _kept_since(self, recording: Recording) -> int:
+        """Return when a recording was stored, by the age clock; if that is unknown, return the recording's end."""
+        with suppress(OSError, ValueError):
+            return int((self._folder / recording.id / _SINCE).read_bytes())
+        return recording.ended
+
+    def _length(self, recording: Recording) -> int:
+        return (self._folder / recording.id / ABOUT).stat().st_size
+
+    @property
+    def largest(self) -> int:
+        """Return the bytes that one recording may have."""
+        return self._disk // _LARGEST
+
+    @property
+    def free(self) -> int:
+        """Return the free bytes on the disk."""
+        return shutil.disk_usage(self._folder).free
+
+    def part(self, recording_id: str) -> Path:
+        """Return the folder of a recording while it is being made."""
+        return self._folder / f".{recording_id}.part"
+
+    def parts(self) -> list[Path]:
+        """Return the folders of unfinished recordings, the oldest first."""
+        return self._named(_PART)
+
+    def _named(self, kind: re.Pattern[str]) -> list[Path]:
+        return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
+
+    def _discard(self, folder: Path) -> None:
+        """Remove a folder without a record in the audit log. Raises `OSError`."""
+        rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
+        folder.rename(rest)
+        shutil.rmtree(rest)
+
+    def discard_part(self, recording_id: str) -> None:
+        """Remove an unfinished recording, if there is one."""
+        with suppress(OSError):
+            self._discard(self.part(recording_id))
+
+    def keep(self, recording: Recording) -> None:
+        """Store a finished recording, which is completely on disk."""
+        kept = self._folder / recording.id
+        with suppress(OSError):  # the disk is full: the recording's age then counts from its end
+            (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
+        self.part(recording.id).rename(kept)
+        (kept / PROGRESS).unlink(missing_ok=True)
+        self._since[recording.id] = self._kept_since(recording)
+        self.recordings.append(recording)
+        self._described[recording.id] = self._length(recording)
+
+    def mark_temporary(self, recording_id: str) -> None:
+        """Mark a recording as temporary before it is made. Raises `OSError`."""
+        self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
+        (self.part(recording_id) / _TEMPORARY).touch()
+
+    def has_temporary_room(self, now: int) -> bool:
+        """Make room for a temporary recording; return False if all are too new to remove. Raises `OSError`."""
+        self._expire(now, MOST_TEMPORARY - 1, _OPENING_SECONDS)
+        return len(self._temporary) < MOST_TEMPORARY
+
+    def publish_temporary(self, recording: Recording) -> None:
+        """Publish a temporary recording for `TEMPORARY_SECONDS`, or until another replaces it. Raises `OSError`."""
+        self.part(recording.id).rename(self._folder / recording.id)
+        self._temporary.append(recording)
+
+    def _expire(self, now: int, most: int, seconds: float) -> None:
+        """Remove the oldest temporary recordings until `most` are left; keep those younger than `seconds`."""
+        while (
+            len(self._temporary) > most and abs(now - self._temporary[0].triggers[0].time) > seconds * _SECOND
+        ):
+            self._discard(self._folder / self._temporary[0].id)
+            del self._temporary[0]
+
+    def find(self, recording_id: str) -> Recording | None:
+        """Return the recording with this id; None if there is none."""
+        return next((found for found in self.recordings if found.id == recording_id), None)
+
+    def knows(self, recording_id: str) -> bool:
+        """Whether a recording with this id is stored, or its removal is not in the audit log yet."""
+        return self.find(recording_id) is not None or self._gone(recording_id).exists()
+
+    def remove(self, recording: Recording, who: str, reason: str) -> None:
+        """Remove a recording; `who` and `reason` are stored for the audit log. Raises `OSError`."""
+        kept, gone = self._folder / recording.id, self._gone(recording.id)
+        with suppress(OSError):  # the disk may be full, since recordings are then removed
+            (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
+        kept.rename(gone)
+        self.recordings.remove(recording)
+        del self._described[recording.id], self._since[recording.id]
+        (gone / BAG).unlink(missing_ok=True)
+
+    def _gone(self, recording_id: str) -> Path:
+        return self._folder / f".{recording_id}.gone"
+
+    def removed(self) -> Iterator[tuple[Recording, str, str]]:
+        """Yield recordings whose removal may not be in the audit log yet, each with the removal's author and reason."""
+        for folder in self._named(_GONE):
+            try:
+                recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
+            except (OSError, ValueError):
+                continue
+            who, reason = "", "the recorder crashed during the recording"
+            with suppress(OSError, ValueError):
+                who, reason = msgspec.json.decode((folder / _REMOVED).read_bytes(), type=tuple[str, str])
+            yield recording, who, reason
+
+    def note(self, recording_id: str) -> None:
+        """Note that a recording, or its removal, is in the audit log. Raises `OSError`."""
+        if self.find(recording_id) is not None:
+            (self._folder / recording_id / _NOTED).touch()
+        elif self._gone(recording_id).exists():
+            self._discard(self._gone(recording_id))
+
+    def unnoted(self) -> list[Recording]:
+        """Return the recordings that may not be in the audit log yet."""
+        return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
+
+    def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
+        """Remove old temporary recordings; yield other recordings that are too old, with the reason.
+
+        The caller must remove each yielded recording before continuing.
+
+        `now` is nanoseconds since the epoch. Raises `OSError`.
+        """
+        self._expire(now, 0, TEMPORARY_SECONDS)
+        while self._seconds is not None and self.recordings:
+            oldest = self.recordings[0]
+            if self._since[oldest.id] + int(self._seconds * 1e9) > self._clock():
+                break
+            yield oldest, "it is older than recorder.days"
+
+    def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
+        """Return the next recording to remove in favour of a new one of this host, and the reason.
+
+        None with a reason means that no recording may be removed; None without a reason means that there is room.
+        `making` has the hosts of the recordings in progress.
+        """
+        held = self._sizes(lambda found: found.charged_to)
+        held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})
+        guests = {name: size for name, size in held.items() if name not in KEPT}
+        kept_here = {found.charged_to for found in self.recordings}
+        if charged_to not in KEPT and held[charged_to] > self._disk // 4 and charged_to in kept_here:
+            return self._oldest({charged_to}), f"{charged_to} used its quota of recorder.disk"
+        if charged_to not in KEPT and sum(guests.values()) > self._disk * 3 // 4:
+            why = "hosts other than the robot used their quota of recorder.disk"
+        elif sum(held.values()) > self._disk:
+            why = "recorder.disk is full"
+        elif len(self.recordings) + len(making) >= MOST_KEPT:
+            why = f"the limit is {MOST_KEPT} recordings"
+        elif sum(self._described.values()) > _MOST_DESCRIBED:
+            why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
+        else:
+            return None, ""
+        others, own = kept_here - KEPT, kept_here & KEPT
+        if others and (charged_to not in KEPT or not own or sum(guests.values()) * 2 > self._disk):
+            return self._oldest({max(others, key=lambda name: held[name])}), why
+        return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
+
+    def _oldest(self, charged_to: Collection[str]) -> Recording:
+        """Return the oldest recording of these hosts, of the kind of trigger that uses the most bytes."""
+        kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
+        del kinds[""]
+        fullest = max(kinds, key=lambda kind: kinds[kind])
+        return next(
+            found for found in self.recordings if found.charged_to in charged_to and _kind(found) == fullest
+        )
+
+    def _sizes(self, of: Callable[[Recording], str]) -> Counter[str]:
+        sizes: Counter[str] = Counter()
+        for recording in self.recordings:
+            sizes[of(recording)] += recording.size
+        return sizes
+
+
+def _kind(recording: Recording) -> str:
+    return recording.triggers[0].what if recording.triggers else "order"

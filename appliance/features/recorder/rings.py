@@ -1,0 +1,68 @@
+"""Keep the memory (rings) in which relays store the last messages; the memory survives a relay.
+
+Each relay writes to its own ring. The recorder gets read-only descriptors, and no process can shrink a ring, so reading
+never fails. This module reads no messages. All memory is allocated at the start. So a lack of memory shows at the start
+and not during an incident, and a relay never waits for pages.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import ByteSize
+
+from appliance.base import clock
+from appliance.channel.messages import RingGiven
+from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.excluded_topics import known_sums
+from appliance.supervisor.errors import StartError
+
+_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+_PAGE = 4096
+
+
+class RecorderRings:
+    """One ring per relay; `rules` has their total size. Raises `StartError` (not enough memory), `OSError`."""
+
+    def __init__(self, rules: RecorderRules, relays: int) -> None:
+        if rules.memory > (left := _left()):
+            raise StartError(
+                f"recorder.memory: {ByteSize(rules.memory).human_readable()} is more than the machine's free memory "
+                f"({left.human_readable()}): set a smaller value, or stop programs that use memory"
+            )
+        size = int(rules.memory) // relays // _PAGE * _PAGE
+        since, sums = clock.wall_ns(), known_sums(rules.never)
+        self._rings: list[tuple[RingGiven, int, int]] = []  # with the writable and the read-only descriptor
+        for index in range(relays):
+            writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.fchmod(writable, 0o600)  # otherwise a reader could open the ring again for writing
+            os.posix_fallocate(writable, 0, size)
+            fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
+            readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
+            given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never), sums)
+            self._rings.append((given, writable, readable))
+
+    def messages_for(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:
+        """Yield the messages and descriptors that a process gets at its start."""
+        for given, writable, readable in self._rings:
+            if role == "recorder":
+                yield given, readable
+            elif role == "relay" and given.index == index:
+                yield given, writable
+
+    def close(self) -> None:
+        """Close all descriptors."""
+        for _given, writable, readable in self._rings:
+            os.close(writable)
+            os.close(readable)
+        self._rings.clear()
+
+
+def _left() -> ByteSize:
+    [row] = [
+        row
+        for row in Path("/proc/meminfo").read_text("ascii").splitlines()
+        if row.startswith("MemAvailable:")
+    ]
+    return ByteSize(int(row.split()[1]) << 10)

@@ -1,0 +1,510 @@
+"""The recorder on a real log and a real ring: how recordings begin, grow, end and are limited."""
+
+import hashlib
+import json
+import mmap
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rosbags.rosbag1 import Reader
+
+from appliance.channel import messages
+from appliance.configuration.settings import RecorderRules
+from appliance.features.recorder.excluded_topics import NAMED
+from appliance.features.recorder.recorder import SETTLE_SECONDS, Recorder
+from appliance.features.recorder.recorder_ring import ExcludedStream
+from appliance.features.recorder.recording import RecordingInProgress
+from appliance.features.recorder.recording_answers import Recording, Trigger
+from appliance.features.recorder.recording_store import MOST_TEMPORARY, RecordingStore
+from appliance.features.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
+from tests.support.audit import decision, settle
+from tests.support.engines import open_log
+from tests.unit.features.recorder.test_ring import HEADER, Clock, frame, opened
+
+SECOND = 1_000_000_000
+BEGAN = 1_000 * SECOND
+TEXT = (5).to_bytes(4, "little") + b"hello"
+
+
+class Scene:
+    """A relay's ring, an audit log and the recorder, with a clock that the test sets."""
+
+    def __init__(self, folder: Path, *, disk: int = 64 << 20, **rules: Any) -> None:
+        self.clock = Clock(BEGAN)
+        self.disk = disk
+        self.folder = folder / "recordings"
+        self.folder.mkdir(exist_ok=True)
+        self.log = open_log(folder / "audit.db", clock=self.clock)
+        settle(self.log)
+        self.rules = RecorderRules(**{"enabled": True, "before": 10, "after": 5, "longest": 60} | rules)
+        self.memory = memoryview(mmap.mmap(-1, SMALLEST))
+        self.born = BEGAN
+        self.writer = RingWriter(self.memory, topic_share=0.25, host_share=0.5, seconds=10, clock=self.clock)
+        self.stream = self.writer.open("/chatter", "10.0.0.1", HEADER)
+        self.said = 0
+        self.recorder = self.make_recorder()
+
+    def begin_anew(self) -> None:
+        """Start the recorder again."""
+        self.recorder.close()
+        self.recorder = self.make_recorder()
+
+    def make_recorder(self) -> Recorder:
+        """Start a recorder on the present state."""
+        store = RecordingStore(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
+        return Recorder(
+            self.rules,
+            store,
+            self.log.path,
+            [self.memory],
+            memory=self.born,
+            reserve=1 << 20,
+            clock=self.clock,
+        )
+
+    def say(self, body: bytes = TEXT) -> None:
+        """Write a message of a publisher."""
+        assert self.stream is not None
+        self.said += 1
+        self.stream.write(memoryview(frame(body)), 1, self.said)
+
+    def happen(self, event: str = "message dropped", **fields: Any) -> str:
+        """Write an audit record now; return its id."""
+        record = decision(self.log, event=event, decision=None, time=self.clock.now, **fields)
+        self.log.record(record)
+        settle(self.log)
+        return record.id
+
+    def later(self, seconds: float, *said: Any) -> list[messages.Message]:
+        """Let the time pass, then let the recorder take its next step."""
+        self.clock.now += int(seconds * SECOND)
+        return self.recorder.step(said)
+
+    def closed(self, answers: list[messages.Message]) -> list[Recording]:
+        """Return the recordings that control received."""
+        return [one.recording for one in answers if isinstance(one, messages.RecordingClosed)]
+
+    def bag(self, recording: Recording) -> list[tuple[str, int, bytes]]:
+        """Return the messages in the bag of a recording."""
+        path = self.folder / recording.id / "recording.bag"
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == recording.sha256
+        assert path.stat().st_size == recording.size
+        with Reader(path) as reader:
+            return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    """Start with a first message."""
+    scene = Scene(tmp_path)
+    scene.say()
+    yield scene
+    scene.log.close()
+
+
+def test_before_and_after(scene: Scene) -> None:
+    """The recording has the seconds before and after its record, the record as a message, and a description."""
+    scene.later(20)
+    scene.say(TEXT.replace(b"hello", b"alarm"))
+    scene.later(1)
+    where = {"host": "10.0.0.1", "caller_id": "/voice", "resource": "/chatter"}
+    dropped = scene.happen(reason="too fast", **where, detail={"monitor": "limit"})
+    assert not scene.closed(scene.later(0.2))
+    scene.say()
+    assert not scene.closed(scene.later(4.9))
+    scene.say()  # after the recording's end
+    [recording] = scene.closed(scene.later(SETTLE_SECONDS + 0.1))
+    assert recording == scene.closed(scene.later(0, messages.RecordingsAsked()))[0]
+    happened = BEGAN + 21 * SECOND
+    assert (recording.began, recording.ended) == (happened - 10 * SECOND, happened + 5 * SECOND)
+    assert (recording.complete, recording.why_not) == (True, "")
+    [trigger] = recording.triggers
+    assert trigger.equal
+    assert msgspec.structs.replace(trigger, equal="") == Trigger(
+        happened,
+        "drop",
+        dropped,
+        "message dropped: too fast",
+        monitor="limit",
+        resource="/chatter",
+        host="10.0.0.1",
+        caller_id="/voice",
+    )
+    [topic] = recording.topics
+    assert (topic.topic, topic.type, topic.messages, topic.missed) == ("/chatter", "std_msgs/String", 2, 0)
+    found = scene.bag(recording)
+    assert [data for name, _time, data in found if name == "/chatter"] == [
+        TEXT.replace(b"hello", b"alarm"),
+        TEXT,
+    ]
+    [(_name, time, record)] = [row for row in found if row[0] == "/rosrv/records"]
+    assert (time, json.loads(record[4:])["id"]) == (happened, dropped)
+    assert [time for name, time, _data in found if name == "/rosrv/log"] == [happened]
+    kept = scene.folder / recording.id
+    assert msgspec.json.decode((kept / "recording.json").read_bytes(), type=Recording) == recording
+    assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json", "since"}
+
+
+def test_a_recording_of_the_memory_is_temporary(scene: Scene) -> None:
+    """The recording has the requested time, as far as memory has it, for ten minutes or until the next recorder."""
+    trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
+
+    def asked(since: int, until: int) -> messages.Message:
+        order = msgspec.structs.replace(trigger, time=scene.clock.now)
+        [answer] = scene.later(0, messages.MemoryWanted(1, order, since, until))
+        return answer
+
+    def lent(since: int, until: int) -> Recording:
+        answer = asked(since, until)
+        assert isinstance(answer, messages.MemoryLent), answer
+        return answer.recording
+
+    def there() -> set[str]:
+        return {path.name for path in scene.folder.iterdir()}
+
+    scene.later(20)
+    scene.say(TEXT.replace(b"hello", b"alarm"))
+    scene.later(1)
+    scene.say()
+    first = lent(0, scene.clock.now)
+    assert (first.began, first.ended) == (BEGAN + 11 * SECOND, BEGAN + 21 * SECOND)  # `before` seconds
+    assert [data for _topic, _time, data in scene.bag(first)] == [TEXT.replace(b"hello", b"alarm"), TEXT]
+    second = lent(BEGAN + 21 * SECOND, scene.clock.now + SECOND)
+    assert (second.ended, len(scene.bag(second))) == (scene.clock.now, 1)
+    assert there() == {first.id, second.id}
+    [refused] = scene.later(0, messages.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
+    assert isinstance(refused, messages.RecordingRefused)
+    assert (refused.unknown, "the last 10 seconds" in refused.reason) == (True, True)
+    [stated, *_rest] = scene.later(0, messages.RecordingsAsked())
+    assert stated == messages.RecordingsStated([])
+    scene.later(601)
+    assert there() == set()
+    scene.say()
+    several = {lent(0, scene.clock.now).id for _order in range(MOST_TEMPORARY)}
+    busy = asked(0, scene.clock.now)  # a recording that a user is about to open stays
+    assert isinstance(busy, messages.RecordingRefused)
+    assert (busy.unknown, "half a minute" in busy.reason) == (False, True)
+    assert there() == several
+    scene.later(31)
+    last = lent(scene.clock.now, scene.clock.now)
+    assert (last.id in there(), len(there() & several)) == (True, MOST_TEMPORARY - 1)
+    scene.begin_anew()
+    assert there() == set()
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(
+            RecordingInProgress, "finish", lambda made, *_given: sys.exit(made.leave())
+        )  # the recorder is killed
+        lent(0, scene.clock.now)
+    assert there()
+    scene.begin_anew()
+    assert there() == set()
+    assert not scene.closed(scene.later(60))
+
+
+def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
+    """The recording is extended to the maximum length; later triggers begin another."""
+    scene.happen()
+    scene.later(0.1)
+    for _second in range(20):
+        assert not scene.closed(scene.later(4))
+        scene.happen()
+        if scene.clock.now >= BEGAN + 56 * SECOND:
+            break
+    answers = scene.later(0.1) + scene.later(10)
+    [recording] = scene.closed(answers)
+    assert recording.ended == BEGAN + 60 * SECOND
+    assert len(recording.triggers) == 15
+    scene.happen()
+    scene.later(0.1)
+    assert scene.closed(scene.later(11))[0].began == recording.ended
+
+
+def test_a_flood_of_triggers_does_not_fill_the_disk(tmp_path: Path) -> None:
+    """Each kind begins a limited number of recordings an hour; control gets one report, and orders still work."""
+    scene = Scene(tmp_path, per_hour=3)
+    told: list[messages.Message] = []
+    for _minute in range(10):
+        scene.happen()
+        told += scene.later(0.1) + scene.later(10)
+    assert len(scene.closed(told)) == 3
+    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    assert "recorder.per_hour" in missed.reason
+    scene.happen("monitor fault")
+    assert len(scene.closed(scene.later(0.1) + scene.later(10))) == 1
+    order = messages.RecordingRequested(7, Trigger(scene.clock.now, "order", "id", "somebody"), 5, 2)
+    [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingStarted)]
+    assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
+    assert scene.closed(scene.later(3))[0].id == begun.id
+    scene.log.close()
+
+
+def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
+    """Write a record for which control planned a recording."""
+    return scene.happen(detail={"recording": recording_id, "charged_to": charged_to})
+
+
+def test_a_planned_recording_is_made(scene: Scene) -> None:
+    """A recording has the id from the audit record, and includes later triggers while it is open."""
+    first = planned(scene, "a" * 20, "10.0.0.9")
+    scene.later(1)
+    second = planned(scene, "a" * 20, "10.0.0.9")
+    [recording] = scene.closed(scene.later(1) + scene.later(10))
+    assert (recording.id, recording.charged_to) == ("a" * 20, "10.0.0.9")
+    assert [trigger.record for trigger in recording.triggers] == [first, second]
+    scene.happen(detail={"not_recorded": "this hour is used up"})
+    answers = scene.later(1) + scene.later(10)
+    assert scene.closed(answers) == []
+    [missed] = [answer for answer in answers if isinstance(answer, messages.RecordingMissed)]
+    assert missed.reason == "this hour is used up"
+
+
+def test_a_guest_does_not_change_the_robots_recording(scene: Scene) -> None:
+    """Robot and guest have separate recordings at the same time, also over a restart of the recorder."""
+    planned(scene, "a" * 20, "10.0.0.9")
+    scene.later(1)
+    planned(scene, "b" * 20, "robot")
+    scene.later(1)
+    scene.begin_anew()
+    answers: list[messages.Message] = []
+    for _second in range(20):
+        planned(scene, "a" * 20, "10.0.0.9")
+        answers += scene.later(1)
+    [robot] = scene.closed(answers)
+    assert (robot.id, robot.charged_to, len(robot.triggers)) == ("b" * 20, "robot", 1)
+    assert robot.ended - robot.triggers[0].time == 5 * SECOND
+    [guest] = scene.closed(scene.later(10))
+    assert (guest.id, len(guest.triggers)) == ("a" * 20, 21)
+
+
+def test_a_recording_that_cannot_be_made_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk control learns of each missing recording."""
+    scene = Scene(tmp_path)
+    monkeypatch.setattr(RecordingStore, "free", property(lambda _self: 0))
+    for name in ("a" * 20, "b" * 20):
+        record = planned(scene, name, "robot")
+        [missed] = [one for one in scene.later(1) if isinstance(one, messages.RecordingMissed)]
+        assert (missed.planned, missed.trigger.record) == (name, record)
+        assert missed.reason == "the disk is nearly full"
+    scene.log.close()
+
+
+def test_a_flood_of_service_calls_does_not_fill_the_disk(tmp_path: Path) -> None:
+    """Service calls have an hourly limit, as triggers do: each call is answered, and control gets one report."""
+    scene = Scene(tmp_path, per_hour=2)
+    told: list[messages.Message] = []
+    for number in range(6):
+        call = messages.RecordingRequested(number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2)
+        told += scene.later(0, call) + scene.later(3)
+    begun = [answer.number for answer in told if isinstance(answer, messages.RecordingStarted)]
+    refused = [answer for answer in told if isinstance(answer, messages.RecordingRefused)]
+    assert (begun, [answer.number for answer in refused]) == ([0, 1], [2, 3, 4, 5])
+    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    assert missed.reason == refused[0].reason
+    assert "recorder.per_hour" in missed.reason
+    assert len(scene.closed(told)) == 2
+    scene.log.close()
+
+
+def test_a_recording_has_at_most_an_eighth_of_the_disk(tmp_path: Path) -> None:
+    """Messages beyond an eighth of the disk are counted, and the recording says why it ended."""
+    scene = Scene(tmp_path, disk=8 * 100_000)
+    scene.happen()
+    for _message in range(12):
+        scene.say(bytes(20_000))
+    [recording] = scene.closed(scene.later(0.1))
+    assert recording.ended == scene.clock.now
+    [topic] = recording.topics
+    assert (topic.messages + topic.missed, topic.missed > 0) == (12, True)
+    assert "an eighth of recorder.disk" in recording.why_not
+    assert not recording.complete
+    scene.log.close()
+
+
+def test_excluded_topics_are_listed_with_the_reason(scene: Scene) -> None:
+    """The configuration may exclude a topic; one that only claims an excluded type makes a recording incomplete."""
+    named = scene.writer.open("/camera", "10.0.0.1", HEADER | {LEFT_OUT: NAMED})
+    assert named is not None
+    ExcludedStream(named).write(memoryview(frame(TEXT)), 1, 1)
+    scene.happen()
+    assert not scene.closed(scene.later(1))
+    [recording] = scene.closed(scene.later(10))
+    assert recording.complete
+    assert [(row.topic, row.host, row.why) for row in recording.left_out] == [("/camera", "10.0.0.1", NAMED)]
+    claimed = scene.writer.open("/front", "10.0.0.9", HEADER | {LEFT_OUT: "its publisher says so"})
+    assert claimed is not None
+    for number in range(1, 4):
+        ExcludedStream(claimed).write(memoryview(frame(TEXT)), 1, number)
+    scene.happen()
+    assert not scene.closed(scene.later(1))
+    scene.begin_anew()
+    [recording] = scene.closed(scene.later(10))
+    assert (recording.complete, "/front" in recording.why_not) == (False, True)
+    assert {row.topic for row in recording.left_out} >= {"/front"}
+    assert {name for name, _time, _data in scene.bag(recording)} <= {
+        "/chatter",
+        "/rosrv/records",
+        "/rosrv/log",
+    }
+
+
+def test_messages_that_had_left_the_memory_are_reported(scene: Scene) -> None:
+    """The description lists the topics whose oldest messages are gone."""
+    for _message in range(30):
+        scene.say(bytes(100_000))
+    scene.happen()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert not recording.complete
+    assert "was no longer in recorder.memory: /chatter" in recording.why_not
+
+
+def test_the_next_recorder_continues_after_a_crash(scene: Scene) -> None:
+    """The recording keeps its name, and has each message once and the trigger once."""
+    scene.happen()
+    scene.later(0.1)
+    [part] = scene.folder.iterdir()
+    scene.say()
+    with (part / "recording.bag").open("ab") as bag:
+        bag.write(b"torn")
+    scene.begin_anew()
+    scene.later(1)
+    scene.say()
+    [recording] = scene.closed(scene.later(6))
+    assert part.name == f".{recording.id}.part"
+    assert recording.complete
+    assert len(recording.triggers) == 1
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT, TEXT, TEXT]
+
+
+def test_a_restart_of_the_appliance_ends_a_recording(scene: Scene) -> None:
+    """The memory is new, so the written part is kept and marked as incomplete; an empty part is removed."""
+    scene.happen()
+    scene.later(0.1)
+    (scene.folder / f".{'a' * 20}.part").mkdir()
+    scene.born = scene.clock.now = BEGAN + 100 * SECOND
+    scene.begin_anew()
+    [recording] = scene.closed(scene.later(0))
+    assert (recording.complete, recording.why_not) == (False, "the appliance stopped during the recording")
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+    assert [path.name for path in scene.folder.iterdir()] == [recording.id]
+
+
+def test_a_late_recorder_handles_earlier_triggers(scene: Scene) -> None:
+    """A new recorder handles triggers that its memory still covers; a trigger with a recording begins no second one."""
+    scene.happen()
+    scene.clock.now += 3 * SECOND
+    scene.begin_anew()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert recording.triggers[0].time == BEGAN
+    scene.begin_anew()
+    scene.later(0.1)
+    assert not scene.closed(scene.later(60))
+
+
+def test_a_recording_is_reported_until_it_is_noted(scene: Scene) -> None:
+    """A recording can be removed by order; an order for an unknown recording is refused."""
+    scene.happen()
+    [opened] = [said.recording for said in scene.later(0.1) if isinstance(said, messages.RecordingOpened)]
+    assert messages.RecordingsStated([], [opened]) in scene.later(0, messages.RecordingsAsked())
+    [recording] = scene.closed(scene.later(6))
+    assert (opened.id, opened.began, opened.trigger) == (recording.id, recording.began, recording.triggers[0])
+    assert scene.closed(scene.later(0, messages.RecordingsAsked())) == [recording]
+    answers = scene.later(0, messages.RecordingNoted(recording.id), messages.RecordingsAsked())
+    assert scene.closed(answers) == []
+    assert messages.RecordingsStated([recording]) in answers
+    remove = messages.RecordingRemovalWanted(3, recording.id, "eve")
+    assert scene.later(0, remove) == [messages.RecordingRemoved(3, recording, "eve", "")]
+    [refused] = scene.later(0, remove)
+    assert isinstance(refused, messages.RecordingRefused)
+    assert refused.unknown
+
+
+def test_revisions_are_the_last_that_control_sent(scene: Scene) -> None:
+    """The revisions are read when a recording begins and when it ends."""
+    scene.happen()
+    assert messages.RevisionsWanted() in scene.later(0.1)
+    scene.later(0, messages.RevisionsStated(4, 2))
+    [recording] = scene.closed(scene.later(6))
+    assert (recording.policy, recording.monitors) == (4, 2)
+
+
+def test_a_header_that_is_not_text_is_recorded(scene: Scene) -> None:
+    """Comments in Latin-1 in a definition, and any bytes in a field, still give a readable bag."""
+    hostile = {"message_definition": "# caf\udce9\nstring data\n", "latching": "x", "type": "t" * 10_000}
+    scene.stream = scene.writer.open("/cafe", "10.0.0.2", HEADER | hostile)
+    scene.said = 0
+    scene.say()
+    scene.happen()
+    scene.later(0.1)
+    scene.begin_anew()
+    scene.later(1)
+    [recording] = scene.closed(scene.later(6))
+    assert sorted(topic.topic for topic in recording.topics) == ["/cafe", "/chatter"]
+    assert {topic for topic, _time, _data in scene.bag(recording)} >= {"/cafe", "/chatter"}
+    with Reader(scene.folder / recording.id / "recording.bag") as reader:
+        [cafe] = [connection for connection in reader.connections if connection.topic == "/cafe"]
+    assert cafe.msgdef.data == "# caf\ufffd\nstring data\n"
+
+
+def test_a_recorder_killed_after_the_last_write_loses_nothing(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the final name is missing: the appliance's next start, with a new memory, names the recording."""
+    scene.happen()
+    scene.later(0.1)
+
+    def killed(_store: RecordingStore, _recording: Recording) -> None:
+        raise SystemExit
+
+    monkeypatch.setattr(RecordingStore, "keep", killed)
+    with pytest.raises(SystemExit):
+        scene.later(6)
+    monkeypatch.undo()
+    [part] = scene.folder.iterdir()
+    scene.born = scene.clock.now = BEGAN + 100 * SECOND
+    scene.recorder = scene.make_recorder()
+    [recording] = scene.closed(scene.later(0))
+    assert part.name == f".{recording.id}.part"
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+
+
+def test_a_clock_that_is_set_back_ends_one_recording_only(scene: Scene) -> None:
+    """The clock goes back an hour, to before the memory was made: the recording ends, and the next one is normal."""
+    scene.happen()
+    scene.later(0.1)
+    scene.clock.now -= 100 * SECOND
+    [cut] = scene.closed(scene.later(0))
+    assert (cut.complete, cut.why_not) == (False, "the clock was set back during the recording")
+    assert cut.began <= cut.ended
+    scene.say()
+    scene.happen()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+    assert recording.ended == scene.clock.now - int(1.1 * SECOND)
+
+
+def test_the_number_of_headers_is_bounded(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages whose headers exceed the limit are missing, and the recording says so; other messages are in it."""
+    monkeypatch.setattr("appliance.features.recorder.recording._MOST_HEADERS", 20_000)
+    scene.happen()
+    scene.later(0.1)
+    quiet = scene.stream
+    for number in range(30):
+        definition = f"# {number} {'x' * 5000}\nstring data\n"
+        scene.stream = opened(scene.writer, "/many", "10.0.0.2", message_definition=definition)
+        scene.said = 0
+        scene.say()
+        scene.stream.close()
+        scene.later(0.1)
+    scene.stream, scene.said = quiet, 1
+    scene.say()
+    [recording] = scene.closed(scene.later(6))
+    assert recording.why_not == "27 messages of too many different connections"
+    assert {topic.topic: topic.messages for topic in recording.topics} == {"/chatter": 2, "/many": 3}
+    assert recording.size < 100_000

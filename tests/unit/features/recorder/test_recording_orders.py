@@ -1,0 +1,270 @@
+"""Orders of operators to the flight recorder; the test plays the recorder."""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from typing import Any, cast
+
+import msgspec
+import pytest
+
+from appliance.audit.log.ids import IdSource
+from appliance.channel import admin, messages
+from appliance.channel.channel import Channel
+from appliance.configuration.settings import RecorderRules
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.features.recorder.recording_answers import OpenRecording, Recording, Trigger
+from appliance.features.recorder.recording_orders import RecorderAwayError, RecordingOrders
+from appliance.features.recorder.recording_plan import RecordingPlan
+from appliance.features.recorder.recording_store import MOST_TEMPORARY
+from appliance.telemetry.audit_trail import AuditTrail
+from tests.support.memory_channel import memory_link
+
+pytestmark = pytest.mark.anyio
+
+KEPT = Recording(
+    "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""
+)
+
+
+class Trail:
+    """The audit trail: its records, and whether they can be written."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.failure: str | None = None
+
+    def happened(self, event: str, _reason: str, **detail: Any) -> str:
+        self.events.append((event, detail))
+        return "record"
+
+    async def durable(self) -> str | None:
+        return self.failure
+
+
+class Scene:
+    """Control's end and the recorder's."""
+
+    def __init__(self, **rules: Any) -> None:
+        self.trail = Trail()
+        self.orders = RecordingOrders(
+            RecorderRules(**{"enabled": True} | rules),
+            cast(AuditTrail, self.trail),
+            lambda: messages.RevisionsStated(4, 2),
+            RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
+        )
+
+    def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
+        ours, theirs = socket.socketpair()
+        self.orders.link.attach(Channel(ours, messages.RecorderLink))
+        recorder = Channel(theirs, messages.RecorderLink)
+
+        def received(message: Any, _descriptors: tuple[int, ...]) -> None:
+            for said in answer(message):
+                recorder.send(said)
+
+        recorder.attach(asyncio.get_running_loop(), received, lambda: None)
+        return recorder
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return Scene()
+
+
+async def told(scene: Scene, done: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10):
+        while not done():
+            await asyncio.sleep(0)
+
+
+async def test_a_missing_recorder_is_reported() -> None:
+    off = Scene(enabled=False)
+    assert off.orders.state() is None
+    with pytest.raises(UnknownThingError, match="enabled: true"):
+        await off.orders.recordings(admin.RecordingsWanted())
+    away = Scene()
+    state = away.orders.state()
+    assert state is not None
+    assert not state.running
+    with pytest.raises(RecorderAwayError, match="is not running now"):
+        await away.orders.now(admin.RecordNow(), "eve")
+
+
+@pytest.mark.nightly
+async def test_a_call_of_the_service_is_an_order() -> None:
+    heard: list[Any] = []
+    call = messages.OwnServiceCalled(7, "/rosrv/record_now", "10.0.0.5", "/arm")
+
+    def answer(message: Any) -> list[messages.Message]:
+        heard.append(message)
+        if len(heard) == 1:
+            return [messages.RecordingStarted(message.number, KEPT.id, 5)]
+        return [messages.RecordingRefused(message.number, "this hour has its 6")]
+
+    scene = Scene()
+    away = await scene.orders.called(call)
+    assert (away.success, away.text) == (False, "the flight recorder is not running now")
+    assert scene.trail.events == []
+    recorder = scene.attach(answer)
+    assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, True, KEPT.id)
+    assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, False, "this hour has its 6")
+    [(event, detail), _again] = scene.trail.events
+    assert event == "recording ordered"
+    assert (detail["host"], detail["caller_id"], detail["resource"]) == ("10.0.0.5", "/arm", call.service)
+    wanted = heard[0]
+    assert (wanted.trigger.what, wanted.trigger.record) == ("service", "record")
+    assert wanted.trigger.text == "/arm of 10.0.0.5 called /rosrv/record_now"
+    assert (wanted.before, wanted.after) == (60, 10)
+    recorder.close()
+
+
+@pytest.mark.nightly
+async def test_a_closed_recording_is_recorded_and_listed() -> None:
+    heard: list[Any] = []
+    scene = Scene()
+
+    def hear(message: Any) -> list[messages.Message]:
+        heard.append(message)
+        return []
+
+    recorder = scene.attach(hear)
+    recorder.send(messages.RevisionsWanted())
+    recorder.send(messages.RecordingClosed(KEPT))
+    await told(scene, lambda: len(heard) == 2)
+    assert heard == [messages.RevisionsStated(4, 2), messages.RecordingNoted(KEPT.id)]
+    assert (await scene.orders.recordings(admin.RecordingsWanted())).recordings == [KEPT]
+    assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
+    [(event, detail)] = scene.trail.events
+    assert (event, detail["recording"], detail["sha256"]) == ("recording closed", KEPT.id, "5a")
+    assert detail["triggers"] == ["drop r"]
+    recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is full"))
+    await told(scene, lambda: len(scene.trail.events) == 2)
+    assert scene.trail.events[1][1]["who"] == "recorder"
+    await told(scene, lambda: len(heard) == 3)
+    assert heard[2] == messages.RecordingNoted(KEPT.id)
+    scene.trail.failure = "no space left on device"
+    recorder.send(messages.RecordingClosed(KEPT))
+    recorder.send(messages.RevisionsWanted())
+    await told(scene, lambda: len(heard) == 4)
+    assert heard[3] == messages.RevisionsStated(4, 2)  # a recording that is not on disk is reported again
+    with pytest.raises(RecorderAwayError, match="cannot be recorded: no space left"):
+        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+    with pytest.raises(UnknownThingError, match="no recording"):
+        await scene.orders.fetch(admin.RecordingFetch("other"), "eve")
+    recorder.close()
+
+
+@pytest.mark.nightly
+async def test_orders_have_the_name_of_their_operator() -> None:
+    def answer(message: Any) -> list[messages.Message]:
+        match message:
+            case messages.RecordingRequested(number, trigger, before, after):
+                assert (trigger.record, trigger.text, before, after) == ("record", "eve: why", 60, 5)
+                return [messages.RecordingStarted(number, KEPT.id, 9)]
+            case messages.RecordingRemovalWanted(number, recording_id, who):
+                if recording_id != KEPT.id:
+                    return [messages.RecordingRefused(number, "there is none", unknown=True)]
+                return [messages.RecordingRemoved(number, KEPT, who, "")]
+        return []
+
+    scene = Scene()
+    recorder = scene.attach(answer)
+    for senseless in (admin.RecordNow(before=601.0), admin.RecordNow(after=0.0)):
+        with pytest.raises(SenselessError):
+            await scene.orders.now(senseless, "eve")
+    assert not scene.trail.events
+    begun = await scene.orders.now(admin.RecordNow(after=5, note="why"), "eve")
+    assert (begun.id, begun.ends) == (KEPT.id, 9)
+    assert scene.trail.events[0][1]["who"] == "eve"
+    with pytest.raises(UnknownThingError, match="still being made"):
+        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+    with pytest.raises(UnknownThingError, match="no recording"):
+        await scene.orders.fetch(admin.RecordingFetch(""), "eve")
+    assert await scene.orders.remove(admin.RecordingRemove(KEPT.id), "eve") == KEPT
+    assert scene.trail.events[1][1]["who"] == "eve"
+    with pytest.raises(UnknownThingError):
+        await scene.orders.remove(admin.RecordingRemove("b" * 20), "eve")
+    recorder.close()
+
+
+async def test_an_open_recording_is_listed(scene: Scene) -> None:
+    """Until it is closed, a recording has its end as the plan extends it, and a request for it answers when to ask."""
+    ours, recorder = memory_link(messages.RecorderLink)
+    scene.orders.link.attach(ours)
+    opened = OpenRecording(KEPT.id, 1_000, 5 * 10**9, Trigger(1_000, "drop", "record", "so"))
+    recorder.send(messages.RecordingsStated([], [opened]))
+    await told(scene, lambda: bool(cast(Any, scene.orders.state()).in_progress))
+    assert (await scene.orders.recordings(admin.RecordingsWanted())).in_progress == [opened]
+    with pytest.raises(UnknownThingError, match="still being made: ask again after 1970-01-01T00:00:05"):
+        await scene.orders.recording(admin.RecordingWanted(KEPT.id))
+    recorder.send(messages.RecordingClosed(KEPT))
+    await told(scene, lambda: not cast(Any, scene.orders.state()).in_progress)
+    assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
+
+
+@pytest.mark.nightly
+async def test_a_fetch_needs_a_record(scene: Scene) -> None:
+    """While the audit log cannot be written a fetch is refused."""
+    recorder = scene.attach(lambda _message: [])
+    recorder.send(messages.RecordingsStated([KEPT]))
+    await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+    assert await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve") == KEPT
+    scene.trail.failure = "the disk is full"
+    with pytest.raises(RecorderAwayError, match="cannot be recorded"):
+        await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+    recorder.close()
+
+
+@pytest.mark.nightly
+async def test_an_order_to_a_dying_recorder_fails_at_once(scene: Scene) -> None:
+    recorder = scene.attach(lambda _message: [])
+    asked = asyncio.ensure_future(scene.orders.now(admin.RecordNow(), "eve"))
+    await told(scene, lambda: bool(scene.trail.events))
+    recorder.close()
+    with pytest.raises(RecorderAwayError, match="before it answered"):
+        await asyncio.wait_for(asked, 5)
+
+
+@pytest.mark.nightly
+async def test_the_memory_can_be_fetched_and_is_not_listed() -> None:
+    lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
+
+    def answer(message: Any) -> list[messages.Message]:
+        if not isinstance(message, messages.MemoryWanted):
+            return []
+        assert (message.since, message.until > 0, message.trigger.record) == (7, True, "record")
+        return [messages.MemoryLent(message.number, next(lent))]
+
+    scene = Scene()
+    recorder = scene.attach(answer)
+    first = await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+    assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
+    assert [(event, detail["who"]) for event, detail in scene.trail.events] == [
+        ("recording ordered", "eve"),
+        ("recording fetched", "eve"),
+    ]
+    known = await scene.orders.recordings(admin.RecordingsWanted())
+    assert (known.recordings, known.topics, known.before) == ([], ["/*"], 60)
+    for _other in range(MOST_TEMPORARY):
+        assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
+        await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+    with pytest.raises(UnknownThingError):
+        await scene.orders.fetch(admin.RecordingFetch(first.id), "eve")
+    recorder.close()
+
+
+@pytest.mark.nightly
+async def test_more_topics_than_a_record_can_name_are_rejected(scene: Scene) -> None:
+    """The record of a fetch must name every topic that is read; if the names do not fit, the fetch is rejected."""
+    recorder = scene.attach(lambda _message: [])
+    recorder.send(messages.RecordingsStated([KEPT]))
+    await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+    for topics in ([f"/t{number}" for number in range(21)], ["/" + "t" * 500]):
+        with pytest.raises(SenselessError, match="at most 20 topics"):
+            await scene.orders.read(admin.RecordingRead(KEPT.id, topics), "eve")
+    assert not scene.trail.events
+    longest = "/" + "t" * 499
+    await scene.orders.read(admin.RecordingRead(KEPT.id, [longest]), "eve")
+    assert scene.trail.events[0][1]["topics"] == [longest]
+    recorder.close()

@@ -1,0 +1,194 @@
+"""The store has complete recordings only; the hosts and kinds with the most bytes make room."""
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from appliance.base.clock import wall_ns
+from appliance.features.recorder.recording_answers import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
+from appliance.features.recorder.recording_store import ABOUT, RecordingStore
+
+MIB = 1 << 20
+SECOND = 1_000_000_000
+
+
+def recording(
+    number: int, what: TriggerKind = "drop", size: int = MIB, charged_to: str = OPERATORS
+) -> Recording:
+    """Return the recording of this second."""
+    time = number * SECOND
+    trigger = Trigger(time, what, "record", "")
+    return Recording(
+        f"{number:020x}",
+        time,
+        time,
+        [trigger],
+        [],
+        1,
+        1,
+        size=size,
+        sha256="",
+        complete=True,
+        why_not="",
+        charged_to=charged_to,
+    )
+
+
+def put(store: RecordingStore, kept: Recording) -> Recording:
+    """Save it, as the recorder does."""
+    part = store.part(kept.id)
+    part.mkdir()
+    (part / ABOUT).write_bytes(msgspec.json.encode(kept))
+    store.keep(kept)
+    return kept
+
+
+def cleared(store: RecordingStore, now: int = 0, *, room: bool = False) -> list[tuple[Recording, str]]:
+    """Remove recordings as the recorder does, and return them."""
+    gone = []
+    for kept, why in store.outdated(now):
+        store.remove(kept, "", why)
+        gone.append((kept, why))
+    return gone + (room_for(store, OPERATORS)[0] if room else [])
+
+
+def room_for(store: RecordingStore, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
+    """Return the recordings that are removed for this host, and the reason if there is still not enough room."""
+    gone: list[tuple[Recording, str]] = []
+    while True:
+        kept, why = store.in_the_way(charged_to)
+        if kept is None:
+            return gone, why
+        store.remove(kept, "", why)
+        gone.append((kept, why))
+
+
+def test_saved_recordings_are_found_again(tmp_path: Path) -> None:
+    """The next recorder finds saved recordings in time order; unfinished ones are parts, damaged ones are ignored."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    second, first = put(store, recording(2)), put(store, recording(1))
+    store.part("f" * 20).mkdir()
+    about = (tmp_path / first.id / ABOUT).read_bytes()
+    for letter, damaged in (("d", about.replace(first.id.encode(), b"\xff" * 20)), ("e", b"{")):
+        assert damaged != about
+        spoilt = tmp_path / (letter * 20)
+        spoilt.mkdir()
+        (spoilt / ABOUT).write_bytes(damaged)
+    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    assert again.recordings == [first, second]
+    assert again.parts() == [again.part("f" * 20)]
+    again.remove(first, "eve", "")
+    assert not (tmp_path / first.id).exists()
+    assert again.find(first.id) is None
+    again = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    assert list(again.removed()) == [(first, "eve", "")]
+    again.note(first.id)
+    assert not list(again.removed())
+    assert {path.name for path in tmp_path.iterdir()} == {second.id, f".{'f' * 20}.part", "d" * 20, "e" * 20}
+
+
+def test_a_noted_recording_is_reported_once(tmp_path: Path) -> None:
+    """A recording is reported again until control has noted it."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    first, second = put(store, recording(1)), put(store, recording(2))
+    store.note(first.id)
+    store.note("0" * 20)
+    assert RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns).unnoted() == [second]
+
+
+def test_the_kind_with_most_bytes_makes_room(tmp_path: Path) -> None:
+    """The oldest of the kind with the most bytes is removed, so that a flood of drops removes no other recording."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    put(store, recording(1, "order", 8 * MIB))
+    put(store, recording(2, "fault", 8 * MIB))
+    for number in range(3, 8):
+        put(store, recording(number, "drop", 8 * MIB))
+    assert not cleared(store)
+    assert not cleared(store, room=True)
+    put(store, recording(8, "drop", 8 * MIB))
+    assert cleared(store, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is full")]
+
+
+def test_a_guest_makes_room_from_its_own_recordings(tmp_path: Path) -> None:
+    """However many recordings a guest causes, it has a quarter of the disk, and those of other hosts stay."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    put(store, recording(1, size=8 * MIB, charged_to=ROBOT))
+    put(store, recording(2, size=8 * MIB, charged_to="10.0.0.7"))
+    for number in range(3, 50):
+        gone, why_not = room_for(store, "10.0.0.9")
+        assert why_not == ""
+        assert {found.charged_to for found, _why in gone} <= {"10.0.0.9"}
+        put(store, recording(number, size=8 * MIB, charged_to="10.0.0.9"))
+    held = [found.charged_to for found in store.recordings]
+    assert (held.count("10.0.0.9"), held[:2]) == (2, [ROBOT, "10.0.0.7"])
+
+
+def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
+    """Ten guests take the free space and then each other's; for the robot, half of the disk is cleared again."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+
+    def arrive(number: int, charged_to: str) -> str:
+        _gone, why_not = room_for(store, charged_to)
+        if not why_not:
+            put(store, recording(number, size=8 * MIB, charged_to=charged_to))
+        return why_not
+
+    for number in range(30):
+        assert arrive(number, f"10.0.0.{number % 10}") == ""
+    assert len(store.recordings) == 6, "three quarters"
+    for number in range(30, 50):
+        assert arrive(number, ROBOT) == ""
+    held = [found.charged_to for found in store.recordings]
+    assert held.count(ROBOT) == 4
+    for number in range(50, 60):
+        assert arrive(number, f"10.0.0.{number % 10}") == ""
+    assert [found.charged_to for found in store.recordings].count(ROBOT) == 4
+
+
+def test_a_guest_has_no_recording_if_the_robot_uses_all(tmp_path: Path) -> None:
+    """The reason for the missing recording is reported."""
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    for number in range(8):
+        put(store, recording(number, size=8 * MIB, charged_to=ROBOT))
+    assert room_for(store, "10.0.0.9") == ([], "recorder.disk is full")
+
+
+def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Control receives all recordings in one message, however many topics they have."""
+    monkeypatch.setattr("appliance.features.recorder.recording_store._MOST_DESCRIBED", 1000)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    for number in range(1, 9):
+        put(store, recording(number))
+    cleared(store, room=True)
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=None, clock=wall_ns)
+    left = [(tmp_path / found.id / "recording.json").stat().st_size for found in store.recordings]
+    assert 0 < sum(left) <= 1000
+
+
+def test_old_recordings_are_removed(tmp_path: Path) -> None:
+    """A recording is removed when the configured time since its saving has passed, by the age clock."""
+    age = 1000 * SECOND
+
+    def make() -> RecordingStore:
+        return RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+
+    store = make()
+    put(store, recording(1))
+    age += SECOND
+    put(store, recording(2))
+    age += 9 * SECOND - 1
+    assert not cleared(make(), 5000 * SECOND)  # whatever the machine's clock says
+    age += 1
+    assert cleared(make()) == [(recording(1), "it is older than recorder.days")]
+
+
+def test_a_recording_of_an_earlier_version_ages_from_its_end(tmp_path: Path) -> None:
+    """The file with its time of saving is missing, or empty after a power cut."""
+    age = 0
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    (tmp_path / put(store, recording(1)).id / "since").unlink()
+    (tmp_path / put(store, recording(2)).id / "since").write_bytes(b"")
+    store = RecordingStore(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    for age, gone in ((11 * SECOND - 1, 0), (11 * SECOND, 1), (12 * SECOND, 1)):  # noqa: B007  the clock reads it
+        assert len(cleared(store)) == gone
