@@ -153,7 +153,7 @@ byte shown[2];                 /* the epoch under which the trace shows the appl
 
 /* --- an appliance ----------------------------------------------------------------------------------------- */
 
-/* = appliance/standby/lease.py ApplianceLease._learn */
+/* = appliance/features/standby/lease.py ApplianceLease._learn */
 inline make_passive(x) {
     leads[x] = false;
     leased[x] = false; trusted[x] = false; offered[x] = false;
@@ -161,7 +161,7 @@ inline make_passive(x) {
 }
 
 /* It hears of a later epoch.
- = appliance/standby/lease.py ApplianceLease.follow */
+ = appliance/features/standby/lease.py ApplianceLease.follow */
 inline hear_epoch(x, e) {
     if
     :: e > term[x] -> term[x] = e
@@ -170,7 +170,7 @@ inline hear_epoch(x, e) {
 }
 
 /* It has an answer that it holds the lease.
- = appliance/standby/lease.py ApplianceLease.answered */
+ = appliance/features/standby/lease.py ApplianceLease.answered */
 inline hold(x, e, other_in_sync) {
     leads[x] = true; leased[x] = true;
     term[x] = e; partner[x] = other_in_sync
@@ -182,7 +182,7 @@ inline copy_from(x) {
     term[OTHER(x)] = term[x]
 }
 
-/* = appliance/standby/lease.py ApplianceLease.received */
+/* = appliance/features/standby/lease.py ApplianceLease.received */
 inline give_promise(x) {
     promise[OTHER(x)] = true; offered[x] = true;
     term[OTHER(x)] = term[x]
@@ -199,7 +199,7 @@ inline give_promise(x) {
 #define FOLLOWS(y, x) (up[y] && !leads[y] && term[y] <= term[x])
 #endif
 
-/* = appliance/standby/lease.py ApplianceLease.tick */
+/* = appliance/features/standby/lease.py ApplianceLease.tick */
 proctype Appliance(byte me) POSSIBLE {
 end:
     do
@@ -313,7 +313,7 @@ inline answer_denied(x) {
 }
 
 /* R1: on disk.
- = appliance/standby/witness.py Witness._claim */
+ = appliance/features/standby/witness.py Witness._claim */
 inline grant(x) {
 #ifndef MUTANT_SAME_EPOCH
     epoch++;
@@ -323,7 +323,7 @@ inline grant(x) {
 }
 
 /* R1: in the firewall.
- = appliance/standby/witness.py Witness._enforce */
+ = appliance/features/standby/witness.py Witness._enforce */
 inline admit_holder() {
     granting = false;
 #ifdef MUTANT_NOT_FENCED
@@ -339,7 +339,7 @@ inline admit_holder() {
 #define MAY_REMOVE(x) (holder == x)
 #endif
 /* It admits the holder again, if the robot has rebooted.
- = appliance/standby/witness.py Witness._renew */
+ = appliance/features/standby/witness.py Witness._renew */
 inline renew(x) {
     running = true;
 #ifndef MUTANT_RENEWED_SHUT
@@ -347,7 +347,7 @@ inline renew(x) {
 #endif
 }
 
-/* = appliance/standby/witness.py Witness.handle */
+/* = appliance/features/standby/witness.py Witness.handle */
 proctype Witness() POSSIBLE {
     byte x;
 end:

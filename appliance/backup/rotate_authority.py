@@ -11,8 +11,8 @@ from pathlib import Path
 from appliance.backup.contents import BackupError
 from appliance.backup.purge import write_over
 from appliance.base.owner_access import acting_as
+from appliance.features.standby.membership import path_of
 from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
-from appliance.standby.membership import path_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.state_directory import StateDirectory, foreign
 

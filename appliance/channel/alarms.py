@@ -9,8 +9,8 @@ from msgspec import structs
 
 from appliance.channel.answers.field_docs import doc
 from appliance.channel.answers.status import BlocksState, BundlesState, ProcessInfo, Status
-from appliance.channel.standby_summary import PATIENCE_SECONDS, standby_troubles
 from appliance.channel.status_summary import no_relay, probe_failed
+from appliance.features.standby.standby_summary import PATIENCE_SECONDS, standby_troubles
 
 Severity = Literal["alarm", "warning", "notice"]
 About = Literal["system", "policy", "monitors", "hosts", "audit"]

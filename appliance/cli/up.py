@@ -19,7 +19,7 @@ from appliance.cli.up_inputs import read_inputs
 from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings
 from appliance.control.assembly.robot import own_address
-from appliance.standby.membership import Membership, MembershipError, load_membership, path_of
+from appliance.features.standby.membership import Membership, MembershipError, load_membership, path_of
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.run import StandbyStart, run_appliance

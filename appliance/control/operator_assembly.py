@@ -22,7 +22,7 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.control.standby_orders import StandbyOrders, StandbySource
+from appliance.features.standby.standby_orders import StandbyOrders, StandbySource
 from appliance.features.table import FeatureParts
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment, find_endpoint

@@ -29,23 +29,28 @@ from appliance.control.assembly.assembly import Parts, assemble
 from appliance.control.assembly.foundation import INNER, OWN, RVMASTER, Current, Foundation, make_foundation
 from appliance.control.assembly.robot import master_address
 from appliance.control.assembly.stored_times import note_times
-from appliance.control.lease_client import LeaseClient
 from appliance.control.links.supervisor_link import ControlLifeline
 from appliance.control.operator_assembly import Operators, make_operators
 from appliance.control.operators.admin_socket import AdminServer
-from appliance.control.passive import until_activated
-from appliance.control.replication import Pair, answered_when_stored
 from appliance.control.spare_memory import return_spare_memory
-from appliance.control.standby_orders import begin_epoch, service_reports, standby_source, state_copies
 from appliance.control.supervisor_messages import SupervisorMessages
-from appliance.control.takeover_check import STATE_ERRORS
-from appliance.control.takeover_record import TakeoverRecorder
+from appliance.features.standby.lease_client import LeaseClient
+from appliance.features.standby.membership import LINK_FILE, MembershipError
+from appliance.features.standby.passive import until_activated
+from appliance.features.standby.replication import Pair, answered_when_stored
+from appliance.features.standby.standby_orders import (
+    begin_epoch,
+    service_reports,
+    standby_source,
+    state_copies,
+)
+from appliance.features.standby.takeover_check import STATE_ERRORS
+from appliance.features.standby.takeover_record import TakeoverRecorder
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.master.endpoints.node_ports import NoPortError
 from appliance.master.graph.registry import Life
 from appliance.master.reconcile.enactor import restore
 from appliance.specifications.compiler_link import SpecificationCompiler
-from appliance.standby.membership import LINK_FILE, MembershipError
 from roswire.uris import node_uri
 
 _log = structlog.get_logger()

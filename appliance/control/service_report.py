@@ -1,4 +1,4 @@
-"""Report to the lease whether the active one of two appliances serves nodes (`standby/service_watch.py`).
+"""Report to the lease whether the active one of two appliances serves nodes (`features/standby/service_watch.py`).
 
 A full disk is reported at once. A relay that died is back after a second, and a firewall that another program changed
 is repaired; they are reported only if they last, because a takeover costs more than the repair.

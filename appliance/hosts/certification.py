@@ -17,12 +17,12 @@ from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
 from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
-from appliance.hosts.appliance_table import ApplianceTable
+from appliance.features.standby.appliance_table import ApplianceTable
+from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.rest_address import RestAddress
-from appliance.hosts.shared_authority import SharedAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.hosts.view import soon
 from appliance.store.state_file import StateStore

@@ -19,10 +19,10 @@ from appliance.base import clock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
-from appliance.hosts.appliance_table import CERTIFICATE_DAYS, ApplianceTable
+from appliance.features.standby.appliance_table import CERTIFICATE_DAYS, ApplianceTable
+from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.host_table import HostRefusedError, HostTable
-from appliance.hosts.shared_authority import SharedAuthority
 from appliance.policy.model import Address
 from appliance.telemetry.audit_trail import AuditTrail
 

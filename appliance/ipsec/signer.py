@@ -31,12 +31,12 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
+from appliance.features.standby.sealed_authority import open_authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.removals import RemovalApprover, RemovalRefusedError, RetentionLimits
-from appliance.ipsec.sealed_authority import open_authority
 from appliance.ipsec.signed_checkpoints import CheckpointMemory, CheckpointRefusedError, newest_signing
 
 KEY_FILE = "audit.key"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from appliance.base.shipped import DPKG
 from appliance.configuration.sections import DEFAULTS, Sections
+from appliance.features.standby.membership import LEASE_FILE
 from appliance.features.table import FEATURES
-from appliance.standby.membership import LEASE_FILE
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.port_check import first_free
 from appliance.supervisor.role import ExternalProgram, Facts, Role
@@ -53,7 +53,7 @@ _ours = partial(Role, path=lambda facts: facts.config, links=("control",))
 _OF_FEATURES = tuple(role for feature in FEATURES for role in feature.roles)
 ROLES = (
     Role(
-        "lease", "rosrv-lease", "lease", "appliance.standby.process:main",
+        "lease", "rosrv-lease", "lease", "appliance.features.standby.process:main",
         path=lambda facts: facts.run(LEASE_FILE), links=("control",), outlives_takeover=True, nice=LEASE_NICE,
         sandbox=lambda _facts: SandboxPlan(allowlist=True, families=NETWORK, binds=None),
     ),

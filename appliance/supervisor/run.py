@@ -14,11 +14,11 @@ import structlog
 from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
 from appliance.features.recorder.rings import RecorderRings
+from appliance.features.standby.membership import Membership
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.firewall_rules import StandbyAccess
 from appliance.network.firewall.iptables import load_modules
 from appliance.network.namespaces import has_privileges
-from appliance.standby.membership import Membership
 from appliance.supervisor import signals
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.isolation_lifecycle import AppliancePorts, NoIsolation, isolation_for

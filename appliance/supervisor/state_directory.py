@@ -21,7 +21,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from appliance.base.atomic_files import remove_unfinished, write_whole
-from appliance.standby.membership import (
+from appliance.features.standby.membership import (
     LEASE_FILE,
     LEFT_FILE,
     LINK_FILE,

@@ -31,6 +31,8 @@ import structlog
 from appliance.base import clock
 from appliance.channel import messages
 from appliance.features.recorder.rings import RecorderRings
+from appliance.features.standby.lapse_answers import BECOMES_STANDBY, PAUSED, answer_for_control
+from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import rosmaster_probe, signals
 from appliance.supervisor.clock_sync import clock_is_synchronised
@@ -39,8 +41,6 @@ from appliance.supervisor.inherited_listeners import InheritedListeners, Listene
 from appliance.supervisor.input_lender import lend_inputs
 from appliance.supervisor.isolation_lifecycle import NoIsolation
 from appliance.supervisor.isolation_watchdog import IsolationWatchdog
-from appliance.supervisor.lapse_answers import BECOMES_STANDBY, PAUSED, answer_for_control
-from appliance.supervisor.lease_watch import LeaseWatch, RoleChanges
 from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.lease_traces import lease_accepts
-from tests.unit.standby.simulation import History
+from tests.unit.features.standby.simulation import History
 
 TAKEOVER = """\
 started witness

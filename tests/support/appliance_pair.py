@@ -14,7 +14,7 @@ from appliance.base.clock import now, using
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.control.links.signer_requests import SignerRequests
-from appliance.control.takeover_record import TakeoverRecorder
+from appliance.features.standby.takeover_record import TakeoverRecorder
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import decision

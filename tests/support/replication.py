@@ -10,18 +10,18 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from appliance.standby.link_certificates import (
+from appliance.features.standby.link_certificates import (
     CERTIFICATE,
     KEY,
     LinkCertificate,
     link_context,
     make_link_certificate,
 )
-from appliance.standby.replica import Replica
-from appliance.standby.replication_frames import ReplicationError
-from appliance.standby.replication_receiver import ReplicationReceiver
-from appliance.standby.replication_sender import ReplicationSender
-from appliance.standby.replication_transport import ReplicationListener, follow_at
+from appliance.features.standby.replica import Replica
+from appliance.features.standby.replication_frames import ReplicationError
+from appliance.features.standby.replication_receiver import ReplicationReceiver
+from appliance.features.standby.replication_sender import ReplicationSender
+from appliance.features.standby.replication_transport import ReplicationListener, follow_at
 from appliance.store.writer_thread import Database, StoreError
 from tests.support.engines import InlineDatabase
 

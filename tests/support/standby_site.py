@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Self
 
+from appliance.features.standby import witness
+from appliance.features.standby.kit import PairPlan, make_kits
+from appliance.features.standby.membership import PORT, Membership, path_of, save_membership
+from appliance.features.standby.witness import LeaseRecord
 from appliance.network import interfaces
-from appliance.standby import witness
-from appliance.standby.kit import PairPlan, make_kits
-from appliance.standby.membership import PORT, Membership, path_of, save_membership
-from appliance.standby.witness import LeaseRecord
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.command import ROSRV

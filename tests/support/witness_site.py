@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from appliance.standby import witness
-from appliance.standby.lease import Operation, WitnessAnswer, WitnessRequest
-from appliance.standby.witness import LeaseFile
-from appliance.standby.witness_link import WitnessChannel
+from appliance.features.standby import witness
+from appliance.features.standby.lease import Operation, WitnessAnswer, WitnessRequest
+from appliance.features.standby.witness import LeaseFile
+from appliance.features.standby.witness_link import WitnessChannel
 from examples.landshark.lab import Host, Lab
 from tests.support.processes import LIMIT, Process
 from tests.support.requirements import need_program

@@ -277,13 +277,13 @@ WALL_CLOCK = {
     "a moment that people are shown, or that stands in a file": [
         "api/front/history.py", "audit/log/ids.py", "audit/log/log.py", "telemetry/audit_trail.py", "backup/create.py",
         "bundles/poller.py", "control/bundle_gate.py",
-        "cli/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
-        "control/assembly/host_blocks.py", "control/passive.py",
-        "control/assembly/policies.py", "control/operators/queries.py", "control/replication.py",
+        "features/standby/second_join.py", "cli/status_watch.py", "collector/connection.py",
+        "control/assembly/host_blocks.py", "features/standby/passive.py",
+        "control/assembly/policies.py", "control/operators/queries.py", "features/standby/replication.py",
         "features/recorder/recording_orders.py", "evidence/bundle.py",
         "features/doors/door_node.py", "features/syslog/log_forwarder.py",
         "forwarding/segment_pusher.py",
-        "hosts/checked_ports.py", "hosts/host_table.py", "hosts/shared_authority.py",
+        "hosts/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
         "features/recorder/recorder.py", "features/recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "features/recorder/recorder_ring.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
@@ -292,7 +292,7 @@ WALL_CLOCK = {
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
         "base/deadlines.py", "bundles/verified_bundles.py",
-        "control/operators/token_orders.py", "hosts/appliance_table.py",
+        "control/operators/token_orders.py", "features/standby/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
         "signing/own_certificate.py",
@@ -314,7 +314,7 @@ WALL_CLOCK = {
 """The files that read the wall clock, by purpose. Add a file only if it has one of these purposes."""
 DIRECT = {
     "appliance/base/clock.py": "offers the clocks of the operating system to the rest",
-    "appliance/standby/witness.py": "is copied to a machine without the appliance",
+    "appliance/features/standby/witness.py": "is copied to a machine without the appliance",
 }
 """The files that read a clock other than by `base/clock.py`."""
 _CLOCKS = {"time", "time_ns", "localtime", "gmtime", "ctime"} | {

@@ -9,8 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from appliance.control import process as control_process
-from appliance.control.passive import PassiveControl
-from appliance.control.replication import Replication
+from appliance.features.standby import witness
+from appliance.features.standby.lease import ApplianceLease
+from appliance.features.standby.lease_watch import LeaseWatch
+from appliance.features.standby.passive import PassiveControl
+from appliance.features.standby.replica import Replica
+from appliance.features.standby.replication import Replication
+from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.gate import CallGate
 from appliance.master.endpoints.relay_control import RelayControl
@@ -29,14 +34,9 @@ from appliance.master.reconcile.enactor import Enactor, Enforcement
 from appliance.master.reconcile.reconciler import Reconciler
 from appliance.policy.model import Decision
 from appliance.relay.grant_table import GrantTable
-from appliance.standby import witness
-from appliance.standby.lease import ApplianceLease
-from appliance.standby.replica import Replica
-from appliance.standby.replication_sender import ReplicationSender
 from appliance.store.changes import Value
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database
-from appliance.supervisor.lease_watch import LeaseWatch
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.world.pair import PairWorld
 from tests.world.world import World, run

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from appliance.channel import admin
-from appliance.standby import witness
-from appliance.standby.membership import PORT, Membership
+from appliance.features.standby import witness
+from appliance.features.standby.membership import PORT, Membership
 from tests.world import robot
 from tests.world.appliance import MASTER_PORT, Appliance
 from tests.world.loop import BrokenPromiseError

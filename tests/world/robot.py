@@ -4,7 +4,7 @@ import re
 from typing import TYPE_CHECKING
 
 from appliance.base import clock
-from appliance.standby import witness
+from appliance.features.standby import witness
 from tests.world.loop import Machine, Process
 from tests.world.network import Address
 from tests.world.streams import DatagramSocket, Streams

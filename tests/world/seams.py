@@ -17,19 +17,19 @@ from appliance.audit.log import log_database, log_writer
 from appliance.audit.log.log import AuditLog
 from appliance.base import clock
 from appliance.channel import child_process
-from appliance.control import passive, replication, supervisor_messages, takeover_check
 from appliance.control import process as control_process
+from appliance.control import supervisor_messages
 from appliance.control.assembly import assembly, foundation, listener_limits, open_audit
 from appliance.control.links import supervisor_link
+from appliance.features.standby import passive, replica, replication, takeover_check
+from appliance.features.standby import process as lease_process
+from appliance.features.standby.replication_frames import ReplicationError
+from appliance.features.standby.replication_receiver import ReplicationReceiver
+from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.master import rosmaster
 from appliance.master.endpoints import node_ports
 from appliance.rpc.server import Handler, HttpRequest, Peer, Refusal
 from appliance.rpc.xmlrpc_client import XmlRpcClient
-from appliance.standby import process as lease_process
-from appliance.standby import replica
-from appliance.standby.replication_frames import ReplicationError
-from appliance.standby.replication_receiver import ReplicationReceiver
-from appliance.standby.replication_sender import ReplicationSender
 from appliance.store import ahead, writer_thread
 from appliance.store.state_file import StateStore
 from tests.world import disk

@@ -15,10 +15,10 @@ from appliance.channel.answers.status import ProcessInfo as ProcessInfo
 from appliance.channel.messages.bundle_link import *
 from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *
-from appliance.channel.messages.lease_link import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *
 from appliance.channel.messages.relay_link import *
 from appliance.channel.messages.signer_link import *
 from appliance.channel.messages.tunnels import *
 from appliance.features.recorder.recorder_link import *
+from appliance.features.standby.lease_link import *

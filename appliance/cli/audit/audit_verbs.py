@@ -22,12 +22,6 @@ from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import read_copies
 from appliance.audit.search.filter_options import FILTER
 from appliance.audit.search.search import LARGEST_PAGE
-from appliance.audit.takeover_verification import (
-    PairVerification,
-    VerifiedLog,
-    verify_alone,
-    verify_takeovers,
-)
 from appliance.cli.audit.audit_errors import Errors, fail, note
 from appliance.cli.audit.filter import filter_of
 from appliance.cli.audit.record_argument import RecordArgument
@@ -38,11 +32,17 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
-from appliance.cli.audit.takeover_table import print_pair
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
-from appliance.standby.membership import MembershipError, load_membership, path_of
+from appliance.features.standby.membership import MembershipError, load_membership, path_of
+from appliance.features.standby.takeover_table import print_pair
+from appliance.features.standby.takeover_verification import (
+    PairVerification,
+    VerifiedLog,
+    verify_alone,
+    verify_takeovers,
+)
 from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = (

@@ -8,7 +8,7 @@ from appliance.control.assembly.endpoints import Endpoints, make_endpoints
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.monitor_states import published_now
-from appliance.control.replication import answered_when_stored
+from appliance.features.standby.replication import answered_when_stored
 from appliance.master import rosout
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_execution import Execution

@@ -20,8 +20,8 @@ from appliance.control.assembly.quota_class import HostQuotaClass, charged_to
 from appliance.control.assembly.robot import robot_addresses
 from appliance.control.links.signer_requests import ReceiptFloor, SignerRequests
 from appliance.control.links.supervisor_link import ControlLifeline
-from appliance.control.replication import Pair, Replication, make_replication
 from appliance.features.recorder.recording_plan import RecordingPlan
+from appliance.features.standby.replication import Pair, Replication, make_replication
 from appliance.hosts.host_table import HostTable
 from appliance.hosts.hosts_file import BUNDLED_HOSTS, DECLARED_HOSTS, DeclaredHosts
 from appliance.hosts.tunnel_state import Tunnels

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 from appliance.channel.link import Link
 from appliance.configuration.settings import Settings
-from appliance.control.replication import Pair, Replication, host_endpoint
-from appliance.hosts.appliance_table import ApplianceTable
+from appliance.features.standby.appliance_table import ApplianceTable
+from appliance.features.standby.replication import Pair, Replication, host_endpoint
+from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.host_table import HostTable
-from appliance.hosts.shared_authority import SharedAuthority
 from appliance.store.state_file import StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from appliance.base import clock
 from appliance.base.age_clock import AgeClock
 from appliance.control.assembly.stored_times import adopt_times
-from appliance.control.replication import Pair
+from appliance.features.standby.replication import Pair
 from appliance.policy.model import Address, address_of
 from appliance.store.host_tables import HostBlockRow
 from appliance.store.state_file import StateStore

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import msgspec
 
 from appliance.base import clock
-from appliance.control.replication import Pair
+from appliance.features.standby.replication import Pair
 from appliance.specifications.timed_disables import returns_moved
 from appliance.store.revisions import LIMITS, limit_moved
 from appliance.store.state_file import StateStore

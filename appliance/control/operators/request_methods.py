@@ -13,8 +13,8 @@ from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.control.standby_orders import StandbyOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
+from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager

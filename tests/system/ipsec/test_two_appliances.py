@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from appliance.ipsec.sealed_authority import keep_sealed, sealed_authority
+from appliance.features.standby.sealed_authority import keep_sealed, sealed_authority
 from appliance.network import interfaces
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import INTERFACE, Host, Lab

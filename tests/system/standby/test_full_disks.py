@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.standby.membership import load_membership, path_of, save_membership
+from appliance.features.standby.membership import load_membership, path_of, save_membership
 from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_program, need_root, needs

@@ -17,10 +17,10 @@ from typing import Any
 
 import pytest
 
-from appliance.standby.kit import WITNESS_PORT
-from appliance.standby.link_certificates import replication_context
-from appliance.standby.membership import PORT, load_membership, path_of
-from appliance.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored
+from appliance.features.standby.kit import WITNESS_PORT
+from appliance.features.standby.link_certificates import replication_context
+from appliance.features.standby.membership import PORT, load_membership, path_of
+from appliance.features.standby.replication_frames import FromActive, ReplicationLink, SnapshotEnd, Stored
 from examples.landshark.lab import INTERFACE, Host
 from tests.support.small_disk import small_disk
 from tests.support.standby_robot import StandbyRobot

@@ -20,9 +20,9 @@ from typing import Any
 import pytest
 
 from appliance.channel import admin
-from appliance.standby.membership import PORT
-from appliance.standby.witness import EXPIRY
-from appliance.supervisor.lapse_answers import PAUSED
+from appliance.features.standby.lapse_answers import PAUSED
+from appliance.features.standby.membership import PORT
+from appliance.features.standby.witness import EXPIRY
 from examples.landshark.lab import Host
 from tests.support.appliance import Appliance
 from tests.support.rest import Answer, Rest

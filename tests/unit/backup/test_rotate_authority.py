@@ -7,8 +7,8 @@ import pytest
 
 from appliance.backup.contents import BackupError
 from appliance.backup.rotate_authority import rotate_authority
+from appliance.features.standby.membership import path_of
 from appliance.ipsec.certificate_authority import CertificateAuthority
-from appliance.standby.membership import path_of
 from appliance.supervisor.state_directory import StateDirectory
 
 

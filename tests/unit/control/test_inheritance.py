@@ -9,10 +9,16 @@ import pytest
 
 from appliance.base import clock
 from appliance.channel.messages import StateLeft
-from appliance.control.inheritance import CopyAge, StateCopies, inherited_state, keep_state, leave_state
-from appliance.control.lease_client import LeaseClient
-from appliance.control.replication import Pair
-from appliance.control.standby_tunnels import StandbyTunnels
+from appliance.features.standby.inheritance import (
+    CopyAge,
+    StateCopies,
+    inherited_state,
+    keep_state,
+    leave_state,
+)
+from appliance.features.standby.lease_client import LeaseClient
+from appliance.features.standby.replication import Pair
+from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.specifications.rollout import Rollout
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase

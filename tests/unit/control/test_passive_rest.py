@@ -1,4 +1,4 @@
-"""Tests of `appliance.control.passive_rest`: the api of a standby knows the replicated tokens."""
+"""Tests of `appliance.features.standby.passive_rest`: the api of a standby knows the replicated tokens."""
 
 import asyncio
 import socket
@@ -11,13 +11,13 @@ import pytest
 
 from appliance.base.clock import wall
 from appliance.channel import admin
-from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink, RequestAnswered, RequestMade, TokensStated
-from appliance.control import passive_rest
-from appliance.control.lease_client import HandOverError
-from appliance.control.passive_rest import PassiveRest, ReplicatedTokens
-from appliance.control.standby_orders import StandbyAdministration
+from appliance.features.standby import passive_rest
+from appliance.features.standby.lease_client import HandOverError
+from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_orders import StandbyAdministration
 from appliance.signing.request_signing import TokenKeys
 from appliance.store.access_tokens import TokenRow, make_token
 from appliance.store.state_file import StateStore
@@ -90,7 +90,7 @@ async def test_a_new_api_learns_the_tokens_at_once(tmp_path: Path) -> None:
 async def test_no_tokens_are_stated_before_they_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    monkeypatch.setattr("appliance.control.passive_rest._READ_SECONDS", 0.01)
+    monkeypatch.setattr("appliance.features.standby.passive_rest._READ_SECONDS", 0.01)
     rest = rest_of(tmp_path)
     api, heard = attached(rest)
     async with asyncio.timeout(20):

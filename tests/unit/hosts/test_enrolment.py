@@ -49,7 +49,9 @@ from appliance.channel.messages import (
     TunnelsStated,
     TunnelsWanted,
 )
-from appliance.hosts.appliance_table import ApplianceTable
+from appliance.features.standby.appliance_table import ApplianceTable
+from appliance.features.standby.replication_frames import Introduction
+from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.host_table import (
@@ -60,11 +62,9 @@ from appliance.hosts.host_table import (
 )
 from appliance.hosts.hosts_file import DeclaredHosts
 from appliance.hosts.rest_address import RestAddress
-from appliance.hosts.shared_authority import SharedAuthority
 from appliance.hosts.tunnel_state import Tunnels
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
 from appliance.policy.model import Address
-from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from tests.support.audit import RecordingTrail
@@ -484,7 +484,7 @@ def test_without_the_authoritys_key_changes_wait(tmp_path: Path) -> None:
 
 def test_a_kit_of_two_appliances_has_both(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its address and pin come from the other one's introduction; until then a warning says what to do."""
-    monkeypatch.setattr("appliance.hosts.appliance_table._INTRODUCTION_SECONDS", 0.01)
+    monkeypatch.setattr("appliance.features.standby.appliance_table._INTRODUCTION_SECONDS", 0.01)
     pin, key = "sha256//" + 43 * "B" + "=", make_key()
     other = Introduction(signing_request(key, "rosrv-appliance"), fingerprint(key), "192.168.1.21", pin)
 

@@ -8,13 +8,13 @@ import pytest
 from cryptography import x509
 
 from appliance.base.clock import using
-from appliance.hosts import appliance_table
-from appliance.hosts.appliance_table import ApplianceTable
+from appliance.features.standby import appliance_table
+from appliance.features.standby.appliance_table import ApplianceTable
+from appliance.features.standby.replication_frames import Introduction
+from appliance.features.standby.shared_authority import SharedAuthority
 from appliance.hosts.certificate_requests import AuthorityError
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.hosts.shared_authority import SharedAuthority
 from appliance.ipsec.requests import fingerprint, make_key, signing_request
-from appliance.standby.replication_frames import Introduction
 from appliance.store.state_file import StateStore
 from tests.support.engines import InlineDatabase
 from tests.support.near_authority import NearAuthority

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
-from appliance.ipsec.sealed_authority import (
+from appliance.features.standby.sealed_authority import (
     FOLDER,
     SealedAuthority,
     keep_sealed,
     open_authority,
     sealed_authority,
 )
+from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
 
 SECRET = b"correct horse"
 

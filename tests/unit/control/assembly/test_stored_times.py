@@ -12,9 +12,9 @@ from appliance.base import clock
 from appliance.base.deadlines import Deadlines
 from appliance.control.assembly.host_blocks import BlockTable, blocks_at_start
 from appliance.control.assembly.stored_times import adopt_times, note_times
-from appliance.control.lease_client import LeaseClient
-from appliance.control.replication import Pair
-from appliance.control.standby_tunnels import StandbyTunnels
+from appliance.features.standby.lease_client import LeaseClient
+from appliance.features.standby.replication import Pair
+from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.hosts.enrolment_tokens import EnrolmentTokens
 from appliance.policy.model import address_of
 from appliance.store import host_tables

@@ -10,7 +10,7 @@ import { Icon } from "../parts/icon.js";
 import { useStore } from "../store.js";
 import { SwitchOver } from "./switch.js";
 
-const SILENT = 5; // seconds, as in channel/standby_summary.py
+const SILENT = 5; // seconds, as in features/standby/standby_summary.py
 const GRAVE = ["both-active", "standby-unready", "standby-away", "standby-behind", "witness-silent", "standby-blind", "witness-disk"];
 
 /** The panel. @param {{state: any, orders?: boolean}} given `orders`: with the button for the switchover */

@@ -1,0 +1,139 @@
+"""The two appliances at which hosts open their tunnels: addresses, and the certificates for their own tunnel keys.
+
+The standby introduces itself over the replication (`replication_frames.Introduction`). The active appliance has its key
+certified and stores the certificate in the replicated state: the standby finds it there when it takes over. Each key
+stays on its appliance. There are at most two rows; the certificate of an appliance that was replaced is revoked.
+"""
+
+import asyncio
+import contextlib
+
+import structlog
+
+from appliance.base import clock
+from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
+from appliance.features.standby.replication_frames import Introduction
+from appliance.features.standby.shared_authority import SharedAuthority
+from appliance.hosts.certificate_requests import AuthorityError
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.store.host_tables import ApplianceRow, HostTables
+
+CERTIFICATE_DAYS = 90.0
+_RENEWED_DAYS = 60.0  # at least these days are left when the standby takes over
+_INTRODUCTION_SECONDS = 8.0
+_REPLACED_SECONDS = 3600.0  # each replaced key makes the list of revoked certificates longer
+
+_log = structlog.get_logger()
+
+
+class ApplianceTable:
+    """Both appliances; `endpoint` is the address at which hosts reach this one, None on a single appliance."""
+
+    def __init__(self, kept: HostTables, revoked: RevokedCertificates, endpoint: str | None) -> None:
+        self._kept = kept
+        self._revoked = revoked
+        self._endpoint = endpoint
+        self._rows = {row.key: row for row in kept.appliances()}
+        self._introducing = asyncio.Lock()
+        self._introduced = asyncio.Event()
+        self._replaceable = (
+            -_REPLACED_SECONDS
+        )  # when the other appliance was last replaced, by the monotonic clock
+        self._own = ""  # the fingerprint of this appliance's tunnel key
+        self._pin = ""
+        if endpoint is None:
+            for row in list(self._rows.values()):
+                self._forget(row)
+
+    @property
+    def paired(self) -> bool:
+        """Whether this is one of two appliances."""
+        return self._endpoint is not None
+
+    @property
+    def other(self) -> ApplianceRow | None:
+        """Return the other appliance; None if it has not introduced itself."""
+        return next((row for row in self._rows.values() if not self._is_own(row)), None)
+
+    async def until_introduced(self) -> None:
+        """Wait a moment for the other appliance of two: with the first host, it begins to prepare its tunnels."""
+        if self.paired and self.other is None:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._introduced.wait(), _INTRODUCTION_SECONDS)
+
+    def certificate(self, key: str) -> bytes:
+        """Return the valid certificate for an appliance's tunnel key, in PEM; empty if there is none."""
+        row = self._rows.get(key)
+        return row.certificate.encode() if row is not None and row.expires > clock.wall() else b""
+
+    def is_served(self, pin: str) -> None:
+        """Note the pin of this appliance's REST server, for the kits that the other one makes."""
+        self._pin = pin
+        row = self._rows.get(self._own)
+        if row is not None and pin not in ("", row.pin):
+            self._save(row._replace(pin=pin))
+
+    def note_own(self, key: str) -> None:
+        """Note which tunnel key is this appliance's own."""
+        self._own = key
+        self.is_served(self._pin)
+
+    def certified(self, key: str, made: CertificateMade) -> None:
+        """Store the certificate for this appliance's own key, if it is one of two."""
+        self._own = key
+        if self._endpoint is not None:
+            self._save(_row(key, self._endpoint, self._pin, made))
+
+    async def introduce(self, other: Introduction, authority: SharedAuthority) -> None:
+        """Store the other appliance, with a certificate for its key that is valid for long; log a failure.
+
+        While an introduction is in progress, further ones are ignored; the standby repeats its own every hour.
+        """
+        if self._introducing.locked():
+            return
+        async with self._introducing:
+            if other.endpoint == self._endpoint:
+                _log.warning("both appliances have the same address for hosts; set ipsec.endpoint on each")
+                return
+            row = self._rows.get(other.key)
+            if row is None or row.expires < clock.wall() + _RENEWED_DAYS * 86_400:
+                await self._certify(other, authority, row)
+            elif (row.endpoint, row.pin) != (other.endpoint, other.pin):
+                self._save(row._replace(endpoint=other.endpoint, pin=other.pin))
+            self._introduced.set()
+
+    async def _certify(
+        self, other: Introduction, authority: SharedAuthority, before: ApplianceRow | None
+    ) -> None:
+        now = clock.now()
+        if before is None and now < self._replaceable + _REPLACED_SECONDS:
+            _log.warning("the other appliance changes its tunnel key too often; it gets no certificate yet")
+            return
+        try:
+            made = await authority.issue(other.request, APPLIANCE_NAME, CERTIFICATE_DAYS)
+        except AuthorityError as error:
+            _log.warning("the other appliance gets no certificate for its tunnels", reason=str(error))
+            return
+        if before is None:
+            self._replaceable = now
+        self._save(_row(other.key, other.endpoint, other.pin, made))
+        for row in list(self._rows.values()):
+            if row.key != other.key and not self._is_own(row):
+                self._forget(row)
+
+    def _is_own(self, row: ApplianceRow) -> bool:
+        return row.key == self._own or row.endpoint == self._endpoint
+
+    def _save(self, row: ApplianceRow) -> None:
+        self._rows[row.key] = row
+        self._kept.save_appliance(row)
+
+    def _forget(self, row: ApplianceRow) -> None:
+        """Remove an appliance that is not one of the two any more; its key may be in wrong hands."""
+        self._revoked.add("", row.serial, row.expires)
+        del self._rows[row.key]
+        self._kept.forget_appliance(row.key)
+
+
+def _row(key: str, endpoint: str, pin: str, made: CertificateMade) -> ApplianceRow:
+    return ApplianceRow(key, endpoint, pin, made.certificate.decode(), made.serial, made.expires)

@@ -1,0 +1,255 @@
+"""`rosrv standby join` on the appliance that has all data: make the keys and the files of all machines."""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from ipaddress import IPv4Address
+from pathlib import Path
+
+import msgspec
+import typer
+from msgspec.structs import replace
+
+from appliance.cli.output import say_json, usage_error
+from appliance.cli.up_inputs import read_node_ports
+from appliance.configuration.config_sources import resolve
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.features.standby.kit import Kits, PairPlan, make_kits
+from appliance.features.standby.membership import (
+    Membership,
+    MembershipError,
+    load_membership,
+    path_of,
+    save_membership,
+)
+from appliance.features.standby.process import EPOCH, stored_epoch
+from appliance.features.standby.sealed_authority import sealed_authority
+from appliance.supervisor.state_directory import foreign
+from rosmop.tool.terminal import refused, say
+
+_VERB = "rosrv standby"
+
+
+@dataclass(frozen=True, kw_only=True)
+class JoinOptions:
+    """The options of the command line."""
+
+    state: Path
+    address: str
+    other: str
+    witness: str
+    fixed: str
+    name: str
+    other_name: str
+    followers: tuple[str, ...]
+    ports: str | None
+    port: int
+    config: Path | None
+    out: Path
+    again: bool
+
+
+def join_first(options: JoinOptions, *, as_json: bool) -> None:
+    """Write the kits, then the membership. A failure before that leaves this appliance as it was."""
+    path = path_of(options.state)
+    _require_state(options.state)
+    earlier = existing_membership(path)
+    if earlier is not None and not options.again:
+        raise refused(
+            [
+                f"{_VERB}: this appliance is {earlier.name}, and the other one is {earlier.other}"
+                f" ({earlier.other_address}) already; --again makes new keys, and all machines are set up again"
+            ]
+        )
+    plan = _plan(options, _settings(options))
+    try:
+        kits = make_kits(plan)
+    except ValueError as error:
+        raise usage_error(str(error), _VERB) from None
+    kits = kits._replace(other=_with_authority(kits.other, options.state))
+    _write_kits(kits, options.out)
+    try:
+        save_membership(path, kits.own)
+    except OSError as error:
+        shutil.rmtree(options.out)
+        raise refused([f"{_VERB}: {path}: {error.strerror}; nothing was changed"]) from None
+    _report(plan, options, as_json=as_json)
+
+
+def _with_authority(other: Membership, state: Path) -> Membership:
+    """Add the tunnels' authority to the other appliance's file, if its key is encrypted."""
+    signer = state / "signer"
+    try:
+        with as_owner(signer):
+            sealed = sealed_authority(signer)
+    except FileNotFoundError:
+        return other  # this appliance was never started
+    except OSError as error:
+        raise refused([f"{_VERB}: {error.filename or signer}: {error.strerror}; run this as root"]) from None
+    if sealed is None:
+        return other
+    return replace(other, sealed_certificate=sealed.certificate, sealed_key=sealed.key)
+
+
+@contextlib.contextmanager
+def as_owner(folder: Path) -> Iterator[None]:
+    """Act as the owner of a folder: in a container, root may not use the folders of other users. Raises `OSError`."""
+    owner, own = folder.stat().st_uid, os.geteuid()
+    if owner == own or own != 0:
+        yield
+        return
+    os.seteuid(owner)
+    try:
+        yield
+    finally:
+        os.seteuid(own)
+
+
+def existing_membership(path: Path) -> Membership | None:
+    """Return the membership in a file, None if there is none; a damaged one is replaced like a missing one.
+
+    Exits with status 1 if it cannot be read.
+    """
+    try:
+        return load_membership(path)
+    except MembershipError as error:
+        typer.echo(f"{_VERB}: {error}; it is replaced", err=True)
+        return None
+    except OSError as error:
+        raise refused([f"{_VERB}: {path}: {error.strerror}; run this as root"]) from None
+
+
+def _require_state(state: Path) -> None:
+    try:
+        reason = foreign(state)
+    except OSError as error:
+        reason = f"{state}: {error.strerror}; run this as root"
+    if reason is not None:
+        raise refused([f"{_VERB}: {reason}"])
+
+
+def _settings(options: JoinOptions) -> Settings:
+    """Return the settings of the running appliance; without one, those of the configuration file."""
+    running = options.state / "run" / "config.json"
+    try:
+        if running.exists():
+            return load_resolved(running)
+    except OSError as error:
+        raise refused([f"{_VERB}: {running}: {error.strerror}; run this as root"]) from None
+    return resolve(options.config, os.environ, {"state": options.state})
+
+
+def _plan(options: JoinOptions, settings: Settings) -> PairPlan:
+    if settings.isolation == "none":
+        raise refused(
+            [
+                f"{_VERB}: isolation none has no firewall, so a standby could be used before it is active; start the"
+                " appliance with isolation netns or container"
+            ]
+        )
+    followers = _followers(options.followers)
+    for text in (options.address, options.other, options.witness, options.fixed, *followers.values()):
+        try:
+            IPv4Address(text)
+        except ValueError:
+            raise usage_error(f"{text!r} is not an IPv4 address", _VERB) from None
+    try:
+        epoch = stored_epoch(options.state / "lease" / EPOCH)
+    except (OSError, ValueError) as error:
+        raise refused([f"{_VERB}: {error}"]) from None
+    return PairPlan(
+        name=options.name,
+        address=options.address,
+        other=options.other_name,
+        other_address=options.other,
+        witness=options.witness,
+        fixed=options.fixed,
+        port=options.port,
+        ports=_ports(options, settings),
+        master_port=settings.listen_address[1],
+        epoch=epoch + 1,
+        followers=followers,
+    )
+
+
+def _ports(options: JoinOptions, settings: Settings) -> tuple[str, ...]:
+    """Return the TCP ports that the robot's computers translate to the active appliance."""
+    if options.ports is not None:
+        return tuple(part.strip() for part in options.ports.split(","))
+    nodes = read_node_ports(settings)
+    single = [settings.listen_address[1], *(() if settings.api_address is None else settings.api_address[1:])]
+    if 0 in single:
+        raise usage_error(
+            "port 0 differs at each start; choose a port in the configuration, or give --ports", _VERB
+        )
+    return (*map(str, single), f"{nodes.start}-{nodes.stop - 1}")
+
+
+def _followers(texts: tuple[str, ...]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for text in texts:
+        name, separator, address = text.partition("=")
+        if not separator or name in found:
+            raise usage_error(f"--follower {text!r}: write NAME=ADDRESS, each name once", _VERB)
+        found[name] = address
+    return found
+
+
+def _write_kits(kits: Kits, out: Path) -> None:
+    """Write all files below a new folder; remove it again after an error."""
+    try:
+        out.mkdir(mode=0o700, parents=True)
+    except FileExistsError:
+        raise usage_error(
+            f"{out} already exists: remove it, or name another folder with --out", _VERB
+        ) from None
+    except OSError as error:
+        raise usage_error(f"{out}: {error.strerror}", _VERB) from None
+    try:
+        text = msgspec.json.format(msgspec.json.encode(kits.other))
+        _write(out / f"standby-{kits.other.name}.json", text, 0o600)
+        for folder, members in kits.folders.items():
+            (out / folder).mkdir(mode=0o700)
+            for member in members:
+                _write(out / folder / member.name, member.text.encode(), member.mode)
+    except OSError as error:
+        shutil.rmtree(out)
+        raise refused([f"{_VERB}: {out}: {error.strerror}; nothing was changed"]) from None
+
+
+def _write(path: Path, data: bytes, mode: int) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+    with os.fdopen(descriptor, "wb") as file:
+        os.fchmod(descriptor, mode)  # independent of the umask
+        file.write(data)
+
+
+def _report(plan: PairPlan, options: JoinOptions, *, as_json: bool) -> None:
+    out, given = options.out, f"standby-{plan.other}.json"
+    if as_json:
+        say_json(
+            {
+                "name": plan.name,
+                "other": plan.other,
+                "ports": list(plan.ports),
+                "out": str(out),
+                "followers": list(plan.followers),
+            }
+        )
+        return
+    say(
+        f"{plan.name} ({plan.address}) and {plan.other} ({plan.other_address}) are a pair at their next start."
+    )
+    say(f"At {plan.fixed} the robot reaches the active one: TCP {', '.join(plan.ports)}.")
+    say("Next:")
+    say(
+        f"1. Copy {out / given} to {plan.other}. There: rosrv standby join {given}, then start the appliance."
+    )
+    say(f"2. Copy {out / 'witness'} to the robot ({plan.witness}). There: sudo ./install.sh")
+    for name, address in plan.followers.items():
+        say(f"   Copy {out / f'follower-{name}'} to {name} ({address}). There: sudo ./install.sh")
+    say("3. Restart this appliance. From step 2 until it has started, the robot's nodes reach no appliance.")
+    say(f"4. Start the nodes with ROS_MASTER_URI=http://{plan.fixed}:{plan.master_port}")
+    say(f"5. Check both: rosrv standby status. Then remove {out}: it has private keys.")

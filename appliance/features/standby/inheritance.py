@@ -1,0 +1,175 @@
+"""Pass the state of monitors from one appliance to the other.
+
+The replicated setting `active appliance` has the name and epoch of the appliance whose relays passed the last messages.
+It is stored only after all relays have taken the inherited state: a control that dies before inherits again. In a
+planned switchover, the relays first drop all messages and leave their state, which is stored before the lease is given
+up.
+
+For any other takeover, the state is copied while it changes: at most every `_COPY_SECONDS`, and less often if it is
+large. The replicated setting `_COPIES` has the time of the last copy; a standby notes when it gets a later one
+(`CopyAge`). A copy is used only if it was made in the last epoch, and if the standby got a time of it in the last
+`_FRESH_SECONDS`. Otherwise the state is lost: monitors that act by their state hold their topics. Monitors without a
+copy then hold theirs too, and so do those with the modifier `hold`, because a copy lacks the last moment.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable
+
+import msgspec
+
+from appliance.base import clock
+from appliance.features.standby.lease_client import HandOverError
+from appliance.features.standby.replication import Pair
+from appliance.specifications.rollout import InheritedState, Rollout
+from appliance.store.state_file import StateStore
+
+_ACTIVE = "active appliance"
+_COPIES = "copies of monitors"
+_LEAVE_SECONDS = 2.0
+_COPY_SECONDS = 0.2
+_LOOK_SECONDS = 0.25
+_NOTE_SECONDS = 1.0  # between two notes that the copies are up to date
+_BYTES_A_SECOND = 1 << 20
+_UNABLE_SECONDS = 5.0  # after a state that cannot be copied
+_FRESH_SECONDS = 5.0  # includes the time of the takeover
+
+
+class _Active(msgspec.Struct, frozen=True):
+    name: str
+    epoch: int
+
+
+class _Copies(msgspec.Struct, frozen=True):
+    """The stored states are those of this epoch; `at` is the time of its monitors (ns).
+
+    0: the relays left these states, and passed no message since.
+    """
+
+    epoch: int
+    at: int
+
+
+def _save_copies(store: StateStore, epoch: int, contents: Iterable[tuple[int, bytes]], at: int) -> None:
+    with store.database.together():
+        for index, content in contents:
+            store.save_monitor_state(index, epoch, content)
+        store.save_setting(_COPIES, msgspec.json.encode(_Copies(epoch, at)).decode())
+
+
+def inherited_state(pair: Pair, store: StateStore) -> tuple[InheritedState, Callable[[], None]]:
+    """Return the state that this appliance's relays start with, and the function to call once they have it."""
+    own = _Active(pair.membership.name, pair.epoch)
+
+    def taken() -> None:
+        with store.database.together():
+            store.save_setting(_ACTIVE, msgspec.json.encode(own).decode())
+            store.save_setting(_COPIES, "")
+            store.clear_monitor_states()
+
+    settings = store.settings()
+    text = settings.get(_ACTIVE)
+    last = msgspec.json.decode(text, type=_Active) if text is not None else own
+    if last.name == own.name:
+        return InheritedState(), taken
+    lost = f"the appliance {last.name} was active, and its monitors' state is lost with it"
+    note = settings.get(_COPIES)
+    copies = msgspec.json.decode(note, type=_Copies) if note else _Copies(0, 0)
+    if copies.epoch != last.epoch or last.epoch != pair.epoch - 1:
+        return InheritedState(lost), taken
+    left = tuple(store.monitor_states(last.epoch))
+    if not copies.at:
+        return InheritedState(left=left), taken
+    fresh = pair.copy_age is not None and pair.copy_age <= _FRESH_SECONDS
+    return InheritedState(lost, left, copies.at) if fresh else InheritedState(lost), taken
+
+
+async def leave_state(pair: Pair, store: StateStore, rollout: Rollout) -> None:
+    """Stop the relays, and store the state of their monitors. Raises `HandOverError` if a relay does not answer."""
+    try:
+        contents = await rollout.leave(_LEAVE_SECONDS)
+    except (TimeoutError, ConnectionError) as error:
+        raise HandOverError("a relay does not answer; try again") from error
+    _save_copies(store, pair.epoch, enumerate(contents), 0)
+
+
+def keep_state(store: StateStore, rollout: Rollout) -> None:
+    """Go on after `leave_state`: what the relays left is void."""
+    store.save_setting(_COPIES, "")
+    rollout.pass_again()
+
+
+class StateCopies:
+    """The copies of the active appliance's monitors, for an unplanned takeover.
+
+    `followed()`: the standby gets changes now.
+    """
+
+    def __init__(self, pair: Pair, store: StateStore, rollout: Rollout, followed: Callable[[], bool]) -> None:
+        self._epoch = pair.epoch
+        self._store = store
+        self._rollout = rollout
+        self._followed = followed
+        self._complete = False  # whether the stored copies are those of all relays
+        self._noted = 0.0
+
+    async def run(self) -> None:
+        """Copy changed states until cancelled."""
+        while True:
+            await asyncio.sleep(await self.copy_once())
+
+    async def copy_once(self) -> float:
+        """Copy the states that have changed; return the seconds until the next time."""
+        if not self._rollout.has_state() or not self._followed():
+            self._void()
+            return _COPY_SECONDS
+        try:
+            copies = await self._rollout.copies(_LEAVE_SECONDS, full=not self._complete)
+        except (TimeoutError, ConnectionError):
+            self._void()
+            return _COPY_SECONDS
+        if not self._rollout.has_state():  # an operator has ordered a switchover since
+            return _COPY_SECONDS
+        if not all(copy.at for copy in copies):
+            self._void()
+            return _UNABLE_SECONDS
+        changed = [(index, copy.content) for index, copy in enumerate(copies) if copy.content is not None]
+        if changed or clock.now() - self._noted >= _NOTE_SECONDS:
+            _save_copies(self._store, self._epoch, changed, max(copy.at for copy in copies))
+            self._noted = clock.now()
+        self._complete = True
+        size = sum(len(content) for _index, content in changed)
+        return max(_COPY_SECONDS, size / _BYTES_A_SECOND)
+
+    def _void(self) -> None:
+        """Make the stored copies void, because they are not continued."""
+        if self._complete:
+            self._complete = False
+            if self._rollout.has_state():
+                self._store.save_setting(_COPIES, "")
+
+
+class CopyAge:
+    """The time since a standby got the last note that the copies are up to date.
+
+    `setting(name)` returns a replicated setting.
+    """
+
+    def __init__(self, setting: Callable[[str], str]) -> None:
+        self._setting = setting
+        self._note = setting(_COPIES)
+        self._changed: float | None = None
+
+    async def run(self) -> None:
+        """Look for new notes until cancelled."""
+        while True:
+            self.look(await asyncio.to_thread(self._setting, _COPIES))
+            await asyncio.sleep(_LOOK_SECONDS)
+
+    def look(self, note: str) -> None:
+        """Take the present note."""
+        if note != self._note:
+            self._note, self._changed = note, clock.now()
+
+    def at(self, moment: float) -> float | None:
+        """Return the age at a time (monotonic); None if there was no new note."""
+        return None if self._changed is None else max(0.0, moment - self._changed)

@@ -1,0 +1,45 @@
+"""Answer operators while a lapse of the lease stops control, and while control starts again as that of a standby.
+
+Requests on the admin socket would otherwise wait for ten seconds and more. The supervisor reads each request up to its
+line end without parsing it, and gives every request the same answer. Most lapses are shorter than `_PATIENCE_SECONDS`:
+control itself answers after these.
+"""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Callable
+from functools import partial
+
+import msgspec
+
+from appliance.features.standby.lease_watch import LONGEST_LAPSE
+
+PAUSED = (
+    "the appliance is paused: its lease has lapsed, and it answers and relays nothing until the lease is renewed; after"
+    f" {LONGEST_LAPSE:g} s it becomes the standby. Check its load, and its network to the robot and the other appliance"
+)
+BECOMES_STANDBY = (
+    "this appliance lost its lease, and is starting again as the standby: try again in some seconds"
+)
+_PATIENCE_SECONDS = 1.0
+_REQUEST_SECONDS = 1.0
+_LONGEST_REQUEST = 16 << 20  # bytes, as in `control/admin_socket.py`
+
+
+async def answer_for_control(listener: Callable[[], socket.socket], reason: str) -> None:
+    """Answer with the reason until cancelled, from `_PATIENCE_SECONDS` on; `listener()` copies the admin socket."""
+    await asyncio.sleep(_PATIENCE_SECONDS)
+    async with await asyncio.start_unix_server(
+        partial(_answer, reason), sock=listener(), limit=_LONGEST_REQUEST
+    ) as server:
+        await server.serve_forever()
+
+
+async def _answer(reason: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    with contextlib.suppress(OSError, ValueError, TimeoutError):
+        async with asyncio.timeout(_REQUEST_SECONDS):
+            await reader.readline()
+            writer.write(msgspec.json.encode({"ok": False, "error": reason, "trouble": "failed"}) + b"\n")
+            await writer.drain()
+    writer.close()

@@ -1,0 +1,340 @@
+"""The lease as an appliance sees it: active or passive, by times and messages alone.
+
+This module reads no clock and no socket. Its owner passes the time with each message, sends what comes back, and calls
+`tick` when `next_event` is due. A time is that of the appliance's own clock, which must run while the machine sleeps
+(CLOCK_BOOTTIME); clocks are never compared.
+
+1. The active appliance stays active for 0.8 of an expiry after it *sent* a renewal that was granted, or a request for a
+   promise that was given. The witness and the other appliance count a whole expiry from a later time.
+2. A passive appliance becomes active only by a grant of the witness. A grant that arrives while it has promised not to
+   claim waits until the promise ends: the other appliance may rely on it.
+3. A passive appliance gives no promise while the witness says that the lease has expired: the active appliance is cut
+   off from the robot, which then needs this one. It asks the witness also while it has promised not to claim.
+4. An appliance that starts may have given a promise before, so it claims one expiry later.
+5. Only the witness makes epochs. An active appliance believes no other one that claims a later epoch: by 1 and 2 there
+   is none. A passive appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
+6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
+   It waits for the standby again before it asks the witness to add it.
+7. The active appliance gives its lease up only if the other one could claim it at once: that one has all data and could
+   serve, the witness answers it, and can save the grant. Each promise has what the other one knows of this.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from appliance.features.standby.witness import EXPIRY
+
+RENEW_SECONDS = 0.3
+CLAIM_SECONDS = 0.1  # between two claims, while no appliance is admitted
+CONFIDENCE = 0.8 * EXPIRY  # the rest allows for clocks that run at different speeds
+SILENCE = EXPIRY / 2  # after which the standby is removed if an answer waits for it
+FARTHEST = 1 << 20  # takeovers and restarts that an appliance may have missed
+_RENEWABLE = 2 * EXPIRY  # in this time after its lease has lapsed, the other appliance has claimed, or cannot
+_MOST_PENDING = 16
+
+Operation = Literal["renew", "claim", "remove", "add", "release", "look"]
+
+
+class LeaseError(Exception):
+    """An order that is not possible now; the message has the remedy."""
+
+
+@dataclass(frozen=True)
+class WitnessRequest:
+    """A request to the witness. `sequence` orders the requests of this process; `sent` is its time."""
+
+    operation: Operation
+    epoch: int
+    sequence: int
+    sent: float
+
+
+@dataclass(frozen=True)
+class WitnessAnswer:
+    """An answer of the witness, with the lease after the request.
+
+    `expired`: no appliance has renewed it in time. `trouble`: why the witness could not save the next grant.
+    """
+
+    ok: bool
+    reason: str
+    epoch: int
+    holder: str
+    in_sync: frozenset[str]
+    expired: bool
+    trouble: str = ""
+
+
+@dataclass(frozen=True)
+class PromiseRequest:
+    """A request of the active appliance: do not claim for one expiry."""
+
+    epoch: int
+    session: str
+    number: int
+
+
+@dataclass(frozen=True)
+class ClaimPromise:
+    """The promise not to claim for one expiry; it repeats the request.
+
+    `able`: the sender could serve after a takeover. `unheard`: the seconds since it sent the last request that the
+    witness answered. An appliance of an earlier version leaves both out.
+    """
+
+    epoch: int
+    session: str
+    number: int
+    able: bool = True
+    unheard: float = 0.0
+
+
+@dataclass(frozen=True)
+class TakeOver:
+    """The order to claim now. It ends the promises up to this number, which the sender no longer relies on."""
+
+    epoch: int
+    session: str
+    number: int
+
+
+PeerMessage = PromiseRequest | ClaimPromise | TakeOver
+Outgoing = Sequence[WitnessRequest | PeerMessage]
+
+
+class ApplianceLease:
+    """The state of one appliance. `epoch` is the highest that it has stored; `session` is new at each start."""
+
+    def __init__(self, name: str, other: str, session: str, epoch: int, now: float) -> None:
+        self.epoch = epoch
+        self.held: int | None = None
+        self.answers_alone = False
+        self.refusal = ""
+        self.ready = True  # False: this appliance could not serve, so it does not claim
+        self._name = name
+        self._other = other
+        self._session = session
+        self._valid_until = now
+        self._promised_until = now + EXPIRY
+        self._promised_to: PromiseRequest | None = None
+        self._next_round = now
+        self._sequence = 0
+        self._asked: dict[int, float] = {}
+        self._number = 0
+        self._started = self._heard = now - EXPIRY
+        self._witnessed_at = self._started  # sending time of the last request that the witness answered
+        self._trouble = ""
+        self._other_able = True
+        self._other_witnessed: float | None = None
+        self._next_removal = now
+        self._expired = False
+        self._last_add = 0
+        self._witnessed = epoch  # the greatest epoch of the witness
+        self._rumoured = (
+            0  # requests up to this number were sent before the other appliance claimed the epoch
+        )
+        # A switchover: requests and promises up to these numbers no longer make this appliance active.
+        self._switching_until: float | None = None
+        self._released = False
+        self._void_sequence = self._void_number = 0
+
+    @property
+    def valid_until(self) -> float:
+        """Return the time to which this appliance stays active if no further answer arrives."""
+        return self._valid_until
+
+    @property
+    def heard(self) -> float | None:
+        """Return the time of the last request of this appliance that the other one answered; None: no answer yet."""
+        return self._heard if self._heard > self._started else None
+
+    @property
+    def other_witnessed(self) -> float | None:
+        """Return the time of the last answer of the witness to the other appliance, by its promises; None: unknown."""
+        return self._other_witnessed
+
+    def handover_obstacle(self, now: float) -> str:
+        """Return why the other appliance could not claim at once if this one gave the lease up; empty: it could."""
+        other = self._other
+        if self.answers_alone or now - self._heard > SILENCE:
+            return f"{other} is not ready to take over; wait until it answers and has all data"
+        if not self._other_able:
+            return f"{other} could not serve after a takeover; `rosrv standby status` there says why"
+        if self._other_witnessed is None or now - self._other_witnessed > EXPIRY:
+            return f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
+        return f"the witness could not save the takeover: {self._trouble}" if self._trouble else ""
+
+    def is_active(self, now: float) -> bool:
+        """Whether this appliance may decide, relay and answer."""
+        return self.held is not None and self._promised_until <= now < self._valid_until
+
+    def may_be_renewed(self, now: float) -> bool:
+        """Whether a lapsed lease may soon be renewed in its epoch; then no other appliance was active since."""
+        if self.held is None or self._switching_until is not None:
+            return False
+        return self.answers_alone or now < self._valid_until + _RENEWABLE
+
+    def may_answer(self, now: float, *, acknowledged: bool) -> bool:
+        """Whether a change may be answered now; `acknowledged` by the standby."""
+        return self.is_active(now) and (acknowledged or self.answers_alone)
+
+    def next_event(self, now: float) -> float:
+        """Return the time of the next `tick`, or of the next change of `is_active`."""
+        changes = (self._valid_until, self._promised_until)
+        return min([self._next_round, *(time for time in changes if time > now)])
+
+    def follow(self, epoch: int) -> bool:
+        """Whether data of an active appliance with this epoch is accepted; a smaller epoch never is."""
+        if epoch < self.epoch or epoch == self.held:
+            return False
+        if epoch - self.epoch > FARTHEST:
+            return False
+        if epoch > self.epoch:
+            self._rumoured = self._sequence
+        self._learn(epoch)
+        return True
+
+    def tick(self, now: float, *, waiting_since: float | None, caught_up: bool) -> Outgoing:
+        """Return what is due.
+
+        `waiting_since`: the time of the oldest change that waits for the standby. `caught_up`: the standby has
+        acknowledged all changes.
+        """
+        if now < self._next_round:
+            return self._remove(now, waiting_since)
+        self._next_round = now + RENEW_SECONDS
+        if self.held is None:
+            if now >= self._promised_until and self.ready:
+                self._next_round = now + CLAIM_SECONDS
+                return (self._to_witness("claim", now),)
+            if now < self._promised_until:
+                self._next_round = min(self._next_round, self._promised_until)
+            return (self._to_witness("look", now),)
+        if self._switching_until is not None:
+            if now < self._switching_until:
+                return (self._take_over() if self._released else self._to_witness("release", now),)
+            self._switching_until = None  # the other appliance did not claim
+        due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
+        if self.is_active(now):
+            due.append(self._ask(now))
+            due += self._remove(now, waiting_since)
+            if self.answers_alone and caught_up:
+                self.answers_alone = False
+                due.append(self._to_witness("add", now))
+                self._last_add = self._sequence
+        return due
+
+    def answered(self, request: WitnessRequest, answer: WitnessAnswer) -> Outgoing:
+        """Take an answer of the witness to a request of this process."""
+        self.refusal, self._trouble = answer.reason, answer.trouble
+        self._witnessed_at = max(self._witnessed_at, request.sent)
+        if self.epoch and answer.epoch - self.epoch > FARTHEST:
+            self.refusal = (
+                f"the witness has epoch {answer.epoch}, this appliance {self.epoch}: if an operator chose that of the"
+                " witness, stop this appliance and run `rosrv standby repair`"
+            )
+            return ()
+        if answer.epoch < self.epoch and request.sequence > self._rumoured:
+            self.epoch = max(
+                answer.epoch, self._witnessed
+            )  # what the other appliance claimed was never granted
+        if answer.epoch < self.epoch:
+            return ()
+        self._witnessed = answer.epoch
+        self._expired = answer.expired
+        if answer.holder != self._name or not answer.ok:
+            self._learn(
+                answer.epoch
+            )  # perhaps of a grant to this appliance whose answer was lost: it claims again
+            return ()
+        if request.operation == "claim" and answer.epoch > request.epoch:
+            self.held = self.epoch = answer.epoch
+            self._switching_until = None
+        if self.held != answer.epoch:
+            return ()
+        if request.sequence > self._last_add:
+            self.answers_alone = self._other not in answer.in_sync
+        if request.operation in ("claim", "renew") and request.sequence > self._void_sequence:
+            self._valid_until = max(self._valid_until, request.sent + CONFIDENCE)
+        if request.operation == "release" and self._switching_until is not None:
+            self._released = True
+            return (self._take_over(),)
+        return ()
+
+    def received(self, now: float, message: PeerMessage) -> Outgoing:
+        """Take a message of the other appliance."""
+        match message:
+            case PromiseRequest():
+                if self.is_active(now):
+                    return ()
+                if not self.follow(message.epoch) or self._expired:
+                    return ()
+                self._promised_until = max(self._promised_until, now + EXPIRY)
+                last = self._promised_to
+                if last is None or (message.epoch, message.number) > (last.epoch, last.number):
+                    self._promised_to = (
+                        message  # an earlier request that arrives late is not the last promise
+                    )
+                unheard = now - self._witnessed_at
+                return (ClaimPromise(message.epoch, message.session, message.number, self.ready, unheard),)
+            case ClaimPromise(epoch, session, number):
+                asked = self._asked.get(number)
+                if session == self._session and epoch == self.held and asked is not None:
+                    if asked >= self._heard:
+                        self._other_able, self._other_witnessed = message.able, asked - message.unheard
+                    self._heard = max(self._heard, asked)
+                    if self.is_active(now) and number > self._void_number:
+                        self._valid_until = max(self._valid_until, asked + CONFIDENCE)
+            case TakeOver(epoch, session, number):
+                promised = self._promised_to
+                if (
+                    promised is not None
+                    and (promised.epoch, promised.session) == (epoch, session)
+                    and promised.number <= number
+                    and epoch == self.epoch
+                ):
+                    self._promised_until = self._next_round = now
+                    self._promised_to = None
+                    return self.tick(now, waiting_since=None, caught_up=False)
+        return ()
+
+    def switch_over(self, now: float) -> Outgoing:
+        """Become passive, and let the other appliance claim at once. Raises `LeaseError`."""
+        if not self.is_active(now):
+            raise LeaseError("this appliance is not active; give the order to the other one")
+        obstacle = self.handover_obstacle(now)
+        if obstacle:
+            raise LeaseError(obstacle)
+        self._valid_until = now
+        self._void_sequence, self._void_number = self._sequence, self._number
+        self._switching_until, self._released = now + 2 * EXPIRY, False
+        self._next_round = now
+        return self.tick(now, waiting_since=None, caught_up=False)
+
+    def _learn(self, epoch: int) -> None:
+        if epoch > self.epoch:
+            self.epoch = epoch
+            self.held = None
+
+    def _remove(self, now: float, waiting_since: float | None) -> Sequence[WitnessRequest]:
+        """Return the request to remove the standby if a change has waited for it too long; at most one in a round."""
+        waits = waiting_since is not None and now - waiting_since > SILENCE
+        if not waits or self.answers_alone or now < self._next_removal or not self.is_active(now):
+            return ()
+        self._next_removal = now + RENEW_SECONDS
+        return (self._to_witness("remove", now),)
+
+    def _to_witness(self, operation: Operation, now: float) -> WitnessRequest:
+        self._sequence += 1
+        epoch = self.epoch if self.held is None else self.held
+        return WitnessRequest(operation, epoch, self._sequence, now)
+
+    def _ask(self, now: float) -> PromiseRequest:
+        self._number += 1
+        self._asked[self._number] = now
+        self._asked.pop(self._number - _MOST_PENDING, None)
+        return PromiseRequest(self.epoch, self._session, self._number)
+
+    def _take_over(self) -> TakeOver:
+        return TakeOver(self.epoch, self._session, self._void_number)

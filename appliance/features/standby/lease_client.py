@@ -1,0 +1,121 @@
+"""Control's end of the link to the lease, on one of two appliances."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+from appliance.base import clock
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
+from appliance.features.standby.witness import EXPIRY
+
+_HAND_OVER_SECONDS = 5.0
+_SERVES_SECONDS = 0.5
+
+
+class HandOverError(Exception):
+    """The other appliance cannot take over now; the text has the reason."""
+
+
+class LeaseClient:
+    """The last report of the lease."""
+
+    def __init__(self) -> None:
+        self.state: messages.LeaseState | None = None
+        self._listeners: list[Callable[[messages.LeaseState], None]] = []
+        self._present = False
+        self._link = Link(self.heard, self._lost)
+        self._news = asyncio.Event()
+        self._handing_over: asyncio.Future[str] | None = None
+
+    def attach(self, channel: Channel) -> None:
+        """Use a new link."""
+        self._link.attach(channel)
+        if self._present:
+            self.send(messages.ControlPresent())
+
+    def present(self) -> None:
+        """Report that this process stands by or serves."""
+        self._present = True
+        self.send(messages.ControlPresent())
+
+    def withdraw(self) -> None:
+        """Report that this process stands by, but could not serve."""
+        if self._present:
+            self._present = False
+            self.send(messages.ControlUnready())
+
+    async def report_service(self, report: Callable[[], messages.ControlServes]) -> None:
+        """Report until cancelled that this process serves, or why it cannot: if reports stop, it does not."""
+        while True:
+            self.send(report())
+            await asyncio.sleep(_SERVES_SECONDS)
+
+    def listen(self, changed: Callable[[messages.LeaseState], None]) -> None:
+        """Call `changed` with the last report, if there is one, and with each later report."""
+        self._listeners.append(changed)
+        if self.state is not None:
+            changed(self.state)
+
+    def send(self, message: messages.Message) -> None:
+        """Send a message; without a link it is lost, and the next link begins with a new report."""
+        self._link.send(message)
+
+    def active(self) -> bool:
+        """Whether this appliance may answer now."""
+        return self.state is not None and clock.since_boot() < self.state.until
+
+    def hears_witness(self) -> bool:
+        """Whether the witness on the robot has just answered this appliance."""
+        answered = None if self.state is None else self.state.answered
+        return answered is not None and clock.since_boot() - answered <= EXPIRY
+
+    async def standby_hears_witness(self) -> bool:
+        """Whether the witness answers a request that the standby sends after this call; wait an expiry at most."""
+        asked = clock.since_boot()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(EXPIRY):
+                while self.state is None or (self.state.other_witnessed or 0.0) < asked:
+                    self._news.clear()
+                    await self._news.wait()
+                return True
+        return False
+
+    async def until_active(self) -> None:
+        """Wait until this appliance may answer. If the lease has ended, the supervisor ends this process."""
+        while not self.active():
+            self._news.clear()
+            await self._news.wait()
+
+    async def hand_over(self) -> None:
+        """Become passive and let the other appliance take over. Raises `HandOverError` if that is not possible now."""
+        if self._handing_over is not None:
+            raise HandOverError("a switchover has already begun")
+        self._handing_over = asyncio.get_running_loop().create_future()
+        try:
+            self.send(messages.HandOverWanted())
+            async with asyncio.timeout(_HAND_OVER_SECONDS):
+                reason = await self._handing_over
+        except TimeoutError:
+            raise HandOverError("the process `lease` does not answer; check the log, and try again") from None
+        finally:
+            self._handing_over = None
+        if reason:
+            raise HandOverError(reason)
+
+    def heard(self, message: Any) -> None:
+        """Take a message of the lease."""
+        match message:
+            case messages.LeaseState():
+                self.state = message
+                self._news.set()
+                for changed in self._listeners:
+                    changed(message)
+            case messages.HandOverAnswered(reason):
+                if self._handing_over is not None and not self._handing_over.done():
+                    self._handing_over.set_result(reason)
+
+    def _lost(self, _reason: str) -> None:
+        """Keep the last report: its `until` ends the right to answer."""

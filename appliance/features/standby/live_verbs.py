@@ -1,0 +1,134 @@
+"""`rosrv standby status|promote`: the running appliance and the other one."""
+
+import threading
+from functools import partial
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from appliance.base import clock
+from appliance.channel.admin import StandbyPromote, StandbyWanted
+from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
+from appliance.cli.connection.target import Appliance, speaks, speaks_with
+from appliance.cli.output import say_json, usage_error
+from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
+from appliance.features.standby.standby_answers import StandbyState
+from appliance.features.standby.standby_view import standby_view
+from rosmop.tool.terminal import printable, say
+
+_VERB = "rosrv standby"
+_WATCH_SECONDS = 2.0
+_SWITCH_SECONDS = 20.0
+_AGAIN_SECONDS = 0.2
+_SHOW_SECONDS = 2.0
+
+
+@speaks_with("One JSON object; with --watch one a line")
+def status(
+    appliance: Appliance,
+    *,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
+    ] = False,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=LEAST_SECONDS,
+            max=LONGEST_SECONDS,
+            help="With --watch: the time between two states (default: 2)",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Show both appliances and the witness: which one is active, and how far behind the standby is.
+
+    Exit status: 0 if the other appliance can take over (on a standby: if this one follows) and the witness answers, 1
+    if not, with the reason, 2 if no appliance runs.
+
+    Example: rosrv standby status --watch
+    """
+    if every is not None and not watch:
+        raise usage_error("--every needs --watch", _VERB)
+    if watch:
+        try:
+            raise typer.Exit(
+                watched(partial(_look, appliance), every or _WATCH_SECONDS, as_json=appliance.as_json)
+            )
+        except NotRunningError as error:
+            raise usage_error(str(error)) from None
+    view = standby_view(appliance.ask_or_exit(StandbyWanted()))
+    if appliance.as_json:
+        say_json(view.fields)
+    else:
+        Console(highlight=False).print(view.screen)
+    raise typer.Exit(view.exit_status)
+
+
+@speaks
+def promote(appliance: Appliance) -> None:
+    """Make the standby the active appliance, for example before an update: a planned switchover.
+
+    Give the order on the active appliance, or on the standby's own machine. It waits until the standby is active, at
+    most 20 s. Exit status: 0 switched over, 1 not, with the reason, 2 no appliance runs.
+
+    Example: rosrv standby promote
+    """
+    before = appliance.ask_or_exit(StandbyWanted())
+    name = before.other.name if before.role == "active" else before.name
+    typer.echo(f"{_VERB}: {printable(name)} is to take over from {_holder(before)}", err=True)
+    lost = ""
+    try:
+        appliance.body_or_exit(appliance.ask(StandbyPromote()))
+    except AccessDeniedError as error:
+        raise usage_error(str(error)) from None
+    except NotRunningError as error:
+        lost = f" ({printable(str(error))})"  # a switchover ends the process that answers
+    after = _held_by(name, appliance)
+    if after is None:
+        text = f"{printable(name)} is not active after {_SWITCH_SECONDS:g} s{lost}; see: rosrv standby status"
+        typer.echo(f"{_VERB}: {text}", err=True)
+        raise typer.Exit(1)
+    if appliance.as_json:
+        say_json(after)
+    else:
+        say(f"{printable(name)} is active, epoch {after.epoch}")
+
+
+def _look(appliance: Appliance) -> StatusView:
+    """Return the present state. Raises `NotRunningError` also for an appliance that cannot give it now.
+
+    Exits with status 1 on an appliance that is not one of two.
+    """
+    answer = appliance.ask(StandbyWanted())
+    if not answer.ok and answer.trouble != "unknown":
+        raise NotRunningError(answer.error)
+    return standby_view(appliance.body_or_exit(answer))
+
+
+def _holder(state: StandbyState) -> str:
+    return printable(state.witness.holder) or "no appliance"
+
+
+def _held_by(name: str, appliance: Appliance) -> StandbyState | None:
+    """Return the state once the appliance with this name holds the lease; None if it does not in time.
+
+    Every few seconds, a line on standard error says that the command waits.
+    """
+    pause, began = threading.Event(), clock.now()
+    shown, until = began, began + _SWITCH_SECONDS
+    while (now := clock.now()) < until:
+        if now - shown >= _SHOW_SECONDS:
+            shown = now
+            typer.echo(f"{_VERB}: waiting for {printable(name)}, {now - began:.0f} s", err=True)
+        try:
+            answer = appliance.ask(StandbyWanted())
+        except NotRunningError:
+            answer = None  # the process that answers is being started again
+        if answer is not None and answer.ok:
+            state = answer.given()
+            if state.witness.holder == name:
+                return state
+        pause.wait(_AGAIN_SECONDS)
+    return None

@@ -1,0 +1,179 @@
+"""`rosrv standby join|leave|repair`: make an appliance one of two, or a single one, without a running appliance."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from msgspec.structs import replace
+
+from appliance.cli.connection.target import DEFAULT_STATE, State
+from appliance.cli.output import Json, say_json, usage_error
+from appliance.features.standby.first_join import JoinOptions, join_first
+from appliance.features.standby.membership import (
+    LEFT_FILE,
+    PORT,
+    MembershipError,
+    load_membership,
+    path_of,
+    save_membership,
+)
+from appliance.features.standby.process import EPOCH
+from appliance.features.standby.second_join import join_second
+from appliance.supervisor.state_directory import StateDirectory
+from rosmop.tool.terminal import printable, say
+
+_VERB = "rosrv standby"
+_Address = Annotated[str | None, typer.Option(metavar="ADDRESS", show_default=False)]
+
+
+def join(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="On the other appliance: the file standby-NAME.json that the first one wrote"),
+    ] = None,
+    *,
+    state: State = DEFAULT_STATE,
+    address: Annotated[
+        str | None, typer.Option(help="Address of this appliance, as the robot sees it (IPv4)")
+    ] = None,
+    other: Annotated[str | None, typer.Option(help="Address of the other appliance")] = None,
+    witness: Annotated[str | None, typer.Option(help="Address of the robot's computer")] = None,
+    fixed: Annotated[
+        str | None,
+        typer.Option(help="Unused address of the robot's network, at which nodes reach the active appliance"),
+    ] = None,
+    name: Annotated[str, typer.Option(help="Name of this appliance")] = "a",
+    other_name: Annotated[str, typer.Option(help="Name of the other appliance")] = "b",
+    follower: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=ADDRESS", help="Further computer that uses the fixed address. Repeatable."
+        ),
+    ] = None,
+    ports: Annotated[
+        str | None,
+        typer.Option(
+            help="TCP ports at the fixed address: 11311,19001-26000 (default: those of the appliance's configuration"
+            " and policy)"
+        ),
+    ] = None,
+    port: Annotated[
+        int, typer.Option(help="Port between the appliances, UDP and TCP", min=1, max=65_535)
+    ] = PORT,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration file, for the default of --ports (default: ./appliance.yaml)"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="New folder for the files of the other machines; it has private keys")
+    ] = None,
+    again: Annotated[
+        bool, typer.Option("--again", help="Replace an earlier membership; all machines are set up again")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Make this appliance one of two at its next start, and write the files for the other machines.
+
+    Run it first on the appliance that has all data. Then give the file that it wrote to the other appliance.
+
+    Example: rosrv standby join --address 192.168.1.2 --other 192.168.1.3 --witness 192.168.1.10 --fixed 192.168.1.100
+    --out standby-kit
+
+    Example: rosrv standby join standby-b.json
+    """
+    if file is not None:
+        if any((address, other, witness, fixed, follower, ports, config, out)):
+            raise usage_error(f"{file} has all settings: give --state and --again only", _VERB)
+        join_second(file, state, again=again, as_json=as_json)
+        return
+    given = {"--address": address, "--other": other, "--witness": witness, "--fixed": fixed, "--out": out}
+    missing = [option for option, value in given.items() if value is None]
+    if address is None or other is None or witness is None or fixed is None or out is None:
+        raise usage_error(
+            f"missing {', '.join(missing)}; on the other appliance, give the file standby-NAME.json instead",
+            _VERB,
+        )
+    options = JoinOptions(
+        state=state,
+        address=address,
+        other=other,
+        witness=witness,
+        fixed=fixed,
+        name=name,
+        other_name=other_name,
+        followers=tuple(follower or ()),
+        ports=ports,
+        port=port,
+        config=config,
+        out=out,
+        again=again,
+    )
+    join_first(options, as_json=as_json)
+
+
+def leave(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
+    """Make this appliance a single one at its next start. The other appliance and the robot are not changed.
+
+    Example: rosrv standby leave --state /var/lib/rosrv
+    """
+    path = path_of(state)
+    membership = None
+    try:
+        membership = load_membership(path)
+        if membership is None:
+            raise usage_error(f"{state} is not the state of one of two appliances", _VERB)
+        # Without secrets: `join` compares it with the file that it gets.
+        left = replace(membership, witness_key="", peer_key="", key="")
+        save_membership(path.with_name(LEFT_FILE), left)
+    except MembershipError as error:
+        typer.echo(f"{_VERB}: {error}; it is removed", err=True)
+    except OSError as error:
+        raise usage_error(f"{path}: {error.strerror}; run this as root", _VERB) from None
+    try:
+        path.unlink()
+    except OSError as error:
+        raise usage_error(f"{path} cannot be removed: {error.strerror}", _VERB) from None
+    if as_json:
+        say_json(
+            {
+                "name": membership.name if membership else "",
+                "other": membership.other if membership else "",
+            }
+        )
+        return
+    if membership is None:
+        say("This appliance is a single one at its next start: restart it.")
+        return
+    say(f"{membership.name} is a single appliance at its next start: restart it.")
+    say(f"On the robot ({membership.witness}) and on each follower: sudo /etc/rosrv/remove-witness.sh")
+    say(f"Start the nodes again with the address of this appliance, {membership.address}, in ROS_MASTER_URI.")
+    say(
+        f"On {membership.other} ({membership.other_address}): stop it, then rosrv standby leave, or rosrv purge"
+    )
+
+
+def repair(state: State = DEFAULT_STATE, as_json: Json = False) -> None:
+    """Forget the epoch that this appliance has stored: at its next start it takes that of the witness. Stop it first.
+
+    For a pair whose witness reports a smaller epoch although its disk was not restored. Run it on both appliances. Exit
+    status: 0 done, 1 the appliance runs, 2 it is not one of two.
+
+    Example: rosrv standby repair
+    """
+    if not path_of(state).exists():
+        raise usage_error(f"{state} is not the state of one of two appliances", _VERB)
+    directory = StateDirectory(state)
+    file = state / "lease" / EPOCH
+    try:
+        epoch = file.read_text("ascii", "replace").strip()[:32] if file.exists() else ""
+        file.unlink(missing_ok=True)
+    except OSError as error:
+        raise usage_error(f"{file} cannot be removed: {error.strerror}; run this as root", _VERB) from None
+    finally:
+        directory.close()
+    if as_json:
+        say_json({"forgotten": epoch})
+    else:
+        say(
+            f"Epoch {printable(epoch) or 'none'} is forgotten: start the appliance, then rosrv standby status."
+        )

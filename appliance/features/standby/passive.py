@@ -1,0 +1,290 @@
+"""Stand by: follow the changes of the active appliance until this one is activated.
+
+The only state that changes is the file of the replica. The admin socket answers requests about the standby; an operator
+gives all other orders to the active appliance.
+"""
+
+import asyncio
+import socket
+import ssl
+from collections.abc import Awaitable, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.base import clock
+from appliance.base.background import run_always
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.configuration.settings import Settings
+from appliance.control.links.supervisor_link import ControlLifeline
+from appliance.control.operators.admin_socket import AdminServer
+from appliance.features.standby.inheritance import CopyAge
+from appliance.features.standby.lease_client import HandOverError, LeaseClient
+from appliance.features.standby.link_certificates import replication_context
+from appliance.features.standby.membership import Membership, load_membership
+from appliance.features.standby.passive_rest import PassiveRest, ReplicatedTokens
+from appliance.features.standby.replica import Replica
+from appliance.features.standby.replica_sync import ReplicaSync
+from appliance.features.standby.replication import Pair, host_endpoint, state_of
+from appliance.features.standby.replication_frames import ReplicationError
+from appliance.features.standby.replication_receiver import ReplicationReceiver
+from appliance.features.standby.replication_transport import follow_at
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState
+from appliance.features.standby.standby_orders import StandbyAdministration
+from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.features.standby.takeover_check import TakeoverCheck
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.store.state_file import SCHEMA
+from appliance.store.writer_thread import StoreError
+
+_AGAIN_SECONDS = 0.3
+_ADMIN = "admin"
+
+_log = structlog.get_logger()
+
+
+class PassiveControl:
+    """Control of a standby. `folder` is closed to other users: it gets the certificate and the key of the link."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        membership: Membership,
+        lifeline: ControlLifeline,
+        lease: LeaseClient,
+        compiler: SpecificationCompiler,
+    ) -> None:
+        """Open the replica. Raises `StoreError`."""
+        self._settings = settings
+        self._membership = membership
+        self._lifeline = lifeline
+        self._lease = lease
+        self._folder = settings.state / "control"
+        self._since = clock.wall()
+        self._replica = Replica(
+            self._folder / "state.db",
+            SCHEMA,
+            failed=lambda reason: _log.error("state is not written", reason=reason),
+        )
+        self.tunnels = StandbyTunnels()
+        endpoint = host_endpoint(settings, membership)
+        self._replica_sync = ReplicaSync(self._replica, self._folder)
+        self._check = TakeoverCheck(settings, membership, compiler.check_at_start)
+        self._complete = False  # whether no acknowledged change is missing
+        self._receiver = ReplicationReceiver(
+            self._replica,
+            self._accepts,
+            lambda: self.tunnels.introduction(endpoint, self._rest.pin),
+            lambda: self._check.obstacle or "",
+            self._check.news.set,
+        )
+        self.copies = CopyAge(self._replica.setting)
+        self._epoch = 0
+        self._connected = False
+        self._away_since = clock.now()
+        self._reason = ""
+        self._rest = PassiveRest(
+            StandbyAdministration(self, orders=False), ReplicatedTokens(self._folder / "state.db")
+        )
+        self.api: Channel | None = None  # the link to the api, after `run`
+
+    async def run(self, until: asyncio.Event) -> None:
+        """Stand by until the event is set. Then the state file is closed and consistent."""
+        loop = asyncio.get_running_loop()
+
+        def begin(what: str, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
+            return loop.create_task(run_always(what, work))
+
+        tasks = [
+            begin("the link to the active appliance", self._follow),
+            begin("the preparation of tunnels", self._prepare_tunnels),
+        ]
+        server = await AdminServer(StandbyAdministration(self, orders=True)).start(
+            self._lifeline.sockets[_ADMIN].dup()
+        )
+        stating = begin("the tokens of REST", self._rest.run)
+        self._lifeline.hear(self._heard)
+        active = self._lifeline.hear_tunnels(self.tunnels.answered)
+        self._lifeline.say(messages.Ready({"stands_by": True}))
+        tasks += [
+            begin("the copy of the state", self._sync),
+            begin("the age of the copies of monitors", self.copies.run),
+            begin("the check of a takeover", partial(self._check.run, self._state_presence)),
+        ]
+        try:
+            await until.wait()
+        finally:
+            server.close()
+            self._lifeline.pause()
+            self._lifeline.hear_tunnels(active)
+            self.api = self._rest.release()
+            self.tunnels.pin = self._rest.pin
+            for task in (*tasks, stating):
+                task.cancel()
+            await asyncio.wait([*tasks, stating])
+            await asyncio.to_thread(self._replica.close)
+
+    async def _sync(self) -> None:
+        """Keep the replica on the disk, and note when it is complete."""
+
+        def complete() -> None:
+            self._complete = True
+            self._state_presence()
+
+        reason = ""
+        while True:
+            try:
+                await self._replica_sync.run(lambda: self._receiver.followed, complete)
+            except (StoreError, OSError) as error:
+                if reason != str(error):
+                    reason = str(error)
+                    _log.error("the copy of the state is not on the disk", reason=reason)
+                await asyncio.sleep(_AGAIN_SECONDS)
+
+    @property
+    def away_seconds(self) -> float | None:
+        """Return the seconds since this appliance last followed the active one; None if it never did."""
+        if not self._receiver.followed:
+            return None
+        return 0.0 if self._connected else clock.now() - self._away_since
+
+    @property
+    def copy_age(self) -> float | None:
+        """Return the age of the copies of monitors' state when this appliance last followed the active one."""
+        return self.copies.at(clock.now() if self._connected else self._away_since)
+
+    def _state_presence(self) -> None:
+        """Let the lease claim only while this appliance has all data and could serve."""
+        if self._complete and self._check.obstacle == "":
+            self._lease.present()
+        else:
+            self._lease.withdraw()
+
+    def state(self) -> StandbyState:
+        """Return the state of both appliances, as this one sees it."""
+        lease = self._lease.state
+        other = OtherAppliance(
+            name=self._membership.other,
+            address=self._membership.other_address,
+            connected=self._connected,
+            in_sync=lease is not None and lease.in_sync,
+            behind_changes=0,
+            behind_bytes=0,
+            waiting_seconds=None,
+            reason="" if self._connected else self._reason,
+            trouble_seconds=None if self._connected else round(clock.now() - self._away_since, 3),
+            witness_seconds=None,
+        )
+        wait = self._settings.availability.wait
+        return state_of(
+            self._membership,
+            lease,
+            role="standby",
+            since=self._since,
+            wait=wait,
+            other=other,
+            obstacle=self._check.obstacle or "",
+        )
+
+    async def hand_over(self) -> None:
+        """Ask the active appliance to hand over. Raises `HandOverError` if that is not possible now."""
+        if self._check.obstacle:
+            raise HandOverError(f"this appliance cannot take over: {self._check.obstacle}")
+        if not self._lease.hears_witness():
+            raise HandOverError(
+                f"the witness on the robot ({self._membership.witness}) does not answer this appliance, so it could not"
+                " take over; check the network between the two"
+            )
+        try:
+            refusal = await self._receiver.want_switchover()
+        except ReplicationError as error:
+            raise HandOverError(
+                f"{self._membership.other} ({self._membership.other_address}): {error}; if it is away, this"
+                " appliance takes over automatically once the lease has expired"
+            ) from error
+        if refusal:
+            raise HandOverError(refusal)
+
+    def _heard(self, message: Any, descriptors: tuple[int, ...]) -> None:
+        """Serve the api and the process for charon; leave the supervisor's other messages to the active control."""
+        if isinstance(message, messages.LinkOpened) and message.role == "api":
+            self._rest.attach(self._lifeline.api_channel(descriptors[0]))
+        elif isinstance(message, messages.LinkOpened) and message.role == "charon":
+            self.tunnels.attach(Channel(socket.socket(fileno=descriptors[0]), messages.TunnelLink))
+        else:
+            self._lifeline.queue(message, descriptors)
+
+    async def _follow(self) -> None:
+        context: ssl.SSLContext | None = None
+        while True:
+            try:
+                context = context or replication_context(self._membership, self._folder, server=False)
+                await follow_at(
+                    self._membership.other_address, self._membership.port, context, self._receiver
+                )
+            except (ReplicationError, StoreError, OSError) as error:
+                if self._reason != str(error):
+                    self._reason = str(error)
+                    _log.info("the active appliance is not followed", reason=self._reason)
+            finally:
+                if self._connected:
+                    self._connected, self._away_since = False, clock.now()
+            await asyncio.sleep(_AGAIN_SECONDS)
+
+    async def _prepare_tunnels(self) -> None:
+        """Prepare the tunnels as soon as the active appliance has an enrolled host."""
+        while not await asyncio.to_thread(self._replica.has_hosts):
+            await asyncio.sleep(_AGAIN_SECONDS)
+        pool = self._settings.ipsec.pool
+        self._lifeline.say(messages.TunnelsWanted(str(pool), str(pool.network_address + 1)))
+
+    def _accepts(self, epoch: int) -> bool:
+        """Whether data of an active appliance with this epoch is accepted: it must be the greatest known."""
+        lease = self._lease.state
+        if lease is None or epoch < max(self._epoch, lease.epoch):
+            return False
+        if epoch > self._epoch:
+            self._epoch = epoch
+            self._lease.send(messages.EpochSeen(epoch))
+        self._connected = True
+        return True
+
+
+async def until_activated(
+    link: Path,
+    settings: Settings,
+    lifeline: ControlLifeline,
+    lease: LeaseClient,
+    compiler: SpecificationCompiler,
+    *,
+    stopping: asyncio.Event,
+) -> Pair | None:
+    """Stand by until this appliance is activated or stopped. Return None if it is stopped, or not one of two.
+
+    `link` is the file with the membership. Raises `MembershipError`, `StoreError`, `OSError`.
+    """
+    membership = load_membership(link)
+    if membership is None:
+        return None
+    taken_over, api, tunnels = not lifeline.activated.is_set(), None, StandbyTunnels()
+    away: float | None = None
+    copy_age: float | None = None
+    if taken_over and not stopping.is_set():
+        passive = PassiveControl(settings, membership, lifeline, lease, compiler)
+        ended, loop = asyncio.Event(), asyncio.get_running_loop()
+        waits = [loop.create_task(event.wait()) for event in (lifeline.activated, stopping)]
+        for wait in waits:
+            wait.add_done_callback(lambda _task: ended.set())
+        try:
+            await passive.run(ended)
+            away, copy_age = passive.away_seconds, passive.copy_age
+        finally:
+            for wait in waits:
+                wait.cancel()
+        api, tunnels = passive.api, passive.tunnels
+    if lifeline.epoch is None:
+        return None
+    return Pair(membership, lease, lifeline.epoch, api, taken_over, tunnels, away, copy_age)

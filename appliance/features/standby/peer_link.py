@@ -1,0 +1,63 @@
+"""The datagrams between two appliances: requests for a promise, promises, and the order to take over.
+
+Each datagram is authenticated with a key that both appliances share. A promise repeats the nonce and the number of its
+request, so no earlier promise is valid. An active appliance uses one nonce in an epoch, because a restarted appliance
+needs a new epoch. So a request is new only if its epoch is greater, or if its nonce is the same and its number is
+greater.
+"""
+
+import msgspec
+
+from appliance.features.standby.lease import ClaimPromise, PeerMessage, PromiseRequest, TakeOver
+from appliance.features.standby.witness import HIGHEST, name_in, seal, unseal
+
+PURPOSES: dict[type[PeerMessage], bytes] = {
+    PromiseRequest: b"rosrv promise request 1\0",
+    ClaimPromise: b"rosrv promise 1\0",
+    TakeOver: b"rosrv take over 1\0",
+}
+
+
+class PeerChannel:
+    """Write messages to the other appliance, and read its messages."""
+
+    def __init__(self, name: str, other: str, key: bytes) -> None:
+        self._name = name
+        self._other = other
+        self._key = key
+        self._last: PromiseRequest | None = None
+
+    def write(self, message: PeerMessage) -> bytes:
+        """Return the datagram of a message."""
+        return seal(PURPOSES[type(message)], self._name, self._key, msgspec.to_builtins(message))
+
+    def read(self, datagram: bytes) -> PeerMessage | None:
+        """Return the message of a datagram; None if it is not authentic, malformed, or was recorded earlier."""
+        if name_in(datagram) != self._other:
+            return None
+        for kind, purpose in PURPOSES.items():
+            body = unseal(purpose, self._key, datagram)
+            if body is not None:
+                try:
+                    message = msgspec.convert(body, kind)
+                except msgspec.ValidationError:
+                    return None
+                fits = 0 <= message.epoch <= HIGHEST and 0 <= message.number <= HIGHEST
+                return message if fits and self._is_new(message) else None
+        return None
+
+    def _is_new(self, message: PeerMessage) -> bool:
+        if not isinstance(message, PromiseRequest):
+            return True  # a promise and an order are compared with the request that they name
+        last = self._last
+        new = (
+            last is None
+            or message.epoch > last.epoch
+            or (
+                (message.epoch, message.session) == (last.epoch, last.session)
+                and message.number > last.number
+            )
+        )
+        if new:
+            self._last = message
+        return new

@@ -1,0 +1,277 @@
+"""Run the lease as a process of the appliance: the witness, the other appliance, the supervisor and control.
+
+The process does nothing else, so neither a busy nor a restarted control loses the lease. It reports each extension to
+the supervisor. If no further extension arrives, the supervisor stops the processes that serve the robot. So the
+appliance also becomes passive if this process hangs or dies. The epoch is on the disk before it is used.
+
+This appliance claims only while its control is present. The control of a standby also withdraws its presence while it
+could not serve (`features/standby/takeover_check.py`). If the control of an active appliance does not serve
+(`service_watch.py`), the lease is given to the other appliance, provided that that one could claim and serve.
+"""
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from appliance.base import clock
+from appliance.base.atomic_files import write_whole
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.child_process import Child
+from appliance.features.standby.lease import (
+    SILENCE,
+    ApplianceLease,
+    LeaseError,
+    Outgoing,
+    WitnessAnswer,
+    WitnessRequest,
+)
+from appliance.features.standby.membership import Membership, load_membership
+from appliance.features.standby.peer_link import PeerChannel
+from appliance.features.standby.service_watch import ServiceWatch
+from appliance.features.standby.witness import HIGHEST, write_synced
+from appliance.features.standby.witness_link import WitnessChannel
+
+EPOCH = "epoch"
+_CONTROL_SECONDS = 1.0
+_LARGEST = 2048
+_BATCH = 64  # datagrams between two ticks
+_EPOCH_BYTES = 32  # less than a sector of a disk, which is written as a whole or not at all
+
+_log = structlog.get_logger()
+
+
+def main(lifeline_fd: int, membership: Path) -> None:
+    """Keep the lease until the supervisor ends the process."""
+    found = load_membership(membership)
+    if found is None:
+        raise FileNotFoundError(f"{membership} is missing")
+    asyncio.run(LeaseProcess(found, lifeline_fd, Path.cwd() / EPOCH).run())
+
+
+class LeaseProcess:
+    """The process; `epoch_file` has the greatest epoch of earlier processes."""
+
+    def __init__(self, membership: Membership, lifeline_fd: int, epoch_file: Path) -> None:
+        self._membership = membership
+        self._epoch_file = epoch_file
+        self._stored = stored_epoch(epoch_file)
+        session = secrets.token_hex(16)
+        own, other = membership.name, membership.other
+        self._lease = ApplianceLease(own, other, session, self._stored, clock.since_boot())
+        self._witness = WitnessChannel(own, bytes.fromhex(membership.witness_key), session)
+        self._peer = PeerChannel(own, other, bytes.fromhex(membership.peer_key))
+        self.supervisor = Channel(socket.socket(fileno=lifeline_fd), messages.Lifeline)
+        self.child = Child(
+            self.supervisor,
+            messages.LeaseLink,
+            said=self.control_said,
+            linked=self.control_linked,
+            lost=lambda _reason: self.control_linked(),
+        )
+        self.peers = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        # The kernel chooses this port, so that no other host can fill the buffer with forged answers.
+        self.asking = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._report = messages.ReplicationReported(0, False, None)
+        self._present = False
+        self._service = ServiceWatch()
+        self._permission = 0
+        self._alone = False
+        self._reported: messages.LeaseHeld | messages.LeaseEnded = messages.LeaseEnded()
+        self._answer: WitnessAnswer | None = None
+        self._answered: float | None = None
+        self._told: messages.LeaseState | None = None
+        self._told_at = 0.0
+        self._wake = asyncio.Event()
+
+    async def run(self) -> None:
+        """Keep the lease. Raises `OSError` if the epoch cannot be stored: the appliance is then passive."""
+        self.peers.bind(("0.0.0.0", self._membership.port))  # noqa: S104  the firewall admits the other appliance
+        loop = asyncio.get_running_loop()
+        for one, received in ((self.peers, self.peer_sent), (self.asking, self.witness_sent)):
+            one.setblocking(False)
+            loop.add_reader(one, self._readable, one, received)
+        self.child.attach(messages.Ready())
+        while not self.child.ended.is_set():
+            self.tick()
+            now = clock.since_boot()
+            delay = max(0.005, min(self._lease.next_event(now) - now, _CONTROL_SECONDS))
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), delay)
+        for one in (self.peers, self.asking):
+            loop.remove_reader(one)
+            one.close()
+
+    # --- the lease ---
+
+    def tick(self) -> None:
+        """Do what is due."""
+        lease, report, now = self._lease, self._report, clock.since_boot()
+        current = report.permission == self._permission
+        waiting = report.waiting_since
+        if lease.answers_alone:
+            # Control waits for the standby again, but the standby is away again: no removal follows, so permit again.
+            overdue = current and waiting is not None and now - waiting > SILENCE
+            if overdue or not self._alone:
+                self._permission += 1
+                current = False
+        self._alone = lease.answers_alone
+        lease.ready = self._present
+        self._give_away(now)
+        caught_up = current and report.caught_up
+        self._after(lease.tick(now, waiting_since=waiting, caught_up=caught_up))
+
+    def _give_away(self, now: float) -> None:
+        """Let the other appliance take over if this one holds the lease, but does not serve."""
+        fault = self._service.fault(now, active=self._lease.is_active(now), present=self._present)
+        if not fault:
+            return
+        with contextlib.suppress(LeaseError):  # the other appliance could not serve, either
+            due = self._lease.switch_over(now)
+            self._service.given_away()
+            _log.error(
+                "the lease is given to the other appliance, because this one does not serve", reason=fault
+            )
+            self._after(due)
+
+    def _after(self, due: Outgoing) -> None:
+        """Store the epoch, send what is due, and report the state."""
+        epoch = self._lease.epoch
+        if epoch != self._stored:
+            store_epoch(self._epoch_file, epoch)
+            self._stored = epoch
+        for message in due:
+            to = self._membership
+            if isinstance(message, WitnessRequest):
+                self.send(self.asking, self._witness.write(message), (to.witness, to.witness_port))
+            else:
+                self.send(self.peers, self._peer.write(message), (to.other_address, to.port))
+        self._tell_supervisor()
+        self._tell_control()
+
+    def send(self, sender: socket.socket, datagram: bytes, to: tuple[str, int]) -> None:
+        with contextlib.suppress(OSError):  # no route at present; the lease asks again
+            sender.sendto(datagram, to)
+
+    def _readable(self, receiver: socket.socket, received: Callable[[bytes, str], None]) -> None:
+        for _ in range(_BATCH):
+            try:
+                datagram, (address, _port) = receiver.recvfrom(_LARGEST)
+            except BlockingIOError:
+                break
+            except OSError:
+                continue  # an earlier datagram was not delivered
+            received(datagram, address)
+        self._wake.set()
+
+    def witness_sent(self, datagram: bytes, address: str) -> None:
+        """Take an answer of the witness; ignore a datagram of any other host."""
+        found = self._witness.read(datagram) if address == self._membership.witness else None
+        if found is not None:
+            self._answered, self._answer = clock.since_boot(), found[1]
+            self._after(self._lease.answered(*found))
+
+    def peer_sent(self, datagram: bytes, address: str) -> None:
+        """Take a message of the other appliance; ignore a datagram of any other host."""
+        if address == self._membership.other_address:
+            message = self._peer.read(datagram)
+            if message is not None:
+                self._after(self._lease.received(clock.since_boot(), message))
+
+    # --- supervisor and control ---
+
+    def _tell_supervisor(self) -> None:
+        lease, now = self._lease, clock.since_boot()
+        report: messages.LeaseHeld | messages.LeaseEnded
+        if lease.held is not None and lease.is_active(now):
+            report = messages.LeaseHeld(lease.valid_until, lease.held)
+        else:
+            report = messages.LeaseEnded(renewable=lease.may_be_renewed(now))
+        if report != self._reported:
+            self._reported = report
+            self.supervisor.send(report)
+
+    def _tell_control(self) -> None:
+        lease, now = self._lease, clock.since_boot()
+        active = lease.is_active(now)
+        answer = self._answer
+        state = messages.LeaseState(
+            until=lease.valid_until if active else 0.0,
+            epoch=lease.epoch,
+            alone=active and self._alone and lease.answers_alone,  # not after the order to add the standby
+            permission=self._permission,
+            in_sync=answer is not None and self._membership.other in answer.in_sync,
+            holder=answer.holder if answer is not None else "",
+            refusal=lease.refusal,
+            answered=self._answered,
+            heard=lease.heard,
+            other_witnessed=lease.other_witnessed,
+            handover_obstacle=lease.handover_obstacle(now) if active else "",
+            trouble=answer.trouble if answer is not None else "",
+        )
+        if state != self._told or now - self._told_at >= _CONTROL_SECONDS:
+            self._told, self._told_at = state, now
+            self.child.tell(state)
+
+    def control_linked(self) -> None:
+        """A new control waits for the standby until it gets a new permission."""
+        self._present = False
+        self._service.linked()
+        self._report = messages.ReplicationReported(self._permission, False, None)
+        self._told = None
+        self._wake.set()
+
+    def control_said(self, message: Any) -> None:
+        """Take a message of control."""
+        match message:
+            case messages.ReplicationReported():
+                self._report = message
+            case messages.EpochSeen(epoch) if epoch <= HIGHEST:
+                self._lease.follow(epoch)
+            case messages.ControlPresent():
+                self._present = True
+            case messages.ControlUnready():
+                self._present = False
+            case messages.ControlServes(obstacle, keeps_state):
+                self._service.reported(clock.since_boot(), obstacle, keeps_state=keeps_state)
+            case messages.HandOverWanted():
+                self._hand_over()
+            case _:
+                _log.error("control sent a message that is not for the lease", message=type(message).__name__)
+        self._wake.set()
+
+    def _hand_over(self) -> None:
+        reason = ""
+        try:
+            due = self._lease.switch_over(clock.since_boot())
+        except LeaseError as error:
+            reason, due = str(error), ()
+        self.child.tell(messages.HandOverAnswered(reason))
+        self._after(due)
+
+
+def stored_epoch(path: Path) -> int:
+    """Return the stored epoch; 0 if there is no file. Raises `ValueError` if it is damaged: then nothing is safe."""
+    try:
+        text = path.read_text("ascii").strip()
+    except FileNotFoundError:
+        return 0
+    if not text.isdecimal() or int(text) > HIGHEST:
+        raise ValueError(f"{path} does not contain an epoch: rosrv standby repair")
+    return int(text)
+
+
+def store_epoch(path: Path, epoch: int) -> None:
+    """Save the epoch; a file that exists is overwritten, which needs no free space. Raises `OSError`."""
+    content = f"{epoch:<{_EPOCH_BYTES - 1}}\n".encode()
+    if path.exists() and path.stat().st_size == _EPOCH_BYTES:
+        write_synced(str(path), content)
+    else:
+        write_whole(path, content, 0o600)

@@ -1,0 +1,53 @@
+"""Keep the replica of a standby on the disk, and notice that a power cut may have taken its last changes.
+
+A change is acknowledged before it is on the disk. While the machine runs, it cannot be lost. After a reboot the last
+changes may be missing, so this appliance takes over only once it has followed the active one again. If no active
+appliance appears within `WAIT_SECONDS`, both lost their power together, and each has all but the last changes.
+"""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+from appliance.base.atomic_files import write_whole
+from appliance.features.standby.replica import Replica
+from appliance.features.standby.witness import BOOT_ID
+
+WAIT_SECONDS = 10.0
+_SYNC_SECONDS = 0.1
+_MARK = "replica-boot"
+
+
+class ReplicaSync:
+    """Syncs a replica. The file `replica-boot` in `folder` has the boot in which the replica was last complete."""
+
+    def __init__(self, replica: Replica, folder: Path, boot: str | None = None) -> None:
+        """`boot` identifies the present boot; None: the kernel's id."""
+        self._replica = replica
+        self._mark = folder / _MARK
+        self._boot = boot if boot is not None else Path(BOOT_ID).read_text("ascii").strip()
+
+    async def run(self, followed: Callable[[], bool], complete: Callable[[], None]) -> None:
+        """Sync after changes, until cancelled; call `complete` once this appliance may take over.
+
+        `followed()` is true once the active appliance has sent what was missing. Raises `StoreError` and `OSError`.
+        """
+        loop = asyncio.get_running_loop()
+        end, marked, synced = loop.time() + WAIT_SECONDS, False, None
+        while True:
+            position = self._replica.position
+            if position != synced:
+                await asyncio.to_thread(self._replica.sync)
+                synced = position
+            if not marked and (self._is_complete() or followed() or loop.time() >= end):
+                await asyncio.to_thread(write_whole, self._mark, self._boot.encode("ascii"), 0o600)
+                marked = True
+                complete()
+            await asyncio.sleep(_SYNC_SECONDS)
+
+    def _is_complete(self) -> bool:
+        """Whether the machine was not started again since the replica was complete; a new one is."""
+        try:
+            return self._mark.read_text("ascii") == self._boot
+        except FileNotFoundError:
+            return True

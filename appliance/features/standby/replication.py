@@ -1,0 +1,364 @@
+"""Replicate the state of the active one of two appliances, and hold answers back until the standby has stored it.
+
+1. With `availability.wait: standby`, an answer waits until the standby has stored all changes made before it, or until
+   the witness has removed the standby from the in-sync set.
+2. Without a valid lease nothing is answered.
+3. A planned switchover begins only while the standby is in sync, and the lease is given up only after the standby has
+   stored every change.
+"""
+
+import asyncio
+import contextlib
+import os
+import socket
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import structlog
+
+from appliance.base import clock
+from appliance.base.background import run_always
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.configuration.settings import Settings
+from appliance.control.robot_admission import RobotAdmission
+from appliance.features.standby.lease_client import HandOverError, LeaseClient
+from appliance.features.standby.link_certificates import replication_context
+from appliance.features.standby.membership import Membership
+from appliance.features.standby.replication_frames import Introduction, ReplicationError
+from appliance.features.standby.replication_sender import ReplicationSender
+from appliance.features.standby.replication_transport import ReplicationListener
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.rpc.server import Handler, HttpRequest
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import Database, StoreError
+
+_REPORT_SECONDS = 0.1
+_SYNC_SECONDS = 0.1
+_BACKLOG = 8
+_SETTLE_SECONDS = 2.0
+_ANSWER_SECONDS = 5.0
+_LEAST_BYTES_A_SECOND = 20 << 20  # that a standby stores
+_PORT_SECONDS = 1.0  # until the port of the replication is tried again
+
+_log = structlog.get_logger()
+
+
+class Pair(NamedTuple):
+    """On one of two appliances: the other one, the lease, and the epoch in which this one is active.
+
+    `api` is the link to the api, and `tunnels` has the link to the process for charon, if they were opened while this
+    appliance stood by. `taken_over`: this process stood by before, so the epoch is new.
+    `away_seconds`: the time since this process last followed the other appliance; None: it did not. `copy_age`: the age
+    of the copies of monitors' state when it last followed (`inheritance.py`); None: it got none.
+    """
+
+    membership: Membership
+    lease: LeaseClient
+    epoch: int
+    api: Channel | None
+    taken_over: bool
+    tunnels: StandbyTunnels
+    away_seconds: float | None = None
+    copy_age: float | None = None
+
+
+def make_replication(settings: Settings, pair: Pair | None, store: StateStore) -> "Replication | None":
+    """Return the replication of one of two appliances; make it before the first change."""
+    if pair is None:
+        return None
+    store.note_whole_parameters()
+    return Replication(
+        pair.membership,
+        pair.lease,
+        store.database,
+        pair.epoch,
+        wait=settings.availability.wait,
+        taken_over=pair.taken_over,
+        folder=settings.state / "control",
+    )
+
+
+def answered_when_stored(replication: "Replication | None", handler: Handler) -> Handler:
+    """Return a handler whose answers wait until all earlier changes may be answered."""
+    if replication is None:
+        return handler
+    stored = replication.stored
+
+    async def handle(request: HttpRequest) -> bytes:
+        answer = await handler(request)
+        await stored()
+        return answer
+
+    return handle
+
+
+def state_of(
+    membership: Membership,
+    lease: messages.LeaseState | None,
+    *,
+    role: Literal["active", "standby"],
+    since: float,
+    wait: Literal["standby", "none"],
+    other: OtherAppliance,
+    obstacle: str,
+) -> StandbyState:
+    """Return the state of this appliance for operators."""
+    now = clock.since_boot()
+    return StandbyState(
+        name=membership.name,
+        address=membership.address,
+        role=role,
+        epoch=lease.epoch if lease is not None else 0,
+        since=since,
+        fixed=membership.fixed,
+        wait=wait,
+        answers_alone=lease is not None and lease.alone,
+        other=other,
+        witness=WitnessSeen(
+            address=membership.witness,
+            answered_seconds=None
+            if lease is None or lease.answered is None
+            else round(now - lease.answered, 3),
+            holder=lease.holder if lease is not None else "",
+            refusal=lease.refusal if lease is not None else "the process `lease` has not reported yet",
+            trouble=lease.trouble if lease is not None else "",
+        ),
+        obstacle=obstacle,
+    )
+
+
+def host_endpoint(settings: Settings, membership: Membership) -> str:
+    """Return the address or name at which hosts open their tunnels to this one of two appliances."""
+    return settings.ipsec.endpoint or membership.address
+
+
+class Replication:
+    """The replication of an active appliance. Create it before the first change that the standby needs.
+
+    `switchover_wanted` is set when an operator of the standby orders a switchover.
+    """
+
+    def __init__(
+        self,
+        membership: Membership,
+        lease: LeaseClient,
+        database: Database,
+        epoch: int,
+        *,
+        wait: Literal["standby", "none"],
+        taken_over: bool,
+        folder: Path,
+    ) -> None:
+        """`folder` is closed to other users: it gets the certificate and the key of the link.
+
+        After a takeover (`taken_over`) the earlier active appliance is away or still restarting, and the first answers
+        would wait for it in vain. So its removal is requested as soon as this appliance serves; until then, it may
+        take the lease back.
+        """
+        self._membership = membership
+        self._lease = lease
+        self._database = database
+        self._wait = wait
+        self._since = clock.wall()
+        self.switchover_wanted = asyncio.Event()
+        self.sender = ReplicationSender(database, lambda: epoch, switchover_wanted=self.switchover_wanted.set)
+        self._listener = ReplicationListener(
+            self.sender, replication_context(membership, folder, server=True)
+        )
+        self._permission = 0
+        self._unserved = ""  # why no standby can connect
+        self._trouble_since: float | None = None
+        self.admission = RobotAdmission()
+        self._taken_over = taken_over and wait == "standby"
+        self._absent = False  # whether the first answers would wait for the other appliance in vain
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._reported: messages.ReplicationReported | None = None
+        lease.listen(self._lease_changed)
+        self.report()
+
+    def on_introduction(self, introduced: Callable[[Introduction], Coroutine[Any, Any, None]]) -> None:
+        """Call this for each introduction of the standby."""
+
+        def start(introduction: Introduction) -> None:
+            task = asyncio.get_running_loop().create_task(introduced(introduction))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        self.sender.on_introduction(start)
+
+    async def run(self) -> None:
+        """Serve the standby until cancelled. While the port is in use, try again."""
+        self.begin()
+        loop = asyncio.get_running_loop()
+        tasks = [
+            loop.create_task(run_always("the report of the replication", self._report_always)),
+            loop.create_task(run_always("the copy on this disk", self._sync_always)),
+        ]
+        try:
+            with await self._listening() as listening:
+                await self._listener.run(listening)
+        finally:
+            for task in tasks:
+                task.cancel()
+
+    def begin(self) -> None:
+        """Report that nodes are served from now on."""
+        self._lease.present()
+        self._absent, self._taken_over = self._taken_over, False
+        self.report()
+
+    def close(self) -> None:
+        """Keep no further changes for the standby; a change that is not answered yet gets no answer."""
+        self.sender.close()
+
+    async def _listening(self) -> socket.socket:
+        address = ("", self._membership.port)
+        while True:
+            try:
+                made = socket.create_server(address, backlog=_BACKLOG)
+            except OSError as error:
+                if not self._unserved:
+                    reason = os.strerror(error.errno or 0)
+                    self._unserved = f"the standby cannot connect to port {address[1]}: {reason}"
+                    _log.error("the replication is not served", reason=self._unserved)
+                await asyncio.sleep(_PORT_SECONDS)
+            else:
+                self._unserved = ""
+                return made
+
+    async def stored(self) -> None:
+        """Wait until all changes made so far may be answered. Raises `StoreError` if they cannot be written."""
+        if self._wait == "standby":
+            number = self._database.number
+            try:
+                await self.sender.acknowledged(number)
+            except ReplicationError as error:
+                _log.warning("a change is not answered", reason=str(error))
+                await asyncio.get_running_loop().create_future()  # the supervisor ends this process
+        await self._lease.until_active()
+
+    def state(self) -> StandbyState:
+        """Return the state of both appliances."""
+        lag, lease, now = self.sender.lag(), self._lease.state, asyncio.get_running_loop().time()
+        waiting, trouble = lag.waiting_since, self._trouble_since
+        witnessed = lease.other_witnessed if lease is not None else None
+        other = OtherAppliance(
+            name=self._membership.other,
+            address=self._membership.other_address,
+            connected=self._connected(),
+            in_sync=self._in_sync(),
+            behind_changes=lag.changes,
+            behind_bytes=lag.bytes,
+            waiting_seconds=None if waiting is None else round(now - waiting, 3),
+            reason="" if self._connected() else self._unserved or lag.reason or "it does not answer",
+            trouble_seconds=None if trouble is None else round(now - trouble, 3),
+            witness_seconds=None if witnessed is None else round(clock.since_boot() - witnessed, 3),
+        )
+        return state_of(
+            self._membership,
+            lease,
+            role="active",
+            since=self._since,
+            wait=self._wait,
+            other=other,
+            obstacle=lag.obstacle,
+        )
+
+    def followed(self) -> bool:
+        """Whether the standby gets the changes now."""
+        return self.sender.lag().connected
+
+    def _connected(self) -> bool:
+        """Whether the standby is connected and answers: a dead one is noticed by its missing promises first."""
+        lease = self._lease.state
+        heard = lease.heard if lease is not None else None
+        return (
+            self.sender.lag().connected and heard is not None and clock.since_boot() - heard < _ANSWER_SECONDS
+        )
+
+    async def require_ready(self) -> None:
+        """Raise `HandOverError`, with the reason, unless the standby could take over now.
+
+        An answer of the witness from before the order proves nothing: the standby's cable may just have been unplugged.
+        """
+        if not self._in_sync() or not self._connected():
+            raise HandOverError(
+                f"{self._membership.other} does not have all changes; wait until `rosrv standby status` says that it is"
+                " in sync"
+            )
+        obstacle = self.sender.lag().obstacle
+        if obstacle:
+            raise HandOverError(f"{self._membership.other} cannot take over: {obstacle}")
+        lease = self._lease.state
+        if lease is not None and lease.handover_obstacle:
+            raise HandOverError(lease.handover_obstacle)
+        if not await self._lease.standby_hears_witness():
+            other = self._membership.other
+            raise HandOverError(
+                f"the witness on the robot does not answer {other}; check the network between {other} and the robot"
+            )
+
+    async def hand_over(self) -> None:
+        """Give the lease up once the standby has all changes. Raises `HandOverError`; this appliance stays active."""
+        try:
+            async with asyncio.timeout(_SETTLE_SECONDS):
+                await self.sender.acknowledged(self._database.number)
+        except (TimeoutError, ReplicationError) as error:
+            raise HandOverError(
+                f"{self._membership.other} does not store the last changes: {error}"
+            ) from error
+        await self._lease.hand_over()
+
+    def _lease_changed(self, state: messages.LeaseState) -> None:
+        if state.answered is not None:
+            self.admission.note_answer(state.answered)
+        if state.alone and state.permission > self._permission:
+            self._permission = state.permission
+            self.sender.answer_alone()
+            self.report()
+
+    def _in_sync(self) -> bool:
+        lease = self._lease.state
+        return lease is not None and lease.in_sync and not lease.alone
+
+    async def _report_always(self) -> None:
+        while True:
+            if self._in_sync() and self._connected():
+                self._trouble_since = None
+            elif self._trouble_since is None:
+                self._trouble_since = asyncio.get_running_loop().time()
+            self.report()
+            await asyncio.sleep(_REPORT_SECONDS)
+
+    async def _sync_always(self) -> None:
+        synced = 0
+        while True:
+            number = self._database.number
+            if number != synced:
+                with contextlib.suppress(StoreError):  # reported by the store, which tries again
+                    await self._database.settled()
+                    synced = number
+            await asyncio.sleep(_SYNC_SECONDS)
+
+    def report(self) -> None:
+        """Report the replication to the lease, if it has changed."""
+        lag = self.sender.lag()
+        self._absent = self._absent and not (lag.connected or self.sender.alone)
+        waiting = lag.waiting_since
+        if self._absent:
+            waiting = 0.0
+        elif waiting is not None:
+            # A standby that stores a large value is not away: it gets the time that the bytes need.
+            waiting = clock.since_boot() - (asyncio.get_running_loop().time() - waiting)
+            waiting += lag.bytes / _LEAST_BYTES_A_SECOND
+        report = messages.ReplicationReported(
+            permission=self._permission,
+            caught_up=lag.caught_up and not self.sender.alone,
+            waiting_since=waiting,
+        )
+        if report != self._reported:
+            self._reported = report
+            self._lease.send(report)

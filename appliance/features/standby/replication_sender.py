@@ -1,0 +1,357 @@
+"""Send the changes of the active appliance's state to its standby, and wait until the standby has them.
+
+The standby connects, and reports its last change. It gets the later changes, if this process made them and still has
+them in memory. Otherwise it gets a snapshot: all rows of a copy of the database, then the changes after the copy. Rows
+are sent rather than the database file, because the standby must not have to trust a file.
+
+1. A change counts as acknowledged only if it was sent on this link, and the standby has reported it stored.
+2. While the standby is away, at most `room` bytes of changes are kept; while it is connected, four times as many, so
+   that it need not take a snapshot for the large values of a few hosts. Changes never wait for the standby; the caller
+   decides whether an answer waits (`acknowledged`).
+3. While the appliance answers alone (`answer_alone`), `acknowledged` does not wait. This ends once the standby has all
+   changes.
+4. A standby that comes back with less than it acknowledged is logged, and no longer counts as having those changes.
+"""
+
+import asyncio
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import structlog
+
+from appliance.features.standby.replication_frames import (
+    LARGEST_FRAME,
+    EncodedChanges,
+    FromStandby,
+    Introduction,
+    ObstacleFound,
+    Refused,
+    ReplicationError,
+    ReplicationLink,
+    SnapshotBegin,
+    SnapshotEnd,
+    SnapshotRows,
+    Stored,
+    SwitchoverWanted,
+    reason_of,
+    refusal_of,
+)
+from appliance.store.changes import ROWS, Put
+from appliance.store.writer_thread import Database, StoreError
+
+_ROOM = 32 << 20
+_LINKED = 4  # times the room, while a standby is connected: more than all large values that may be under way at once
+_BATCH = 1 << 20  # bytes in one frame, but at least one change
+_OVERHEAD = 64 << 10  # bytes of a frame besides the changes
+_CHANGES_UNANSWERED = (
+    2  # while two are under way, changes gather: the standby writes them to its disk together
+)
+_ROWS_UNANSWERED = 64
+_HEARTBEAT_SECONDS = 1.0
+_SILENCE_SECONDS = 30.0  # the standby writes a large snapshot to its disk in this time
+
+T = TypeVar("T")
+
+_log = structlog.get_logger()
+
+
+class ReplicationLag(NamedTuple):
+    """How far the standby is behind, and why its last link ended.
+
+    `waiting_since` (time of the loop) is set while `acknowledged` has waiters. `obstacle` is why the connected standby
+    could not serve after a takeover; empty: it could, or it is not connected.
+    """
+
+    connected: bool
+    changes: int
+    bytes: int
+    waiting_since: float | None
+    reason: str
+    obstacle: str = ""
+
+    @property
+    def caught_up(self) -> bool:
+        """Whether the standby is connected and has all changes."""
+        return self.connected and not self.changes
+
+
+class ReplicationSender:
+    """The changes of `database` for the standby; `epoch` returns the epoch in which this appliance is active.
+
+    Create it in the event loop, before the first change that the standby needs.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        epoch: Callable[[], int],
+        *,
+        room: int = _ROOM,
+        switchover_wanted: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`room`: bytes of changes that are kept. `switchover_wanted()` is called for an order of the standby."""
+        self._database = database
+        self._epoch = epoch
+        self._switchover_wanted = switchover_wanted
+        self._loop = asyncio.get_running_loop()
+        self._changed = asyncio.Event()
+        self._room = room
+        self._feed = database.follow(self._notice, room)
+        self._acknowledged = 0
+        self._sent = self._most_sent = 0  # on this link, on all links
+        self._unanswered = 0
+        self._answered = asyncio.Event()
+        self._reason = self._obstacle = ""
+        self.link: asyncio.Task[None] | None = None
+        self._open: ReplicationLink[FromStandby] | None = None
+        self._waiting: dict[asyncio.Future[None], tuple[int, float]] = {}
+        self.alone = False
+        self._introduced: Callable[[Introduction], None] = lambda _introduction: None
+
+    async def acknowledged(self, number: int) -> None:
+        """Wait until the standby has stored all changes up to this number.
+
+        While the standby is away, this waits until it is back, or until this appliance answers alone. Raises
+        `ReplicationError` when the sender is closed.
+        """
+        if self.alone:
+            return
+        if number > self._acknowledged and not self.alone:
+            waiter = self._loop.create_future()
+            self._waiting[waiter] = (number, self._loop.time())
+            try:
+                await waiter
+            finally:
+                del self._waiting[waiter]
+
+    def on_introduction(self, introduced: Callable[[Introduction], None]) -> None:
+        """Call this for each introduction of the standby."""
+        self._introduced = introduced
+
+    async def refuse_switchover(self, reason: str) -> None:
+        """Tell the standby why its order to hand over is not carried out, if it is still connected."""
+        if self._open is not None:
+            with contextlib.suppress(ReplicationError):
+                await self._open.send(refusal_of(reason))
+
+    def answer_alone(self) -> None:
+        """Answer without the standby until it has all changes: the witness has removed it from the in-sync set."""
+        self.alone = True
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def lag(self) -> ReplicationLag:
+        """Return how far the standby is behind."""
+        return ReplicationLag(
+            self.link is not None,
+            self._database.number - self._acknowledged,
+            self._feed.size,
+            min((since for _number, since in self._waiting.values()), default=None),
+            self._reason,
+            self._obstacle if self.link is not None else "",
+        )
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Send to the standby until the link ends; a new link ends the earlier one. Raises `ReplicationError`."""
+        link: ReplicationLink[FromStandby] = ReplicationLink(reader, writer, FromStandby)
+        try:
+            while (earlier := self.link) is not None:
+                earlier.cancel()
+                await asyncio.wait([earlier])
+                if self.link is earlier:
+                    self.link = None
+            own = self.link = self._loop.create_task(self._serve(link))
+            self._feed.keep(_LINKED * self._room)
+            try:
+                await asyncio.wait([own])
+            finally:
+                own.cancel()
+                if self.link is own:
+                    self.link = None
+                    self._feed.keep(self._room)
+            if own.cancelled():
+                raise ReplicationError(
+                    "the standby opened another link, or this appliance is no longer active"
+                )
+            try:
+                own.result()
+            except (ReplicationError, StoreError) as error:
+                self._reason = str(error)
+                raise ReplicationError(self._reason) from error
+        finally:
+            await link.close()
+
+    def close(self) -> None:
+        """End the link, and keep no further changes; callers of `acknowledged` get an error."""
+        self._database.unfollow(self._feed)
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_exception(ReplicationError("this appliance is no longer active"))
+        if self.link is not None:
+            self.link.cancel()
+
+    def _notice(self) -> None:
+        if not self._changed.is_set():  # `_send` clears it before it looks for the last changes
+            with contextlib.suppress(RuntimeError):  # the loop has ended, so no link is open
+                self._loop.call_soon_threadsafe(self._changed.set)
+
+    async def _serve(self, link: ReplicationLink[FromStandby]) -> None:
+        begin = await link.receive(_SILENCE_SECONDS)
+        if not isinstance(begin, Stored):
+            reason = begin.reason if isinstance(begin, Refused) else "it did not send its position first"
+            raise ReplicationError(f"the standby refuses: {reason}")
+        if begin.epoch > self._epoch():
+            error = ReplicationError(
+                f"the standby has seen epoch {begin.epoch}, and this appliance is active in {self._epoch()}"
+            )
+            await link.send(reason_of(error))
+            raise error
+        known = begin.history == self._database.history and begin.number <= self._most_sent
+        position = begin.number if known and self._feed.after(begin.number, 0) is not None else None
+        if known and begin.number < self._acknowledged:
+            _log.error(
+                "the standby has lost changes that it acknowledged",
+                acknowledged=self._acknowledged,
+                stored=begin.number,
+            )
+        self._acknowledged = self._sent = self._unanswered = 0
+        self._obstacle = ""
+        if position is not None:
+            self._sent = position
+            self.take(begin)
+        self._open = link
+        ends = [
+            self._loop.create_task(self._receive(link)),
+            self._loop.create_task(self._send(link, position)),
+        ]
+        try:
+            ended, _ = await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            for task in ended:
+                task.result()
+        finally:
+            self._open = None
+            for task in ends:
+                task.cancel()
+            await asyncio.gather(*ends, return_exceptions=True)
+
+    async def _receive(self, link: ReplicationLink[FromStandby]) -> None:
+        while True:
+            message = await link.receive(_SILENCE_SECONDS)
+            if isinstance(message, Refused):
+                raise ReplicationError(f"the standby refuses: {message.reason}")
+            if isinstance(message, SwitchoverWanted):
+                self._switchover_wanted()
+                continue
+            if isinstance(message, Introduction):
+                self._introduced(message)
+                continue
+            if isinstance(message, ObstacleFound):
+                self._obstacle = message.reason
+                continue
+            self._unanswered -= 1
+            self._answered.set()
+            if message.history == self._database.history:
+                self.take(message)
+
+    def take(self, stored: Stored) -> None:
+        """Take an acknowledgement of the standby. Raises `ReplicationError` if it is not possible."""
+        if stored.number > self._sent:
+            raise ReplicationError(
+                f"the standby acknowledged change {stored.number}, and was sent only {self._sent} changes"
+            )
+        if stored.number < self._acknowledged:
+            raise ReplicationError(
+                f"the standby acknowledged change {stored.number} after {self._acknowledged}"
+            )
+        self._acknowledged = stored.number
+        self._feed.release(stored.number)
+        self.alone = self.alone and stored.number < self._database.number
+        for waiter, (number, _since) in self._waiting.items():
+            if number <= stored.number and not waiter.done():
+                waiter.set_result(None)
+
+    async def _send(self, link: ReplicationLink[FromStandby], position: int | None) -> None:
+        while True:
+            await self._free_to_send(_CHANGES_UNANSWERED)
+            changes = None if position is None else self._feed.after(position, _BATCH)
+            if (
+                position is None
+                or changes is None
+                or sum(len(change.body) for change in changes) > LARGEST_FRAME - _OVERHEAD
+            ):  # a snapshot has only the latest values, so a value that was too large may be gone
+                position = await self._send_snapshot(link)
+                continue
+            bodies = [msgspec.Raw(change.body) for change in changes]
+            self.note_sent(position + len(changes))
+            await self._post(
+                link, EncodedChanges(self._epoch(), self._database.history, position + 1, bodies)
+            )
+            position = self._sent
+            if self._feed.after(position, 0) == []:
+                self._changed.clear()
+                if self._feed.after(position, 0) == []:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(self._changed.wait(), _HEARTBEAT_SECONDS)
+
+    async def _send_snapshot(self, link: ReplicationLink[FromStandby]) -> int:
+        """Send a copy of the database; return the number of its last change."""
+        await self._database.settled()
+        copy = await _in_thread(self._database.copy)
+        with contextlib.closing(copy):
+            found = copy.execute("SELECT number FROM journal").fetchone()
+            number = found[0] if found else 0
+            self.note_sent(number)
+            await self._post(link, SnapshotBegin(self._epoch(), self._database.history, number))
+            rows = 0
+            puts = _rows_of(copy, self._database.tables)
+            while (put := await _in_thread(next, puts, None)) is not None:
+                await self._free_to_send(_ROWS_UNANSWERED)
+                await self._post(link, SnapshotRows([put]))
+                rows += len(put.rows)
+            await self._post(link, SnapshotEnd(rows))
+        return number
+
+    async def _free_to_send(self, most: int) -> None:
+        """Wait until fewer than `most` messages are unanswered."""
+        while self._unanswered >= most:
+            self._answered.clear()
+            await self._answered.wait()
+
+    async def _post(self, link: ReplicationLink[FromStandby], message: msgspec.Struct) -> None:
+        self._unanswered += 1
+        await link.send(message)
+
+    def note_sent(self, number: int) -> None:
+        """Note that all changes up to this number are sent on the present link."""
+        self._sent = number
+        self._most_sent = max(self._most_sent, number)
+
+
+async def _in_thread(function: Callable[..., T], *arguments: Any) -> T:
+    """Call a function in a thread, and wait for its end even if cancelled: it uses a connection that is closed then."""
+    task = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait([task])
+        raise
+
+
+def _rows_of(copy: sqlite3.Connection, tables: Iterable[str]) -> Iterator[Put]:
+    """Yield all rows: at most `ROWS` at a time, and fewer if they have more than `_BATCH` bytes."""
+    for table in tables:
+        rows: list[tuple[str | int | float | bytes | None, ...]] = []
+        size = 0
+        for row in copy.execute(f"SELECT * FROM {table}"):  # noqa: S608  a table of the schema
+            size_of_row = sum(len(value) for value in row if isinstance(value, str | bytes))
+            if rows and (len(rows) == ROWS or size + size_of_row > _BATCH):
+                yield Put(table, rows)
+                rows, size = [], 0
+            rows.append(row)
+            size += size_of_row
+        if rows:
+            yield Put(table, rows)

@@ -1,0 +1,132 @@
+"""Judge the state of two appliances for alarms, metrics and `rosrv standby status`. No I/O."""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+
+PATIENCE_SECONDS = 60.0
+"""How long the standby may be away or behind before this is an alarm: an update of its machine takes longer."""
+
+SILENT_SECONDS = 5.0
+"""From this age of its last answer on, the witness is silent. It is asked every 0.3 s."""
+
+
+class StandbyTrouble(NamedTuple):
+    """A condition that needs attention; `text` has the reason and what to do."""
+
+    severity: Literal["alarm", "warning"]
+    kind: str
+    text: str
+
+
+def standby_troubles(state: StandbyState, patience: float = 0.0) -> Iterator[StandbyTrouble]:
+    """Yield what is wrong, the most urgent first; `patience`: seconds that the other may be away or behind."""
+    other = state.other
+    if both_active(state):
+        holder = state.witness.holder
+        text = (
+            f"both appliances claim to be active: this one does, but the witness names {holder}, and the robot admits"
+            f" only {holder}; stop this appliance, then start it again"
+        )
+        yield StandbyTrouble("alarm", "both-active", text)
+    if state.obstacle:
+        yield _unready(state)
+    lasting = other.trouble_seconds
+    if lasting is not None and lasting >= patience:
+        yield _away(state, lasting) if not other.connected else _behind(other, lasting)
+    if is_silent(state.witness):
+        yield _silent(state.witness)
+    elif is_blind(other):
+        yield _blind(state)
+    elif state.witness.trouble:
+        yield _unsaved(state.witness)
+
+
+def both_active(state: StandbyState) -> bool:
+    """Whether this appliance is active, and the witness names another holder of the lease."""
+    witness = state.witness
+    return state.role == "active" and not is_silent(witness) and witness.holder not in ("", state.name)
+
+
+def is_silent(witness: WitnessSeen) -> bool:
+    """Whether the witness does not answer."""
+    return witness.answered_seconds is None or witness.answered_seconds >= SILENT_SECONDS
+
+
+def is_blind(other: OtherAppliance) -> bool:
+    """Whether the other appliance is connected, but the witness does not answer it."""
+    return other.connected and other.witness_seconds is not None and other.witness_seconds >= SILENT_SECONDS
+
+
+def lag_of(other: OtherAppliance) -> str:
+    """Return how far the standby is behind, in words."""
+    changes = "1 change" if other.behind_changes == 1 else f"{other.behind_changes} changes"
+    return f"{changes} ({other.behind_bytes} bytes) behind" if other.behind_changes else "catching up"
+
+
+def lasting(seconds: float) -> str:
+    """Return a duration in one unit."""
+    for length, unit in ((86_400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= length:
+            return f"{int(seconds // length)} {unit}"
+    return f"{int(seconds)} s"
+
+
+def _away(state: StandbyState, seconds: float) -> StandbyTrouble:
+    other, away = state.other, lasting(seconds)
+    why = f": {other.reason}" if other.reason else ""
+    check = "check that it runs, and the network between the two"
+    if state.role == "active":
+        text = f"the standby {other.name} ({other.address}) has been away for {away}{why}; {check}"
+    else:
+        text = (
+            f"the active appliance {other.name} ({other.address}) has not been connected for {away}, so its changes"
+            f" since then are missing here{why}; {check}"
+        )
+    return StandbyTrouble("warning", "standby-away", text)
+
+
+def _unready(state: StandbyState) -> StandbyTrouble:
+    active = state.role == "active"
+    name, address = (state.other.name, state.other.address) if active else (state.name, state.address)
+    text = (
+        f"the standby {name} ({address}) cannot take over: {state.obstacle}; once this is corrected, {name} notices it"
+        " within seconds"
+    )
+    return StandbyTrouble("alarm", "standby-unready", text)
+
+
+def _behind(other: OtherAppliance, seconds: float) -> StandbyTrouble:
+    text = (
+        f"the standby {other.name} has been {lag_of(other)} for {lasting(seconds)}, so it cannot take over;"
+        " check the disk and the load of its machine"
+    )
+    return StandbyTrouble("warning", "standby-behind", text)
+
+
+def _silent(witness: WitnessSeen) -> StandbyTrouble:
+    seconds = witness.answered_seconds
+    since = "has never answered" if seconds is None else f"has not answered for {lasting(seconds)}"
+    text = (
+        f"the witness on the robot ({witness.address}) {since}, so the standby cannot take over; check on the robot:"
+        " systemctl status rosrv-witness"
+    )
+    return StandbyTrouble("warning", "witness-silent", text)
+
+
+def _blind(state: StandbyState) -> StandbyTrouble:
+    other, witness = state.other, state.witness
+    text = (
+        f"the witness on the robot ({witness.address}) has not answered the standby {other.name} ({other.address}) for"
+        f" {lasting(other.witness_seconds or 0)}, so the standby cannot take over; check the network between both"
+    )
+    return StandbyTrouble("alarm", "standby-blind", text)
+
+
+def _unsaved(witness: WitnessSeen) -> StandbyTrouble:
+    text = (
+        f"the witness on the robot ({witness.address}) could not save a takeover: {witness.trouble}; correct"
+        " that on the robot"
+    )
+    return StandbyTrouble("alarm", "witness-disk", text)

@@ -1,0 +1,49 @@
+"""Prepare the tunnels on a standby: the firewall of the pool, and the process that runs charon, without charon.
+
+The process makes its own key. Its signing request goes to the active appliance, which stores a certificate for it in
+the replicated state. So a takeover needs neither the authority's key nor the start of this process.
+"""
+
+import structlog
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
+from appliance.features.standby.replication_frames import Introduction
+from appliance.hosts.tunnel_state import Tunnels
+
+_log = structlog.get_logger()
+
+
+class StandbyTunnels:
+    """The link to the process that runs charon, until the appliance is activated; `pin` is then the pin of the api."""
+
+    def __init__(self) -> None:
+        self._link = Link(self._heard)
+        self._needed: messages.CertificateNeeded | None = None
+        self.pin = ""
+
+    def attach(self, channel: Channel) -> None:
+        """Use a new link."""
+        self._needed = None
+        self._link.attach(channel)
+
+    def answered(self, message: messages.TunnelsEnclosed) -> None:
+        """Take the supervisor's answer to `TunnelsWanted`."""
+        if message.esp is None:
+            _log.warning("this appliance cannot take over the tunnels of hosts", reason=message.reason)
+
+    def introduction(self, endpoint: str, pin: str) -> Introduction | None:
+        """Return the request for this appliance's certificate; None while the process has not made it."""
+        needed = self._needed
+        return None if needed is None else Introduction(needed.request, needed.key, endpoint, pin)
+
+    def hand_to(self, tunnels: Tunnels) -> None:
+        """Give the link and the request to the tunnels of the active appliance."""
+        channel, self._link.channel = self._link.channel, None
+        if channel is not None:
+            tunnels.attach(channel, self._needed)
+
+    def _heard(self, message: object) -> None:
+        if isinstance(message, messages.CertificateNeeded):
+            self._needed = message

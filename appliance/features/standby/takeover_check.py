@@ -1,0 +1,148 @@
+"""Check on a standby that control could start if this appliance took over now.
+
+The check calls the functions by which the start of control reads the stored policy, specifications, hosts and nodes,
+makes the certificate of the link and opens the port of the ROS master. It also writes to the disk of the state. It runs
+at the start, when the active appliance brings another policy or other specifications into force, and every
+`_AGAIN_SECONDS`, because the appliance's own files, disk and ports may change.
+
+While the check fails, this appliance does not claim the lease. It still follows the active appliance and promises not
+to claim, and stays in the in-sync set: once the cause is gone, it takes over with all data.
+"""
+
+import asyncio
+import contextlib
+import os
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import structlog
+
+from appliance.configuration.settings import Settings
+from appliance.control.assembly.foundation import make_host_table, open_listener
+from appliance.control.assembly.policies import kept_policy
+from appliance.control.assembly.policy_gate import PolicyRefusedError, policy_at_start
+from appliance.control.assembly.robot import robot_addresses
+from appliance.features.standby.link_certificates import replication_context
+from appliance.features.standby.membership import Membership
+from appliance.features.standby.read_only import ReadOnlyDatabase
+from appliance.master.graph.registry import Registry
+from appliance.master.reconcile.enactor import restore
+from appliance.policy.judgement import PolicyContext
+from appliance.specifications.specification_files import (
+    CheckedSpecifications,
+    Sources,
+    SpecificationFolder,
+    SpecificationsRefusedError,
+)
+from appliance.specifications.specification_revisions import Check, specifications_at_start
+from appliance.specifications.switches import Switches
+from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.store.writer_thread import StoreError
+
+STATE_ERRORS = (PolicyRefusedError, SpecificationsRefusedError, StoreError, OSError)
+"""The errors of a stored state or an own file that control cannot start with."""
+
+_AGAIN_SECONDS = 15.0
+_ROOM = 4 << 20  # bytes, as for an order (`Database.require_room`)
+
+_log = structlog.get_logger()
+
+
+class TakeoverCheck:
+    """The check; set `news` when the policy or the specifications of the active appliance have changed.
+
+    `obstacle` is why this appliance could not serve after a takeover, in a line; empty: it could, None: not known yet.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        membership: Membership,
+        compile_specifications: Check,
+        *,
+        again: float = _AGAIN_SECONDS,
+    ) -> None:
+        """`again`: seconds between two checks without news."""
+        self._settings = settings
+        self._membership = membership
+        self._compile = compile_specifications
+        self._again = again
+        self._folder = settings.state / "control"
+        self._compiled: tuple[Sources, CheckedSpecifications] | None = None
+        self.obstacle: str | None = None
+        self.news = asyncio.Event()
+
+    async def run(self, changed: Callable[[], None]) -> None:
+        """Check until cancelled; call `changed` when the result has changed."""
+        while True:
+            self.news.clear()
+            obstacle = await self._find_obstacle()
+            if obstacle != self.obstacle:
+                if self.obstacle:
+                    _log.info("the reason why this appliance cannot take over is gone", reason=self.obstacle)
+                self.obstacle = obstacle
+                changed()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self.news.wait(), self._again)
+
+    async def _find_obstacle(self) -> str:
+        try:
+            await self._load()
+        except STATE_ERRORS as error:
+            reason, *more = str(error).splitlines() or [repr(error)]
+        except Exception as error:  # noqa: BLE001  whatever it is, it would also end the start
+            what = f"the state of the active appliance is not understood ({error!r})"
+            reason, more = f"{what}; update this appliance to the same version", []
+        else:
+            return ""
+        if reason != self.obstacle:
+            _log.error("this appliance cannot take over", reason=reason, more=more)
+        return reason
+
+    async def _load(self) -> None:
+        """Read what a takeover reads. Raises any error that would end it."""
+        settings = self._settings
+        await asyncio.to_thread(_require_room, self._folder)
+        last = await asyncio.to_thread(self._load_state)
+        await specifications_at_start(
+            last,
+            SpecificationFolder(settings.monitors),
+            self._compile_once,
+            settings.site_keys,
+            named=Switches(settings.enable).named,
+        )
+        if self.obstacle != "":  # the membership stays the same, and each call writes files
+            replication_context(self._membership, self._folder, server=True)
+        open_listener(*settings.listen_address).close()
+
+    def _load_state(self) -> MonitorRevisionRow | None:
+        """Read the state and the policy; return the stored specifications, if there are any."""
+        settings = self._settings
+        store = StateStore(self._folder, failed=_log.error, kind=ReadOnlyDatabase)
+        known = PolicyContext(
+            make_host_table(settings, store).addresses(),
+            robot_addresses(settings, self._membership.witness),
+            site_keys=settings.site_keys,
+        )
+        last = next(iter(store.revisions(1)), None)
+        kept = None if last is None else kept_policy(last)
+        policy_at_start(kept, settings.policy, known, kept_first=True)
+        restore(Registry(), store)
+        return next(iter(store.monitor_revisions(1)), None)
+
+    async def _compile_once(self, sources: Sources, site_keys: Sequence[str]) -> CheckedSpecifications:
+        """Compile specifications that differ from the last ones; the compiler takes seconds for large ones."""
+        if self._compiled is None or self._compiled[0] != sources:
+            self._compiled = (sources, await self._compile(sources, site_keys))
+        return self._compiled[1]
+
+
+def _require_room(folder: Path) -> None:
+    """Raise `OSError` if the disk of the state cannot take the first records and changes after a takeover."""
+    disk = os.statvfs(folder)
+    free = disk.f_bavail * disk.f_frsize
+    if free < _ROOM:
+        raise OSError(f"{folder}: {free} bytes are free on its disk, {_ROOM} are wanted: free space")
+    with tempfile.TemporaryFile(dir=folder) as file:  # it has no name, so nothing stays
+        file.write(b"\0")

@@ -1,0 +1,62 @@
+"""Print the verification of two logs and of the takeovers between them."""
+
+from collections.abc import Iterator
+
+from appliance.audit.log.record_format import printable, rfc3339
+from appliance.cli.audit.record_table import print_verification, write
+from appliance.features.standby.takeover_verification import PairVerification, TakeoverProof
+
+
+def print_pair(pair: PairVerification) -> None:
+    """Print both verifications, then the findings between the logs, and each takeover with its proof."""
+    names = {takeover.log: takeover.appliance for takeover in pair.takeovers}
+    for result in pair.logs:
+        if result.log in names:
+            write(f"Log of {names[result.log]}:")
+        print_verification(result)
+        write("")
+    for finding in pair.findings:
+        write(f"{finding.kind.value.upper()}: {printable(finding.message)}")
+    for takeover in pair.takeovers:
+        by = f"{takeover.appliance} took over from {takeover.other}"
+        write(f"epoch {takeover.epoch}, {rfc3339(takeover.time)}: {by} (record {takeover.sequence})")
+        for text in _proven(takeover):
+            write(f"    {text}")
+    write(_verdict(pair))
+
+
+def _proven(takeover: TakeoverProof) -> Iterator[str]:
+    other, through = takeover.other, takeover.through
+    match takeover.link:
+        case "none":
+            yield f"it names no checkpoint of {other}, so it proves nothing about that log"
+        case "wrong":
+            yield f"it names a checkpoint of {other} that is wrong, see above"
+        case "removed":
+            yield f"retention has removed the records of {other} up to record {through}, which it names"
+        case "proven":
+            yield f"the log of {other} agrees with it up to record {through}"
+    if through:
+        yield (
+            f"records of {other} after that, until its next takeover: {takeover.tail};"
+            f" later checkpoints seal {takeover.tail_signed}"
+        )
+    match takeover.overlap:
+        case "excluded":
+            yield f"{other} decided nothing more until it took over again"
+        case "found":
+            yield f"{other} went on deciding, see above"
+        case "unknown":
+            yield f"the logs do not show whether {other} went on deciding"
+
+
+def _verdict(pair: PairVerification) -> str:
+    if not pair.ok:
+        return "A log was tampered with or is damaged, or the two logs do not fit together."
+    if pair.absent:
+        return f"{pair.absent} has no log yet, because it was never active: there is no takeover to verify."
+    if not pair.takeovers:
+        return "Both logs are complete and unchanged, but neither has a takeover: nothing links them."
+    count = len(pair.takeovers)
+    takeovers = "the takeover" if count == 1 else f"the {count} takeovers"
+    return f"Both logs are complete and unchanged, and so are {takeovers} between them."

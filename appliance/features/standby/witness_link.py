@@ -1,0 +1,107 @@
+"""The datagrams between an appliance and the witness, and the socket that carries them."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import msgspec
+
+from appliance.features.standby.lease import WitnessAnswer, WitnessRequest
+from appliance.features.standby.witness import ANSWER, HIGHEST, REQUEST, name_in, seal, unseal
+
+_MOST_PENDING = 32
+
+_Count = Annotated[int, msgspec.Meta(ge=0, le=HIGHEST)]
+
+
+class _AnswerBody(msgspec.Struct, frozen=True):
+    boot: str
+    session: str
+    number: _Count
+    stale: bool = False
+    last: _Count = 0
+    ok: bool = False
+    reason: str = ""
+    epoch: _Count = 0
+    holder: str = ""
+    in_sync: frozenset[str] = frozenset()
+    expired: bool = False
+    trouble: str = ""
+
+
+class WitnessChannel:
+    """Write requests and read answers. `session` is a nonce of this process: no earlier answer has it."""
+
+    def __init__(self, name: str, key: bytes, session: str) -> None:
+        self._name = name
+        self._key = key
+        self._session = session
+        self._boot = ""
+        self._number = 0
+        self._pending: dict[int, WitnessRequest] = {}
+
+    def write(self, request: WitnessRequest) -> bytes:
+        """Return the datagram of a request."""
+        self._number += 1
+        self._pending[self._number] = request
+        if len(self._pending) > _MOST_PENDING:
+            del self._pending[next(iter(self._pending))]
+        body = {
+            "boot": self._boot,
+            "session": self._session,
+            "number": self._number,
+            "do": request.operation,
+            "epoch": request.epoch,
+        }
+        return seal(REQUEST, self._name, self._key, body)
+
+    def read(self, datagram: bytes) -> tuple[WitnessRequest, WitnessAnswer] | None:
+        """Return an answer with its request, or None if it answers no pending request.
+
+        An answer to a request with an old nonce or number has the present ones: the next request uses them.
+        """
+        if name_in(datagram) != self._name:
+            return None
+        try:
+            body = msgspec.convert(unseal(ANSWER, self._key, datagram), _AnswerBody)
+        except msgspec.ValidationError:
+            return None
+        request = self._pending.pop(body.number, None) if body.session == self._session else None
+        if request is None:
+            return None
+        if body.stale:
+            self._boot, self._number = body.boot, max(self._number, body.last)
+            return None
+        answer = WitnessAnswer(
+            body.ok, body.reason, body.epoch, body.holder, body.in_sync, body.expired, body.trouble
+        )
+        return request, answer
+
+
+class WitnessLink(asyncio.DatagramProtocol):
+    """The socket to the witness; each answer goes to `answered`."""
+
+    def __init__(
+        self, channel: WitnessChannel, answered: Callable[[WitnessRequest, WitnessAnswer], None]
+    ) -> None:
+        self._channel = channel
+        self._answered = answered
+        self._transport: asyncio.DatagramTransport | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Keep the socket."""
+        self._transport = transport
+
+    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002  asyncio passes it
+        """Pass an authentic answer on."""
+        answer = self._channel.read(data)
+        if answer is not None:
+            self._answered(*answer)
+
+    def error_received(self, exc: Exception) -> None:
+        """Ignore an unreachable witness: the lease counts on answers only."""
+
+    def send(self, request: WitnessRequest) -> None:
+        """Send a request. Without a socket or a route it is lost; the lease asks again."""
+        if self._transport is not None:
+            self._transport.sendto(self._channel.write(request))

@@ -1,0 +1,269 @@
+"""The kits as `rosrv standby join` writes them, installed on the robot and on a follower, with `rosrv protect`."""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.features.standby.membership import Membership, load_membership, path_of
+from examples.landshark.lab import Host, Lab
+from tests.support.command import ROSRV, rosrv
+from tests.support.processes import LIMIT
+from tests.support.requirements import need_program, need_root
+from tests.support.script_host import ScriptHost
+from tests.support.waiting import eventually
+from tests.support.witness_site import ADDRESSES, FIXED, FOLLOWER, MASTER, NODE, ROBOT, Peer
+
+_SYSTEMCTL = """\
+#!/bin/sh
+# Enough of systemd for the kits: it starts and stops the programs of the units.
+set -eu
+units=/etc/systemd/system
+state=/run/rosrv
+mkdir -p $state
+command=
+now=
+names=
+for word; do
+    case $word in
+        --now) now=yes ;;
+        -*) ;;
+        *) if [ -z "$command" ]; then command=$word; else names="$names ${word%.service}"; fi ;;
+    esac
+done
+stop() {
+    rm -f $state/$1.done
+    [ -e $state/$1.pid ] || return 0
+    pid=$(cat $state/$1.pid)
+    kill -- -$pid 2>/dev/null || true
+    while kill -0 $pid 2>/dev/null; do sleep 0.05; done
+    rm -f $state/$1.pid
+}
+start() {
+    for wanted in $(sed -n 's/^Wants=//p' $units/$1.service); do
+        if [ -e $units/$wanted ]; then (start ${wanted%.service}); fi
+    done
+    line=$(sed -n 's/^ExecStart=//p' $units/$1.service)
+    if grep -q ^Type=oneshot $units/$1.service; then
+        [ -e $state/$1.done ] || { $line && : > $state/$1.done; }
+    elif [ ! -e $state/$1.pid ]; then
+        setsid $line </dev/null >>$state/$1.log 2>&1 &
+        echo $! > $state/$1.pid
+    fi
+}
+for name in $names; do
+    [ -e $units/$name.service ] || { echo "Unit $name.service not loaded" >&2; exit 5; }
+    case $command in
+        enable) echo $name >> $state/enabled ;;
+        disable)
+            sed -i "/^$name\\$/d" $state/enabled
+            if [ -n "$now" ]; then stop $name; fi ;;
+        restart) stop $name; start $name ;;
+        stop) stop $name ;;
+        *) exit 1 ;;
+    esac
+done
+"""
+
+
+class RobotSite:
+    """Two appliances, the robot and a follower, which have the kits; an attacker without one."""
+
+    def __init__(self, lab: Lab, folder: Path, stack: contextlib.ExitStack) -> None:
+        self._stack = stack
+        self.hosts = {name: lab.host(name, f"{address}/24") for name, address in ADDRESSES.items()}
+        self.attacker = lab.host("attacker", "10.77.0.66/24")
+        programs = folder / "bin"
+        programs.mkdir()
+        (programs / "systemctl").write_text(_SYSTEMCTL)
+        (programs / "systemctl").chmod(0o755)
+        self._path = f"{programs}:{os.environ['PATH']}:/usr/sbin"
+        self.robot = self._host(lab.host("robot", f"{ROBOT}/24"), folder / "robot")
+        self.follower = self._host(lab.host("follower", f"{FOLLOWER}/24"), folder / "follower")
+        self.servers = {name: self._listening(host, MASTER) for name, host in self.hosts.items()}
+        self.nodes = {
+            host.outer.address: self._listening(host.outer, NODE) for host in (self.robot, self.follower)
+        }
+        self.kit = folder / "kit"
+        self.state = folder / "state"
+        self.join("kit")
+
+    def join(self, kit: str, *more: str) -> None:
+        """Make the kits, and the memberships of both appliances."""
+        self.kit = self.kit.with_name(kit)
+        arguments = [f"--address={ADDRESSES['a']}", f"--other={ADDRESSES['b']}", f"--witness={ROBOT}"]
+        arguments += [f"--fixed={FIXED}", f"--follower=arm={FOLLOWER}", "--ports=11311,20000-20999"]
+        done = rosrv("standby", "join", "--state", str(self.state), *arguments, "--out", str(self.kit), *more)
+        assert done.returncode == 0, done.stderr
+
+    def _host(self, outer: Host, folder: Path) -> ScriptHost:
+        host = self._stack.enter_context(ScriptHost(outer, folder))
+        host.run("mount", "-t", "tmpfs", "tmpfs", "/var/lib")
+        host.run("mkdir", "-p", "/run/systemd/system")
+        return host
+
+    def _listening(self, host: Host, port: int) -> socket.socket:
+        return self._stack.enter_context(host.run(lambda: socket.create_server((host.address, port))))
+
+    def script(
+        self, host: ScriptHost, path: str | Path, *, check: bool = True
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a script of the kit."""
+        return host.run("sh", str(path), check=check, PATH=self._path)
+
+    def memberships(self) -> dict[str, Membership]:
+        """Return the memberships of both appliances."""
+        own, other = load_membership(path_of(self.state)), load_membership(self.kit / "standby-b.json")
+        assert own is not None and other is not None
+        return {"a": own, "b": other}
+
+    def peer(self, name: str) -> Peer:
+        """Return an appliance with the key of its membership."""
+        peer = Peer(self.hosts[name], name, bytes.fromhex(self.memberships()[name].witness_key))
+        self._stack.enter_context(peer.socket)
+        return peer
+
+    def connects(self, host: Host, address: str, port: int) -> bool:
+        """Whether a connection is accepted."""
+        try:
+            host.run(lambda: socket.create_connection((address, port), timeout=LIMIT / 3)).close()
+        except OSError:
+            return False
+        return True
+
+    def rules(self, host: ScriptHost) -> str:
+        """Return all firewall rules of a host."""
+        return host.run("nft", "list", "ruleset").stdout
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[RobotSite]:
+    """Yield a site before any kit is installed."""
+    need_root()
+    need_program("nft", "nftables")
+    with Lab("rosrv-kit") as lab, contextlib.ExitStack() as stack:
+        yield RobotSite(lab, tmp_path, stack)
+
+
+def test_the_robots_kit_fences_the_appliances_beside_protect(site: RobotSite) -> None:
+    """Installed, with closed ports, changed over, installed again, removed."""
+    robot, a, b = site.robot, site.peer("a"), site.peer("b")
+    said = site.script(robot, site.kit / "witness" / "install.sh").stdout
+    assert "the first lease is written: a has all data" in said
+    assert f"ROS_MASTER_URI=http://{FIXED}:{MASTER}" in said
+    assert robot.run("cat", "/run/rosrv/enabled").stdout.split() == ["rosrv-witness-shut", "rosrv-witness"]
+    assert not any(site.connects(host, ROBOT, NODE) for host in site.hosts.values())
+    assert "b is not in sync" in b.ask("claim", 0).reason or "holds the lease" in b.ask("claim", 0).reason
+    epoch = a.granted(0)
+    assert epoch == 2
+
+    addresses = [f"--appliance={address}" for address in ADDRESSES.values()]
+    robot.run(ROSRV, "protect", *addresses, "--ports=32768-60999", "--apply")
+    assert site.connects(site.hosts["a"], ROBOT, NODE)
+    assert not site.connects(site.hosts["b"], ROBOT, NODE)
+    assert not site.connects(site.attacker, ROBOT, NODE)
+    assert site.connects(robot.outer, FIXED, MASTER)
+    assert a.ask("add", epoch).ok and a.ask("release", epoch).ok
+    epoch = b.granted(epoch)
+    assert site.connects(site.hosts["b"], ROBOT, NODE)
+    assert not site.connects(site.hosts["a"], ROBOT, NODE)
+    assert not site.connects(site.attacker, ROBOT, NODE)
+
+    said = site.script(robot, site.kit / "witness" / "install.sh").stdout
+    assert "the first lease" not in said, "b has the newer data"
+    assert site.connects(site.hosts["b"], ROBOT, NODE)
+    assert b.ask("renew", epoch).ok
+
+    site.script(robot, "/etc/rosrv/remove-witness.sh")
+    assert "rosrv_witness" not in site.rules(robot) and "rosrv_protect" in site.rules(robot)
+    assert all(site.connects(host, ROBOT, NODE) for host in site.hosts.values())
+    left = [
+        file
+        for file in robot.files()
+        if "rosrv" in file and robot.run("test", "-e", file, check=False).returncode == 0
+    ]
+    assert left == []
+    assert robot.run("ls", "/var/lib").stdout == ""
+    assert robot.run("cat", "/run/rosrv/enabled").stdout == ""
+    site.script(robot, site.kit / "witness" / "remove.sh")  # again: there is nothing to remove
+
+
+def test_a_follower_and_the_robot_are_installed_in_any_order(site: RobotSite) -> None:
+    """The follower shuts out both until the witness answers; removed, it has no rule."""
+    follower = site.follower
+    site.script(follower, site.kit / "follower-arm" / "install.sh")
+    assert not any(site.connects(host, FOLLOWER, NODE) for host in site.hosts.values())
+    site.script(site.robot, site.kit / "witness" / "install.sh")
+    a = site.peer("a")
+    epoch = a.granted(0)
+
+    def admitted() -> bool:
+        assert a.ask("renew", epoch).ok
+        return site.connects(follower.outer, FIXED, MASTER)
+
+    eventually(admitted, lambda: follower.run("cat", "/run/rosrv/rosrv-witness-follow.log").stdout)
+    assert not site.connects(site.hosts["b"], FOLLOWER, NODE)
+    site.script(follower, "/etc/rosrv/remove-witness.sh")
+    assert site.rules(follower) == ""
+    assert site.connects(site.hosts["b"], FOLLOWER, NODE)
+
+
+def test_a_new_kit_begins_a_new_lease_with_the_first_appliance_alone_in_sync(site: RobotSite) -> None:
+    """A new standby, which has no data yet, cannot claim as the old one could."""
+    robot = site.robot
+    site.script(robot, site.kit / "witness" / "install.sh")
+    a = site.peer("a")
+    epoch = a.granted(0)
+    assert a.ask("add", epoch).ok
+    lease = site.state / "lease" / "epoch"
+    lease.parent.mkdir()
+    lease.write_text(f"{epoch}\n")
+    site.join("new", "--again")
+    site.script(robot, site.kit / "witness" / "install.sh")
+    a, b = site.peer("a"), site.peer("b")
+    assert a.granted(epoch) == epoch + 2
+    assert b.ask("look", epoch).in_sync == frozenset({"a"})
+    site.script(robot, site.kit.with_name("kit") / "witness" / "install.sh")
+    assert not site.connects(site.hosts["b"], ROBOT, NODE), "the old kit's keys are not the appliances'"
+
+
+def test_an_incomplete_kit_changes_nothing(site: RobotSite) -> None:
+    """The copy of the folder was interrupted."""
+    (site.kit / "witness" / "witness.json").unlink()
+    done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
+    assert done.returncode == 1 and "copy the whole folder" in done.stderr
+    assert site.rules(site.robot) == ""
+    assert site.robot.run("test", "-e", "/etc/rosrv/witness.py", check=False).returncode
+
+
+def test_a_python_that_cannot_run_the_program_changes_nothing(site: RobotSite) -> None:
+    """A small installation lacks modules such as hmac; the error names the module and the remedy."""
+    program = site.kit / "witness" / "witness.py"
+    program.write_text("import hmac_that_is_missing\n" + program.read_text())
+    done = site.script(site.robot, site.kit / "witness" / "install.sh", check=False)
+    assert done.returncode == 1 and "No module named 'hmac_that_is_missing'" in done.stderr
+    assert "sudo apt install python3" in done.stderr
+    assert site.robot.run("test", "-e", "/etc/rosrv/witness.py", check=False).returncode
+
+
+def test_damaged_settings_can_be_removed(site: RobotSite) -> None:
+    """The rules go, although the program cannot read its settings."""
+    robot = site.robot
+    site.script(robot, site.kit / "witness" / "install.sh")
+    robot.run("sh", "-c", "echo damaged > /etc/rosrv/witness.json")
+    site.script(robot, "/etc/rosrv/remove-witness.sh")
+    assert site.rules(robot) == ""
+    assert json.loads((site.kit / "witness" / "witness.json").read_text())["fixed"] == FIXED
+
+
+def test_the_scripts_are_posix_and_complete(site: RobotSite) -> None:
+    """They run with dash, and all values are filled in."""
+    for script in site.kit.glob("*/*.sh"):
+        done = subprocess.run(["/bin/dash", "-n", str(script)], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "@" not in script.read_text().replace('"$@"', "")

@@ -1,0 +1,240 @@
+"""The witness with the kernel's firewall and real connections: a robot, two appliances, an attacker on one network."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.features.standby import witness
+from appliance.features.standby.lease import WitnessAnswer, WitnessRequest
+from appliance.features.standby.witness_link import WitnessChannel, WitnessLink
+from examples.landshark.lab import Lab
+from tests.support.processes import LIMIT, Process
+from tests.support.requirements import need_program, need_root
+from tests.support.waiting import eventually
+from tests.support.witness_site import (
+    ADDRESSES,
+    AT_ONCE,
+    BACKENDS,
+    FIXED,
+    KEYS,
+    MASTER,
+    NODE,
+    ROBOT,
+    WITNESS,
+    Site,
+    forged,
+    seconds_until_reset,
+)
+
+
+@pytest.fixture(params=BACKENDS)
+def site(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Site]:
+    """Yield a site whose lease has epoch 1, without a running witness."""
+    need_root()
+    with Lab("rosrv-witness") as lab, contextlib.ExitStack() as sockets:
+        made = Site(lab, tmp_path, request.param, sockets)
+        made.run("begin", "--in-sync", "a,b", "--epoch", "1")
+        yield made
+        made.stop()
+
+
+def test_a_new_holder_resets_the_connections_of_the_old_one(site: Site) -> None:
+    """In both directions, also the idle ones; new connections reach the new holder through the same address."""
+    site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    to_master = [site.connect(site.robot, FIXED, MASTER) for _ in range(3)]
+    accepted = [site.accepted(site.servers["a"]) for _ in to_master]
+    from_a = [site.connect(site.hosts["a"], ROBOT, NODE) for _ in range(3)]
+    at_node = [site.accepted(site.node) for _ in from_a]
+    for near, far in zip(to_master + at_node, accepted + from_a, strict=True):
+        near.sendall(b"x")
+        assert far.recv(1) == b"x"
+    assert site.refused(site.hosts["b"], ROBOT, NODE)
+    assert site.refused(site.robot, ADDRESSES["b"], MASTER)
+
+    assert a.ask("release", epoch).ok
+    epoch = b.granted(epoch)
+    assert seconds_until_reset(to_master + at_node) < AT_ONCE
+    with contextlib.suppress(ConnectionResetError):
+        for far in accepted + from_a:
+            far.send(b"x")
+    assert seconds_until_reset(from_a) < AT_ONCE
+
+    new = site.connect(site.robot, FIXED, MASTER)
+    far = site.accepted(site.servers["b"])
+    new.sendall(b"y")
+    assert far.recv(1) == b"y"
+    site.connect(site.hosts["b"], ROBOT, NODE).close()
+    assert site.refused(site.hosts["a"], ROBOT, NODE)
+    assert site.refused(site.robot, ADDRESSES["a"], MASTER)
+
+    assert b.ask("release", epoch).ok
+    a.granted(epoch)
+    assert seconds_until_reset([new]) < AT_ONCE
+    site.connect(site.robot, FIXED, MASTER).close()
+    site.accepted(site.servers["a"])
+
+
+def test_a_reboot_shuts_out_both_until_the_holder_renews(site: Site) -> None:
+    """The boot rule needs no witness; the first renewal admits the holder again, and a claim waits."""
+    process = site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    process.stop()
+    site.connect(site.robot, FIXED, MASTER).close()  # the end of the witness alone changes nothing
+    site.run("remove")
+    site.lease.write(site.lease.read()._replace(boot="an earlier boot"))
+    site.run("shut")
+    for name, host in site.hosts.items():
+        assert site.refused(host, ROBOT, NODE)
+        assert site.refused(site.robot, ADDRESSES[name], MASTER)
+    assert site.refused(site.robot, FIXED, MASTER)
+    program = site.folder / "witness.py"
+    text = program.read_text()
+    assert "\nEXPIRY = 1.2" in text
+    # The lease still belongs to its holder when the claim arrives, however slow this machine is.
+    program.write_text(text.replace("\nEXPIRY = 1.2", "\nEXPIRY = 120.0"))
+    site.serve()
+    assert "holds the lease for another" in b.ask("claim", epoch).reason
+    assert site.refused(site.hosts["a"], ROBOT, NODE)
+    assert a.ask("renew", epoch).ok
+    site.connect(site.robot, FIXED, MASTER).close()
+    assert site.refused(site.hosts["b"], ROBOT, NODE)
+
+
+def test_a_damaged_lease_shuts_out_both_until_begin(site: Site) -> None:
+    """The log and the answers have the command."""
+    (site.folder / "lease").write_bytes(b"damaged")
+    process = site.serve()
+    assert "witness.py begin" in site.log()
+    a = site.peer("a")
+    assert "run witness.py begin" in a.ask("claim", 1).reason
+    assert site.refused(site.hosts["a"], ROBOT, NODE)
+    process.stop()
+    site.run("begin", "--in-sync", "a", "--epoch", "7")
+    site.serve()
+    assert a.granted(7) == 8
+    site.connect(site.hosts["a"], ROBOT, NODE).close()
+
+
+def test_rules_that_another_program_removes_are_written_again(site: Site) -> None:
+    """Whether they were removed, or rules for established connections were put before them."""
+    site.serve()
+    site.peer("a").granted(1)
+    if site.backend == "nft":
+        changes = [(["nft", "flush", "ruleset"], "")]
+    else:
+        accept = "*filter\n-I INPUT 1 -j ACCEPT\nCOMMIT\n"
+        changes = [(["iptables-restore", "--noflush"], accept), (["iptables-restore"], "*filter\nCOMMIT\n")]
+    for command, text in changes:
+        assert site.refused(site.hosts["b"], ROBOT, NODE)
+        with Process(site.robot, command, env=site.environment, label=command[0]) as process:
+            assert process.popen.stdin is not None
+            process.popen.stdin.write(text)
+            process.popen.stdin.close()
+            process.wait()
+        eventually(lambda: site.refused(site.hosts["b"], ROBOT, NODE), "b is shut out again")
+    assert "another program changed the firewall rules" in site.log()
+    site.connect(site.robot, FIXED, MASTER).close()
+
+
+def test_an_attacker_on_the_network_gets_no_lease_and_delays_none(site: Site) -> None:
+    """Forged, recorded and many datagrams, under the appliance's own address: nothing changes, renewals continue."""
+    site.serve()
+    a, b = site.peer("a"), site.peer("b")
+    epoch = a.granted(1)
+    assert a.ask("renew", epoch).ok
+    recorded = [a.sent]
+    assert a.ask("remove", epoch).ok
+    assert a.ask("add", epoch).ok
+    recorded.append(a.sent)
+    assert a.ask("remove", epoch).ok
+    raw = site.attacker.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
+    site.sockets.enter_context(raw)
+    wrong_key = WitnessChannel("b", KEYS["a"], "session").write(WitnessRequest("claim", epoch, 1, 0.0))
+    for number in range(8_000):
+        payload = (recorded[0], recorded[1], wrong_key, os.urandom(100))[number % 4]
+        source = (ADDRESSES["a"], ADDRESSES["a"], ADDRESSES["b"], "10.77.0.66")[number % 4]
+        raw.sendto(forged(source, payload), (ROBOT, 0))
+        if number % 800 == 0:
+            assert a.ask("renew", epoch).ok
+    assert a.ask("renew", epoch).ok
+    assert site.lease.read().in_sync == ("a",)
+    assert not b.ask("claim", epoch).ok
+    eventually(lambda: "without a valid authentication code" in site.log(), site.log)
+    assert len(site.log().splitlines()) < 40
+    site.connect(site.robot, FIXED, MASTER).close()
+
+
+def test_forged_datagrams_take_no_room_from_a_renewal(site: Site) -> None:
+    """While the witness reads nothing, a flood from its address fills one buffer; the renewal is in another."""
+    process = site.serve()
+    a = site.peer("a")
+    epoch = a.granted(1)
+    raw = site.attacker.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW))
+    site.sockets.enter_context(raw)
+    local = site.robot.run(lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    site.sockets.enter_context(local)
+    process.popen.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(2_000):
+            raw.sendto(forged(ADDRESSES["a"], os.urandom(100)), (ROBOT, 0))
+            with contextlib.suppress(PermissionError):  # by the firewall
+                local.sendto(os.urandom(100), (ROBOT, WITNESS))
+        renewal = a.channel.write(WitnessRequest("renew", epoch, 1, 0.0))
+        a.socket.send(renewal)
+    finally:
+        process.popen.send_signal(signal.SIGCONT)
+    a.socket.settimeout(AT_ONCE)
+    found = a.channel.read(a.socket.recv(1024))
+    assert found is not None
+    assert found[1].ok
+
+
+def test_the_appliances_socket_gets_the_lease(site: Site) -> None:
+    """The asyncio socket of an appliance, with lost first answers."""
+    site.serve()
+
+    async def claimed() -> WitnessAnswer:
+        answers: asyncio.Queue[WitnessAnswer] = asyncio.Queue()
+        link = WitnessLink(
+            WitnessChannel("a", KEYS["a"], "session"), lambda _, answer: answers.put_nowait(answer)
+        )
+        with site.hosts["a"].entered():
+            own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        own.setblocking(False)
+        own.connect((ROBOT, WITNESS))
+        link.send(WitnessRequest("claim", 1, 1, 0.0))  # before there is a socket: lost
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(lambda: link, sock=own)
+        with contextlib.closing(transport):
+            async with asyncio.timeout(LIMIT):
+                while True:
+                    link.send(WitnessRequest("claim", 1, 2, 0.0))
+                    with contextlib.suppress(TimeoutError):
+                        answer = await asyncio.wait_for(answers.get(), 0.3)
+                        if answer.ok:
+                            return answer
+
+    assert asyncio.run(claimed()).holder == "a"
+
+
+def test_the_units_start_the_witness_and_shut_out_both_before_the_network() -> None:
+    """systemd accepts both files; their commands are those of the program."""
+    folder = Path(witness.__file__).parent
+    units = sorted((folder / "kit_files").glob("*.service"))
+    command = [need_program("systemd-analyze", "systemd"), "verify", *map(str, units)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    following, shutting, serving = (unit.read_text() for unit in units)
+    assert "ExecStart=/usr/bin/python3 -I /etc/rosrv/witness.py follow\n" in following
+    assert "ExecStart=/usr/bin/python3 -I /etc/rosrv/witness.py serve\n" in serving
+    assert "ExecStart=/usr/bin/python3 -I /etc/rosrv/witness.py shut\n" in shutting
+    assert "Before=network-pre.target" in shutting and "DefaultDependencies=no" in shutting

@@ -1,0 +1,115 @@
+"""Mutants of each rule of the lease: the product's source with one change, which the simulation must find.
+
+python -m tests.unit.features.standby.mutants HISTORIES      prints the first seed that finds each
+"""
+
+import importlib.util
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
+
+from appliance.features.standby import lease, witness
+from tests.unit.features.standby.simulation import History, Product, Violation
+
+
+class Mutant(NamedTuple):
+    """A change of the source, and the first seed whose history finds it, with these kinds of faults (or any)."""
+
+    module: ModuleType
+    old: str
+    new: str
+    seed: int
+    faults: tuple[str, ...] = ()
+
+
+_STALE = ("bad link", "link of the appliances", "pause of the active")
+MUTANTS = {
+    "R1: a claim does not wait for the expiry": Mutant(witness, "if self._clock() < self._expires:", "if False:", 0),
+    "R1: an appliance out of sync gets the lease": Mutant(witness, "if name not in before.in_sync:", "if False:", 18),
+    "R1: a grant keeps the epoch": Mutant(witness, "epoch=before.epoch + 1, holder=name", "holder=name", 0),
+    "R1: a grant is not saved": Mutant(witness, "        self._save(record)\n", "", 0),
+    "R1: a grant leaves the firewall": Mutant(witness, "            self._enforce(name)\n", "            pass\n", 0),
+    "R1: a failing firewall is ignored": Mutant(
+        witness, "            self._change(before)\n            raise\n", "            self._change(before)\n", 1
+    ),
+    "R1: the fixed address is not translated": Mutant(witness, "            translate.append(", "            str(", 0),
+    "R2: the holder answers alone at once": Mutant(lease, "(acknowledged or self.answers_alone)", "True", 26),
+    "R2: the holder answers alone until the standby is added": Mutant(
+        lease, "                self.answers_alone = False\n", "", 29
+    ),
+    "R2: an older answer counts as removal": Mutant(
+        lease, "if request.sequence > self._last_add:", "if True:", 87, _STALE
+    ),
+    "R3: valid longer than an expiry": Mutant(lease, "0.8 * EXPIRY", "1.3 * EXPIRY", 6),
+    "R3: a promise counts from its arrival": Mutant(
+        lease, "asked + CONFIDENCE", "now + CONFIDENCE", 43, ("bad link", "witness link", "pause")
+    ),
+    "R3: a promise is forgotten at a restart": Mutant(
+        lease, "self._promised_until = now + EXPIRY\n        self._promised_to:",
+        "self._promised_until = now\n        self._promised_to:", 4, ("witness link", "crash"),
+    ),
+    "R3: an older epoch gets promises, and its data is stored": Mutant(
+        lease, "if epoch < self.epoch or epoch == self.held:", "if epoch == self.held:", 671,
+        ("bad link", "crash of the active"),
+    ),
+    "R3: promises go on after the expiry": Mutant(
+        lease, "if not self.follow(message.epoch) or self._expired:", "if not self.follow(message.epoch):", 3
+    ),
+    "R4: the first grant comes at once": Mutant(
+        witness, "self._expires = clock() + EXPIRY", "self._expires = clock()", 62
+    ),
+    "a holder of an older epoch stays active": Mutant(
+        lease, "            self.epoch = epoch\n            self.held = None", "            self.epoch = epoch", 7
+    ),
+    "a smaller epoch is accepted": Mutant(lease, "if answer.epoch < self.epoch:", "if False:", 256),
+    "a switchover: an older renewal makes active": Mutant(
+        lease, " and request.sequence > self._void_sequence", "", 0, ("switchover",)
+    ),
+    "a switchover ends later promises": Mutant(
+        lease, "and promised.number <= number", "and True", 4230, ("switchover", "bad link", "witness link")
+    ),
+    "a delayed request counts": Mutant(witness, ' or body["number"] <= self._last[name]', "", 668, _STALE),
+}  # fmt: skip
+
+
+def product_of(mutant: Mutant, folder: Path) -> Product:
+    """Return the product with this change."""
+    source = Path(str(mutant.module.__file__)).read_text(encoding="utf-8")
+    if source.count(mutant.old) != 1:
+        raise ValueError(f"{mutant.old!r} is {source.count(mutant.old)} times in {mutant.module.__file__}")
+    path = folder / "mutant.py"
+    path.write_text(source.replace(mutant.old, mutant.new), encoding="utf-8")
+    spec = importlib.util.spec_from_file_location(f"mutant_of_{mutant.module.__name__}", path)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{path} cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return Product(witness=module) if mutant.module is witness else Product(lease=module)
+
+
+def first_seed(product: Product, faults: tuple[str, ...], histories: int) -> int | None:
+    """Return the first seed whose history breaks a promise."""
+    for seed in range(histories):
+        try:
+            History(seed, product, faults=faults).run()
+        except Violation:
+            return seed
+    return None
+
+
+def main(arguments: list[str]) -> int:
+    """Print the first seed of each mutant; return 1 if one is not found."""
+    missing = 0
+    for name, mutant in MUTANTS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            seed = first_seed(product_of(mutant, Path(folder)), mutant.faults, int(arguments[0]))
+        missing += seed is None
+        sys.stdout.write(f"{seed if seed is not None else 'NOT FOUND'}\t{name}\n")
+        sys.stdout.flush()
+    return min(missing, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

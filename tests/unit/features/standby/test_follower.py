@@ -1,0 +1,514 @@
+"""A follower admits what the witness admits, never longer than the lease runs there, and never an older epoch."""
+
+import json
+import random
+from pathlib import Path
+
+import pytest
+
+from appliance.features.standby import witness
+from appliance.features.standby.witness import (
+    ANSWER,
+    EXPIRY,
+    HIGHEST,
+    OPERATIONS,
+    REQUEST,
+    AppliancePeer,
+    BoundedLog,
+    LeaseFile,
+    LeaseRecord,
+    Witness,
+    WitnessError,
+    WitnessFollower,
+    WitnessGate,
+    iptables_rules,
+    main,
+    nft_rules,
+    read_settings,
+    seal,
+    unseal,
+)
+
+BOTH = ("a", "b")
+KEY = b"f" * 32
+APPLIANCES = {
+    name: AppliancePeer(f"10.0.0.{number}", name.encode() * 32) for number, name in enumerate(BOTH, 2)
+}
+FOLLOWERS = {"arm": AppliancePeer("10.0.0.20", KEY)}
+
+
+class Robot:
+    """A witness and a follower with one clock; a test carries their datagrams."""
+
+    def __init__(self, epoch: int = 0) -> None:
+        self.now = 100.0
+        self.robot_admits: list[str] = []
+        self.follower_admits: list[str] = []
+        self.saved: list[int] = []
+        self.broken = False
+        self.start_witness(LeaseRecord(1, "", BOTH, ""))
+        self.start_follower(epoch)
+
+    def start_witness(self, record: LeaseRecord | None, boot: str = "one") -> None:
+        """Start the witness, or start it again."""
+        self.witness = Witness(
+            record=record,
+            save=lambda _record: None,
+            admit=self.robot_admits.append,
+            boot=boot,
+            clock=lambda: self.now,
+        )
+        self.gate = WitnessGate(self.witness, APPLIANCES, f"nonce {id(self.witness)}", FOLLOWERS)
+
+    def start_follower(self, epoch: int = 0, session: str = "first") -> None:
+        """Start the follower, or start it again."""
+        self.follower = WitnessFollower(
+            name="arm",
+            key=KEY,
+            appliances=BOTH,
+            session=session,
+            epoch=epoch,
+            save=self._save,
+            admit=self._admit,
+            clock=lambda: self.now,
+        )
+
+    def _save(self, epoch: int) -> None:
+        if self.broken:
+            raise WitnessError("the disk is full")
+        self.saved.append(epoch)
+
+    def _admit(self, name: str) -> None:
+        if self.broken:
+            raise WitnessError("nft: no")
+        self.follower_admits.append(name)
+
+    def claim(self, name: str) -> None:
+        """Let the lease expire; grant it to an appliance."""
+        self.now += EXPIRY
+        assert self.witness.handle(name, "claim", 0, "") == ""
+
+    def answer(self, datagram: bytes | None = None, address: str = "10.0.0.20") -> bytes | None:
+        """Return the witness's answer to a new request, or to this one."""
+        return self.gate.answer(datagram or self.follower.request(), address)
+
+    def look(self) -> str:
+        """Carry one request and its answer; return the appliance that the follower then admits."""
+        answer = self.answer()
+        assert answer is not None
+        self.follower.receive(answer)
+        return self.follower_admits[-1]
+
+
+def following(holder: str = "a") -> Robot:
+    """Return a robot whose follower admits the holder; the first answer has the witness's nonce only."""
+    robot = Robot()
+    robot.claim(holder)
+    assert robot.look() == ""
+    assert robot.look() == holder
+    return robot
+
+
+def test_a_follower_admits_what_the_robot_admits() -> None:
+    """It saves the epoch first; a takeover changes the rules at the next answer."""
+    robot = following()
+    assert robot.saved == [2]
+    robot.claim("b")
+    assert robot.look() == "b"
+    assert robot.saved == [2, 3]
+    assert robot.follower_admits == ["", "a", "b"]
+
+
+def test_a_follower_never_admits_an_appliance_whose_lease_may_be_over() -> None:
+    """An answer counts from the time of its request: whenever the robot admits `b`, the follower has shut out `a`."""
+    robot = following()
+    request = robot.follower.request()
+    robot.now += 0.1
+    answer = robot.answer(request)
+    assert answer is not None
+    robot.now += 0.8
+    robot.follower.receive(answer)
+    assert robot.follower_admits[-1] == "a"
+    robot.now += 0.31
+    assert robot.witness.handle("b", "claim", 0, "") == ""
+    robot.follower.tick()
+    assert robot.follower_admits[-1] == ""
+
+
+def test_without_answers_both_are_shut_out_after_one_expiry() -> None:
+    """The first answer admits the holder again."""
+    robot = following()
+    robot.now += EXPIRY
+    robot.follower.tick()
+    assert robot.follower_admits == ["", "a", ""]
+    assert robot.witness.handle("a", "renew", 2, "b") == ""
+    assert robot.look() == "a"
+
+
+def test_after_a_reboot_of_the_robot_the_follower_waits_as_the_robot_does() -> None:
+    """The lease has a holder, which the robot does not admit before its renewal."""
+    robot = following()
+    robot.start_witness(robot.witness.record, boot="two")
+    robot.look()
+    assert robot.look() == ""
+    assert robot.witness.handle("a", "renew", 2, "b") == ""
+    assert robot.look() == "a"
+
+
+def test_an_answer_is_used_once_and_only_by_the_process_that_asked() -> None:
+    """A repeated answer, an older one and one to an earlier process change nothing."""
+    robot = following()
+    first, second = robot.answer(), robot.answer()
+    assert first is not None and second is not None
+    robot.claim("b")
+    assert robot.look() == "b"
+    for old in (first, second):
+        robot.follower.receive(old)
+        assert robot.follower_admits[-1] == "b"
+    request = robot.follower.request()
+    robot.start_follower(session="second")
+    answer = robot.answer(request)
+    assert answer is not None
+    robot.follower.receive(answer)
+    assert robot.follower_admits[-1] == ""
+
+
+def test_an_older_answer_does_not_replace_a_newer_one() -> None:
+    """The robot was rebooted in between and admits no appliance; the epoch is the same."""
+    robot = following()
+    first = robot.answer()
+    robot.start_witness(robot.witness.record, boot="two")
+    for _ in range(2):
+        robot.look()
+    assert robot.follower_admits[-1] == "" and first is not None
+    robot.follower.receive(first)
+    assert robot.follower_admits[-1] == ""
+
+
+def test_an_answer_that_was_delayed_for_an_expiry_admits_no_appliance() -> None:
+    """An attacker who keeps a packet back gains nothing."""
+    robot = following()
+    answer = robot.answer()
+    assert answer is not None
+    robot.now += EXPIRY
+    robot.follower.receive(answer)
+    assert robot.follower_admits[-1] == ""
+
+
+def test_a_smaller_epoch_is_never_accepted() -> None:
+    """A witness that was restored from an older disk shuts out both on the followers, and they report the reason."""
+    robot = Robot(epoch=7)
+    robot.claim("a")
+    robot.look()
+    assert robot.look() == ""
+    assert "the witness knows only epoch 2" in robot.follower.refusal
+    robot.start_follower()
+    robot.claim("a")
+    for _ in range(2):
+        robot.look()
+    assert robot.saved == [3]
+    robot.start_witness(LeaseRecord(2, "b", BOTH, "one"))
+    for _ in range(2):
+        robot.look()
+    robot.now += EXPIRY
+    robot.follower.tick()
+    assert robot.follower_admits[-1] == "" and "b" not in robot.follower_admits
+
+
+def test_a_smaller_epoch_is_rejected_whatever_the_witness_says() -> None:
+    """The follower itself compares the epochs."""
+    robot = Robot(epoch=7)
+    request = unseal(REQUEST, KEY, robot.follower.request())
+    assert request is not None
+    lie = {"boot": "", "session": "first", "number": request["number"], "ok": True, "epoch": 6}
+    robot.follower.receive(seal(ANSWER, "arm", KEY, lie | {"admitted": "a", "left": 1000}))
+    assert robot.follower_admits == [""]
+    assert robot.follower.refusal == "the witness has epoch 6, but had 7 before"
+
+
+def test_an_epoch_that_cannot_be_saved_admits_no_appliance() -> None:
+    """The time of the earlier one passes."""
+    robot = following()
+    robot.claim("b")
+    robot.broken = True
+    answer = robot.answer()
+    assert answer is not None
+    with pytest.raises(WitnessError, match="disk is full"):
+        robot.follower.receive(answer)
+    robot.broken = False
+    robot.follower.tick()
+    assert robot.follower_admits[-1] == ""
+    assert robot.look() == "b"
+
+
+def test_rules_that_cannot_be_written_are_tried_again() -> None:
+    """Until then their state is unknown."""
+    robot = following()
+    robot.broken = True
+    robot.now += EXPIRY
+    with pytest.raises(WitnessError, match="nft: no"):
+        robot.follower.tick()
+    robot.broken = False
+    robot.follower.tick()
+    assert robot.follower_admits[-1] == ""
+    robot.follower.enforce_again()
+    assert robot.follower_admits[-2:] == ["", ""]
+
+
+@pytest.mark.parametrize("operation", [name for name in OPERATIONS if name != "look"])
+def test_a_follower_cannot_change_the_lease(operation: str) -> None:
+    """Its key is valid for `look` alone: R1 to R4 do not depend on it."""
+    robot = following()
+    before = robot.witness.record
+    robot.now += EXPIRY
+    body = {"boot": f"nonce {id(robot.witness)}", "session": "x", "number": 99, "do": operation, "epoch": 2}
+    assert robot.answer(seal(REQUEST, "arm", KEY, body)) is None
+    for name in BOTH:
+        assert robot.answer(seal(REQUEST, name, KEY, body), APPLIANCES[name].address) is None
+    assert robot.gate.rejected == 3
+    assert robot.witness.record == before
+    assert robot.answer(seal(REQUEST, "arm", KEY, body | {"do": "look"}), "10.0.0.21") is None, "its address"
+
+
+ANSWERED = {"session": "first", "number": 1, "ok": True, "epoch": 2, "admitted": "a", "left": 1000}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"session": "other"},
+        {"number": 2},
+        {"number": True},
+        {"epoch": "2"},
+        {"epoch": HIGHEST + 1},
+        {"epoch": None},
+        {"left": -1},
+        {"left": 0.5},
+        {"admitted": "c"},
+        {"admitted": None},
+        {"ok": 1},
+        {"ok": False, "reason": "no"},
+        {"stale": True, "boot": 1, "last": -1},
+    ],
+)
+def test_a_malformed_answer_changes_nothing(change: dict[str, object]) -> None:
+    """Even with a valid authentication code."""
+    robot = Robot()
+    robot.follower.request()
+    robot.follower.receive(seal(ANSWER, "arm", KEY, ANSWERED | change))
+    assert robot.follower_admits == [""]
+    assert robot.saved == []
+
+
+@pytest.mark.parametrize("datagram", [b"", b"\x03arm", seal(ANSWER, "arm", b"x" * 32, ANSWERED)])
+def test_an_answer_that_is_not_authentic_is_ignored(datagram: bytes) -> None:
+    """The pending request remains, and its own answer counts."""
+    robot = Robot()
+    robot.follower.request()
+    robot.follower.receive(datagram)
+    assert robot.follower_admits == [""]
+    robot.follower.receive(seal(ANSWER, "arm", KEY, ANSWERED | {"left": HIGHEST}))
+    assert robot.follower_admits == ["", "a"]
+    robot.now += EXPIRY
+    robot.follower.tick()
+    assert robot.follower_admits[-1] == "", "an answer counts for one expiry at most"
+
+
+def test_a_restarted_follower_goes_on_with_the_witnesss_numbers() -> None:
+    """Two answers later it admits the holder."""
+    robot = following()
+    for _ in range(20):
+        robot.answer()
+    robot.start_follower(epoch=2, session="second")
+    robot.look()
+    assert robot.look() == "a"
+
+
+def test_a_damaged_epoch_accepts_no_answer(tmp_path: Path) -> None:
+    """The log has the reason and the commands; a missing one is that of a new follower."""
+    lines: list[str] = []
+    log, file = BoundedLog(lines.append, lambda: 0.0), LeaseFile(str(tmp_path / "epoch"), BOTH)
+    assert witness.followed_epoch(file, log) == 0
+    file.write(LeaseRecord(7, "", BOTH, ""))
+    assert witness.followed_epoch(file, log) == 7
+    (tmp_path / "epoch").write_bytes(b"damaged")
+    robot = Robot(epoch=witness.followed_epoch(file, log))
+    assert "systemctl restart rosrv-witness-follow" in lines[0]
+    robot.claim("a")
+    for _ in range(2):
+        assert robot.look() == ""
+
+
+class RandomHistory:
+    """Appliances that come and go, a witness that restarts, a network that loses, delays and repeats; 3 % of drift."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = random.Random(seed)  # noqa: S311  a reproducible history
+        self.seconds = 0.0
+        self.speeds = [self.random.uniform(0.97, 1.03) for _ in range(2)]
+        self.robot_admits = self.follower_admits = ""
+        self.record, self.boot, self.saved = LeaseRecord(1, "", BOTH, ""), 1, 0
+        self.up = dict.fromkeys(BOTH, True)
+        self.wire: list[tuple[float, bytes, bool]] = []
+        self.admitted_seconds = 0.0
+        self.start_witness()
+        self.start_follower()
+
+    def start_witness(self) -> None:
+        """Start the witness again, sometimes after a reboot of the robot."""
+        self.boot += self.random.random() < 0.3
+        self.witness = Witness(
+            record=self.record,
+            save=lambda record: setattr(self, "record", record),
+            admit=lambda name: setattr(self, "robot_admits", name),
+            boot=str(self.boot),
+            clock=lambda: self.seconds * self.speeds[0],
+        )
+        self.gate = WitnessGate(self.witness, APPLIANCES, f"{self.random.random()}", FOLLOWERS)
+
+    def start_follower(self) -> None:
+        """Start the follower again."""
+        self.follower = WitnessFollower(
+            name="arm",
+            key=KEY,
+            appliances=BOTH,
+            session=f"{self.random.random()}",
+            epoch=self.saved,
+            save=lambda epoch: setattr(self, "saved", epoch),
+            admit=lambda name: setattr(self, "follower_admits", name),
+            clock=lambda: self.seconds * self.speeds[1],
+        )
+
+    def send(self, datagram: bytes, *, answer: bool) -> None:
+        """Lose, delay or repeat a datagram; most arrive at once."""
+        chosen = self.random.random()
+        for _ in range(0 if chosen < 0.1 else 2 if chosen > 0.9 else 1):
+            delay = self.random.uniform(0, 2) if self.random.random() < 0.2 else 0.01
+            self.wire.append((self.seconds + delay, datagram, answer))
+
+    def step(self) -> None:
+        """Let 20 ms pass; check what is admitted."""
+        self.seconds += 0.02
+        if self.random.random() < 0.03:
+            self.up[self.random.choice(BOTH)] ^= True
+        if self.random.random() < 0.004:
+            self.start_witness()
+        if self.random.random() < 0.002:
+            self.start_follower()
+        for name in [one for one in BOTH if self.up[one] and self.random.random() < 0.1]:
+            other = "b" if name == "a" else "a"
+            operation = "renew" if self.record.holder == name else "claim"
+            self.witness.handle(name, operation, self.record.epoch, other)
+        if self.random.random() < 0.1:
+            self.send(self.follower.request(), answer=False)
+        due = [one for one in self.wire if one[0] <= self.seconds]
+        self.wire = [one for one in self.wire if one[0] > self.seconds]
+        for _, datagram, answer in due:
+            if answer:
+                self.follower.receive(datagram)
+            elif (made := self.gate.answer(datagram, "10.0.0.20")) is not None:
+                self.send(made, answer=True)
+        self.follower.tick()
+        both = {self.robot_admits, self.follower_admits} - {""}
+        assert len(both) < 2, f"after {self.seconds} s"
+        self.admitted_seconds += 0.02 if self.follower_admits else 0
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_robot_and_follower_never_admit_different_appliances(seed: int) -> None:
+    """Whatever is lost, late, repeated or restarted; most of the time the follower admits one."""
+    history = RandomHistory(seed)
+    for _ in range(3_000):
+        history.step()
+    assert history.record.epoch > 3, "there were takeovers"
+    assert history.admitted_seconds > 10
+
+
+# ---- Settings and rules
+
+
+def written(folder: Path, **changes: object) -> Path:
+    """Return a settings file of a follower."""
+    path = folder / "witness.json"
+    body: dict[str, object] = {
+        "listen": "10.0.0.1:7411",
+        "fixed": "10.0.0.100",
+        "ports": ["11311"],
+        "appliances": {name: {"address": one.address} for name, one in APPLIANCES.items()},
+        "followers": {"arm": {"address": "10.0.0.20", "key": KEY.hex()}},
+        "follows_as": "arm",
+        "state": str(folder / "epoch"),
+    }
+    path.write_text(json.dumps(body | changes))
+    path.chmod(0o600)
+    return path
+
+
+def test_the_settings_of_a_follower_have_only_its_own_key(tmp_path: Path) -> None:
+    """The keys of the appliances are neither needed nor read."""
+    settings = read_settings(str(written(tmp_path)))
+    assert settings.follows_as == "arm"
+    assert [one.key for one in settings.appliances.values()] == [b"", b""]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"follows_as": "leg"}, "the only follower"),
+        ({"followers": {}}, "the only follower"),
+        ({"followers": {"arm": {"address": "10.0.0.2", "key": KEY.hex()}}}, "different addresses"),
+        ({"followers": {"arm": {"address": "10.0.0.1", "key": KEY.hex()}}}, "different addresses"),
+        (
+            {"followers": {"a": {"address": "10.0.0.20", "key": KEY.hex()}}, "follows_as": "a"},
+            "a name and a key",
+        ),
+        ({"followers": {"arm": {"address": "10.0.0.20"}}}, "'key' is missing"),
+        (
+            {
+                "followers": {
+                    f"f{number}": {"address": f"10.0.1.{number}", "key": f"{number:064x}"}
+                    for number in range(1, 34)
+                },
+                "follows_as": "f1",
+            },
+            "more than 32 followers",
+        ),
+    ],
+)
+def test_wrong_settings_of_a_follower_are_rejected(
+    tmp_path: Path, changes: dict[str, object], reason: str
+) -> None:
+    """With the reason."""
+    with pytest.raises(WitnessError, match=reason):
+        read_settings(str(written(tmp_path, **changes)))
+
+
+def test_each_computer_has_its_own_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A follower neither grants the lease nor begins one, and the witness follows no other."""
+    path = written(tmp_path)
+    for command in ("serve", "begin"):
+        assert main([command, "--settings", str(path), "--in-sync", "a", "--epoch", "5"]) == 1
+        assert "is a command for the computer with the witness" in capsys.readouterr().err
+    keys = {name: {"address": one.address, "key": one.key.hex()[:64]} for name, one in APPLIANCES.items()}
+    path = written(tmp_path, follows_as="", appliances=keys)
+    assert main(["follow", "--settings", str(path)]) == 1
+    assert "is a command for a follower" in capsys.readouterr().err
+    assert not (tmp_path / "epoch").exists()
+
+
+def test_requests_pass_only_from_appliances_and_followers(tmp_path: Path) -> None:
+    """Requests of other addresses are dropped, and all requests of this computer, where no appliance runs."""
+    settings = read_settings(str(written(tmp_path)))
+    rules = nft_rules(settings, "a")
+    assert rules.count('iif "lo" ip daddr 10.0.0.1 udp dport 7411 drop\n        iif "lo" accept') == 1
+    assert "udp dport 7411 ip saddr != { 10.0.0.2, 10.0.0.3, 10.0.0.20 } drop" in rules
+    tag = seal(REQUEST, "arm", KEY, {})[:4].hex()
+    assert rules.count("@th,64,32") == 1, "a follower knows no key but its own"
+    assert f"ip saddr 10.0.0.20 udp dport 7411 @th,64,32 != 0x{tag} drop" in rules
+    lines = iptables_rules(settings, "a", {}).splitlines()
+    own = [line for line in lines if line.startswith("-A rosrv-witness-in ")]
+    assert own[0] == "-A rosrv-witness-in -i lo -d 10.0.0.1 -p udp --dport 7411 -j DROP"
+    assert own[-2:] == [
+        "-A rosrv-witness-in -s 10.0.0.20 -j RETURN",
+        "-A rosrv-witness-in -p udp --dport 7411 -j DROP",
+    ]

@@ -1,0 +1,434 @@
+"""The lease as an appliance sees it: when it is active, and what it sends."""
+
+import pytest
+
+from appliance.features.standby.lease import (
+    CONFIDENCE,
+    FARTHEST,
+    ApplianceLease,
+    ClaimPromise,
+    LeaseError,
+    Outgoing,
+    PromiseRequest,
+    TakeOver,
+    WitnessAnswer,
+    WitnessRequest,
+)
+from appliance.features.standby.witness import EXPIRY, HIGHEST
+from appliance.features.standby.witness_link import WitnessChannel
+from tests.unit.features.standby.test_witness import KEYS, Robot
+
+BOTH, ALONE = frozenset("ab"), frozenset("a")
+
+
+def answer_of(**changes: object) -> WitnessAnswer:
+    """Return an answer of the witness: granted, except for these fields."""
+    full = {
+        "ok": True, "reason": "", "epoch": 2, "holder": "a", "in_sync": BOTH, "expired": False
+    } | changes  # fmt: skip
+    return WitnessAnswer(**full)  # type: ignore[arg-type]  # of several types
+
+
+class Lease:
+    """The lease of `a`, with a clock."""
+
+    def __init__(self, epoch: int = 1) -> None:
+        self.now = 50.0
+        self.lease = ApplianceLease("a", "b", "session", epoch, self.now)
+
+    def later(self, seconds: float) -> "Lease":
+        """Move the clock."""
+        self.now += seconds
+        return self
+
+    def tick(self, *, waiting_since: float | None = None, caught_up: bool = False) -> Outgoing:
+        """Return what is due."""
+        return self.lease.tick(self.now, waiting_since=waiting_since, caught_up=caught_up)
+
+    def operations(self, *, waiting_since: float | None = None, caught_up: bool = False) -> list[str]:
+        """Return the operations that are due at the witness."""
+        due = self.tick(waiting_since=waiting_since, caught_up=caught_up)
+        return [one.operation for one in due if isinstance(one, WitnessRequest)]
+
+    def request(self, operation: str) -> WitnessRequest:
+        """Return the request that is due."""
+        (found,) = [
+            one for one in self.tick() if isinstance(one, WitnessRequest) and one.operation == operation
+        ]
+        return found
+
+    def answered(self, request: WitnessRequest, **answer: object) -> Outgoing:
+        """Answer a request: granted, unless the test says otherwise."""
+        return self.lease.answered(request, answer_of(**answer))
+
+    def active(self) -> bool:
+        """Whether it is active now."""
+        return self.lease.is_active(self.now)
+
+
+def active_lease() -> Lease:
+    """Return a lease that has just been granted."""
+    lease = Lease().later(EXPIRY)
+    lease.answered(lease.request("claim"))
+    assert lease.active()
+    return lease
+
+
+def asked_by(lease: Lease) -> PromiseRequest:
+    """Return the request for a promise that is due."""
+    return next(one for one in lease.tick() if isinstance(one, PromiseRequest))
+
+
+def test_a_start_waits_one_expiry_before_it_claims() -> None:
+    """It may have given a promise before it ended."""
+    lease = Lease()
+    assert lease.operations() == ["look"]
+    assert lease.later(EXPIRY - 0.01).operations() == ["look"]
+    assert lease.later(0.31).operations() == ["claim"]
+
+
+def test_it_is_passive_after_0_8_of_an_expiry_without_renewal_or_promise() -> None:
+    """The time counts from the request."""
+    lease = active_lease()
+    assert lease.later(CONFIDENCE - 0.01).active()
+    assert lease.lease.next_event(lease.now) <= lease.now + 0.011
+    assert not lease.later(0.02).active()
+
+
+def test_a_renewal_counts_from_the_time_when_it_was_sent() -> None:
+    """A late answer is worth less; it makes a holder active again that no other appliance replaced."""
+    lease = active_lease().later(0.5)
+    renewal = lease.request("renew")
+    lease.later(0.9)
+    assert not lease.active()
+    lease.answered(renewal)
+    assert lease.active() and not lease.later(0.1).active()
+
+
+def test_a_promise_alone_keeps_it_active() -> None:
+    """R3: a dead witness changes nothing."""
+    lease = active_lease()
+    for _ in range(20):
+        asked = asked_by(lease.later(0.3))
+        lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+        assert lease.active()
+    lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, "other", asked.number))
+    assert not lease.later(CONFIDENCE - 0.49).active()
+
+
+def test_a_promise_makes_no_passive_appliance_active() -> None:
+    """Only the witness does."""
+    lease = active_lease()
+    asked = asked_by(lease.later(0.9))
+    lease.later(0.1)
+    assert not lease.active()
+    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    assert not lease.active()
+
+
+def test_it_does_not_claim_while_its_promise_lasts() -> None:
+    """A grant that is on its way waits until the promise ends."""
+    lease = Lease().later(EXPIRY)
+    claim = lease.request("claim")
+    (promise,) = lease.lease.received(lease.later(0.2).now, PromiseRequest(1, "theirs", 7))
+    assert isinstance(promise, ClaimPromise)
+    assert (promise.epoch, promise.session, promise.number) == (1, "theirs", 7)
+    assert lease.later(0.3).operations() == ["look"]
+    lease.answered(claim)
+    assert not lease.active()
+    renewal = lease.later(0.4).request("renew")
+    lease.answered(renewal)
+    assert not lease.active()
+    assert lease.later(EXPIRY - 0.69).active()
+
+
+def test_it_promises_nothing_after_the_lease_has_expired() -> None:
+    """An active appliance that is cut off from the robot loses the promises, and the robot gets the other one."""
+    lease, asked = Lease().later(EXPIRY), PromiseRequest(1, "theirs", 7)
+    assert lease.lease.received(lease.now, asked)
+    look = lease.request("look")
+    lease.answered(look, epoch=1, holder="b", expired=True)
+    assert not lease.lease.received(lease.later(0.3).now, asked)
+    assert lease.later(EXPIRY).operations() == ["claim"]
+    lease.answered(look, epoch=1, holder="b", expired=False)
+    assert lease.lease.received(lease.now, asked)
+
+
+def test_it_promises_nothing_to_an_older_epoch() -> None:
+    """A newer epoch ends its own, once it is no longer active."""
+    lease = active_lease()
+    assert list(lease.lease.received(lease.now, PromiseRequest(1, "theirs", 1))) == []
+    assert lease.active()
+    assert not lease.lease.follow(1) and not lease.lease.follow(2), "data of an older epoch, or of its own"
+    lease.later(CONFIDENCE)
+    assert list(lease.lease.received(lease.now, PromiseRequest(3, "theirs", 1))) != []
+    assert not lease.active() and lease.lease.epoch == 3
+
+
+@pytest.mark.parametrize("epoch", [3, 2 + FARTHEST, HIGHEST])
+def test_an_active_appliance_believes_no_later_epoch(epoch: int) -> None:
+    """Only one appliance is active: a datagram with a later epoch is forged, ends no service and is not stored."""
+    lease = active_lease()
+    assert not lease.lease.received(lease.now, PromiseRequest(epoch, "theirs", 1))
+    assert lease.active() and lease.lease.epoch == 2
+    lease.answered(lease.later(0.3).request("renew"))
+    assert lease.later(CONFIDENCE - 0.01).active()
+
+
+def test_a_passive_appliance_believes_the_witness_more() -> None:
+    """An epoch that the other appliance claimed counts until the witness answers a later request with a smaller one."""
+    lease = Lease(epoch=2)
+    look = lease.request("look")
+    assert lease.lease.follow(3) and not lease.lease.follow(2)
+    lease.answered(look, holder="b")
+    assert lease.lease.epoch == 3, "the answer may be older than the epoch"
+    lease.answered(lease.later(0.3).request("look"), holder="b")
+    assert lease.lease.epoch == 2 and lease.lease.follow(2)
+
+
+def test_a_claimed_epoch_lets_no_restored_witness_in() -> None:
+    """After a claim was undone, an epoch below the witness's own greatest one is still ignored."""
+    lease = Lease(epoch=5)
+    assert lease.lease.follow(6)
+    lease.answered(lease.request("look"), epoch=4)
+    assert lease.lease.epoch == 5
+
+
+def test_an_epoch_that_jumps_is_not_believed() -> None:
+    """Neither of the other appliance, nor of the witness; then the reason names the remedy, after which it is."""
+    lease = Lease(epoch=7)
+    assert not lease.lease.follow(8 + FARTHEST)
+    assert lease.lease.follow(7 + FARTHEST)
+    lease = Lease(epoch=7)
+    lease.answered(lease.request("look"), epoch=8 + FARTHEST, holder="b")
+    assert lease.lease.epoch == 7 and "rosrv standby repair" in lease.lease.refusal
+    repaired = Lease(epoch=0)
+    repaired.answered(repaired.request("look"), epoch=8 + FARTHEST, holder="b")
+    assert repaired.lease.epoch == 8 + FARTHEST
+
+
+def test_a_refused_renewal_of_a_replaced_holder_ends_its_epoch() -> None:
+    """It claims like any other."""
+    lease = active_lease().later(0.3)
+    lease.answered(lease.request("renew"), ok=False, reason="b holds epoch 3", epoch=3, holder="b")
+    assert not lease.active() and lease.lease.refusal == "b holds epoch 3"
+    assert lease.later(0.3).operations() == ["claim"]
+
+
+def test_a_grant_whose_answer_was_lost_is_claimed_again() -> None:
+    """The witness has a later epoch for this appliance than the appliance knows."""
+    lease = active_lease().later(0.3)
+    lease.answered(lease.request("renew"), ok=False, reason="a holds epoch 3", epoch=3)
+    assert (lease.lease.epoch, lease.lease.held) == (3, None)
+    assert lease.later(0.3).operations() == ["claim"]
+
+
+def test_a_smaller_epoch_is_ignored() -> None:
+    """A witness that lost its lease grants nothing."""
+    lease = Lease(epoch=9).later(EXPIRY)
+    lease.answered(lease.request("claim"), epoch=2)
+    assert not lease.active()
+
+
+def test_it_answers_alone_only_after_the_removal() -> None:
+    """R2: it asks for the removal when an answer has waited for half an expiry."""
+    lease = active_lease()
+    now = lease.later(0.3).now
+    assert lease.operations(waiting_since=now) == ["renew"]
+    renewal, removal = (
+        one for one in lease.later(0.61).tick(waiting_since=now) if isinstance(one, WitnessRequest)
+    )
+    assert removal.operation == "remove"
+    lease.answered(renewal)
+    assert not lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.lease.may_answer(lease.now, acknowledged=True)
+    lease.answered(removal, in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+
+
+def test_a_change_that_waits_too_long_does_not_wait_for_the_next_round() -> None:
+    """The removal is requested at once, and again in each round until the witness answers."""
+    lease = active_lease()
+    assert lease.later(0.3).operations(waiting_since=0.0) == ["renew", "remove"]
+    assert lease.later(0.1).operations(waiting_since=0.0) == []
+    assert lease.later(0.2).operations(waiting_since=0.0) == ["renew", "remove"]
+    assert lease.later(0.05).operations() == []
+    lease.answered(lease.later(0.25).request("renew"), in_sync=ALONE)
+    assert lease.later(0.1).operations(waiting_since=0.0) == []
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+
+
+def test_a_change_that_waits_is_noticed_between_two_rounds() -> None:
+    """A takeover does not take one more round."""
+    lease = active_lease().later(0.3)
+    assert lease.operations(waiting_since=lease.now) == ["renew"]
+    assert lease.later(0.1).operations(waiting_since=0.0) == ["remove"]
+    assert Lease().later(EXPIRY + 0.1).operations(waiting_since=0.0) == ["claim"], "only while active"
+
+
+def test_it_claims_when_its_promise_ends_and_ten_times_a_second() -> None:
+    """The robot has no appliance in that time."""
+    lease = Lease().later(EXPIRY)
+    lease.lease.received(lease.now, PromiseRequest(1, "theirs", 7))
+    end = lease.now + EXPIRY
+    while lease.operations() == ["look"]:
+        lease.now = lease.lease.next_event(lease.now)
+    assert lease.now == pytest.approx(end)
+    lease.now = lease.lease.next_event(lease.now)
+    assert lease.now == pytest.approx(end + 0.1) and lease.operations() == ["claim"]
+
+
+def test_it_waits_for_the_standby_before_it_is_added() -> None:
+    """An older answer does not change that."""
+    lease = active_lease().later(0.3)
+    old = lease.request("renew")
+    lease.answered(old, in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False)
+    assert lease.later(0.3).operations(caught_up=True) == ["renew", "add"]
+    lease.answered(old, in_sync=ALONE)
+    assert not lease.lease.may_answer(lease.now, acknowledged=False)
+    lease.answered(lease.later(0.3).request("renew"), in_sync=ALONE)
+    assert lease.lease.may_answer(lease.now, acknowledged=False), "the addition was lost"
+
+
+def in_a_switchover() -> tuple[Lease, TakeOver]:
+    """Return a lease that is handed over, and its order to the other appliance."""
+    lease = active_lease()
+    asked = asked_by(lease.later(0.3))
+    lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    (release,) = lease.lease.switch_over(lease.now)
+    assert isinstance(release, WitnessRequest) and release.operation == "release"
+    assert not lease.active()
+    (order,) = lease.answered(release)
+    assert isinstance(order, TakeOver)
+    return lease, order
+
+
+def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
+    """The standby claims at once."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number))
+    assert standby.later(0.1).operations() == ["look"]
+    (claim,) = standby.lease.received(standby.now, order)
+    assert isinstance(claim, WitnessRequest) and claim.operation == "claim"
+
+
+def test_a_late_order_does_not_end_a_later_promise() -> None:
+    """The other appliance did not hand over in the end, and relies on the new promise."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, order.number + 1))
+    assert list(standby.lease.received(standby.now, order)) == []
+    assert standby.later(0.3).operations() == ["look"]
+
+
+def test_a_late_request_does_not_make_a_late_order_valid() -> None:
+    """The last promise counts, and a request that was overtaken is not the last."""
+    _, order = in_a_switchover()
+    standby = Lease().later(EXPIRY)
+    for number in (order.number + 1, order.number):
+        standby.lease.received(standby.now, PromiseRequest(order.epoch, order.session, number))
+    assert list(standby.lease.received(standby.now, order)) == []
+    assert standby.later(0.3).operations() == ["look"]
+
+
+def test_older_answers_do_not_undo_a_switchover() -> None:
+    """If the other appliance does not claim, the holder renews after a while."""
+    lease = active_lease().later(0.3)
+    renewal, asked = lease.tick()
+    assert isinstance(renewal, WitnessRequest) and isinstance(asked, PromiseRequest)
+    promise = ClaimPromise(asked.epoch, asked.session, asked.number)
+    lease.lease.received(lease.now, promise)
+    lease.lease.switch_over(lease.now)
+    lease.answered(renewal)
+    lease.lease.received(lease.now, promise)
+    assert not lease.active()
+    assert lease.later(0.3).operations() == ["release"]
+    lease.answered(lease.later(2 * EXPIRY).request("renew"))
+    assert lease.active()
+
+
+def test_an_impossible_switchover_is_refused_with_the_reason() -> None:
+    """Nothing changes."""
+    with pytest.raises(LeaseError, match="not active; give the order to the other one"):
+        Lease().lease.switch_over(50.0)
+    lease = active_lease()
+    with pytest.raises(LeaseError, match="b is not ready to take over"):
+        lease.lease.switch_over(lease.now)
+    assert lease.active()
+
+
+@pytest.mark.parametrize(
+    ("able", "silence", "trouble", "reason"),
+    [
+        (True, 0.3, "", ""),
+        (False, 0.3, "", "b could not serve after a takeover"),
+        (True, EXPIRY + 0.4, "", "the witness on the robot does not answer b"),
+        (True, 0.3, "the disk is full", "the witness could not save the takeover: the disk is full"),
+    ],
+)
+def test_a_lease_is_given_up_only_to_an_appliance_that_could_claim_it(
+    able: bool, silence: float, trouble: str, reason: str
+) -> None:
+    """The standby reports with each promise whether it could serve, and since when the witness is silent."""
+    standby = Lease().later(EXPIRY)
+    standby.answered(standby.request("claim"), ok=False, holder="a")
+    standby.lease.ready = able
+    lease = active_lease()
+    lease.answered(lease.later(0.3).request("renew"), trouble=trouble)
+    asked = asked_by(lease.later(0.3))
+    for promise in standby.lease.received(standby.later(silence).now, asked):
+        lease.lease.received(lease.now, promise)  # type: ignore[arg-type]  # a promise
+    assert reason in lease.lease.handover_obstacle(lease.now)
+    if reason:
+        with pytest.raises(LeaseError, match=reason):
+            lease.lease.switch_over(lease.now)
+    else:
+        lease.lease.switch_over(lease.now)
+    assert lease.active() == bool(reason)
+
+
+# ---- The datagrams
+
+
+def exchanged(channel: WitnessChannel, robot: Robot, request: WitnessRequest) -> WitnessAnswer | None:
+    datagram = robot.gate.answer(channel.write(request), "10.0.0.2")
+    assert datagram is not None
+    found = channel.read(datagram)
+    return None if found is None else found[1]
+
+
+def test_a_new_appliance_learns_nonce_and_number() -> None:
+    """The first answer carries them; a restarted appliance goes on behind the last number."""
+    robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
+    for session in ("one", "two"):
+        channel = WitnessChannel("a", KEYS["a"], session)
+        assert exchanged(channel, robot, claim) is None
+        assert exchanged(channel, robot, claim) is not None
+    assert robot.disk is not None and robot.disk.holder == "a"
+
+
+def test_a_recorded_or_forged_answer_counts_for_nothing() -> None:
+    """Answers to an earlier process, repeated answers and damaged answers are ignored."""
+    robot, claim = Robot().expired(), WitnessRequest("claim", 1, 1, 0.0)
+    channel, restarted = WitnessChannel("a", KEYS["a"], "one"), WitnessChannel("a", KEYS["a"], "two")
+    exchanged(channel, robot, claim)
+    datagram = robot.gate.answer(channel.write(claim), "10.0.0.2")
+    assert datagram is not None
+    restarted.write(claim)
+    restarted.write(claim)
+    for wrong in (b"", datagram[:20], datagram[:-1] + b" ", datagram + b"\0"):
+        assert channel.read(wrong) is None
+    assert restarted.read(datagram) is None
+    assert channel.read(datagram) is not None
+    assert channel.read(datagram) is None
+
+
+def test_an_appliance_that_could_not_serve_does_not_claim() -> None:
+    """It asks for the lease's state, and claims once its control is present."""
+    lease = Lease().later(EXPIRY)
+    lease.lease.ready = False
+    assert lease.operations() == ["look"]
+    lease.lease.ready = True
+    assert lease.later(1.0).operations() == ["claim"]

@@ -1,0 +1,209 @@
+"""The supervisor's dead man's switch: it serves only up to the time that the lease reported last.
+
+A lapse suspends the service; only a renewal in the same epoch ends the lapse.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from appliance.base import clock
+from appliance.features.standby.lease_watch import LeaseWatch, RoleChanges
+from tests.support import autojump
+from tests.support.virtual_clock import VirtualClock
+
+
+class Role:
+    """A watch, and what it ordered."""
+
+    def __init__(self, *, member: bool = True) -> None:
+        self.orders: list[int | str] = []
+        self.stopped = asyncio.Event()
+        self.serving = True  # False: a process is only starting
+        changes = RoleChanges(
+            self.orders.append,
+            lambda: self._stop("passive"),
+            self._suspend,
+            lambda: self.orders.append("resumed"),
+        )
+        self.watch = LeaseWatch(changes, member=member)
+
+    def _stop(self, order: str) -> None:
+        self.orders.append(order)
+        self.stopped.set()
+
+    def _suspend(self) -> bool:
+        if self.serving:
+            self._stop("suspended")
+        return self.serving
+
+    async def until_stopped(self) -> float:
+        """Return the time when it stopped to serve."""
+        await self.stopped.wait()
+        return clock.since_boot()
+
+
+def run(work: Callable[[Role], Awaitable[None]], *, member: bool = True) -> None:
+    """Run a test in a loop."""
+
+    async def inside() -> None:
+        await work(Role(member=member))
+
+    autojump.run(inside())
+
+
+def test_it_is_passive_until_the_lease_is_held() -> None:
+    """Then it is active in the epoch that was reported."""
+
+    async def work(role: Role) -> None:
+        assert role.orders == []
+        role.watch.held(clock.since_boot() + 60, 5)
+        assert role.orders == [5]
+        assert role.watch.active
+
+    run(work)
+
+
+def test_it_stops_when_no_further_report_arrives() -> None:
+    """Not before the reported time, and without any message."""
+
+    async def work(role: Role) -> None:
+        until = clock.since_boot() + 0.2
+        role.watch.held(until, 5)
+        assert await role.until_stopped() >= until
+        assert role.orders == [5, "suspended"]
+        assert not role.watch.active
+
+    run(work)
+
+
+def test_a_later_report_extends_the_time() -> None:
+    """An earlier one that is still under way does not shorten it only for a moment: the last report counts."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        until = clock.since_boot() + 0.3
+        role.watch.held(until, 5)
+        assert await role.until_stopped() >= until
+        assert role.orders == [5, "suspended"]
+
+    run(work)
+
+
+def test_a_renewal_in_the_same_epoch_ends_a_lapse() -> None:
+    """No other appliance was active in between: the service goes on with its state, and may lapse again."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        for _ in range(2):
+            await role.until_stopped()
+            role.stopped.clear()
+            role.watch.lapsed()  # the report of the same lapse
+            role.watch.held(clock.since_boot() - 0.001, 5)  # late
+            assert not role.watch.active
+            role.watch.held(clock.since_boot() + 0.05, 5)
+            assert role.watch.active
+        assert role.orders == [5, *["suspended", "resumed"] * 2]
+
+    run(work)
+
+
+@pytest.mark.parametrize("end", ["ended", "not_renewable", "later epoch", "time"])
+def test_a_lapse_that_no_renewal_ends(end: str) -> None:
+    """The lease is lost, its process has ended, another appliance was active, or too much time has passed."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.lapsed()
+        role.stopped.clear()
+        if end == "later epoch":
+            role.watch.held(clock.since_boot() + 60, 7)
+        elif end != "time":
+            getattr(role.watch, end)()
+        await role.until_stopped()
+        assert role.orders == [5, "suspended", "passive", *([7] if end == "later epoch" else [])]
+
+    run(work)
+
+
+@pytest.mark.parametrize("reason", ["starting", "not renewable"])
+def test_a_lapse_that_cannot_be_suspended_ends_the_service(reason: str) -> None:
+    """A process that is only starting would start to serve; a new process of the lease gets a new epoch."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 0.05, 5)
+        role.serving = reason != "starting"
+        if reason == "not renewable":
+            role.watch.not_renewable()
+        await role.until_stopped()
+        assert role.orders == [5, "passive"]
+
+    run(work)
+
+
+def test_a_report_that_arrives_too_late_does_not_activate() -> None:
+    """The supervisor was stopped for a while, and another appliance may be active by now."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() - 0.001, 5)
+        assert role.orders == [] and not role.watch.active
+
+    run(work)
+
+
+def test_a_late_report_of_an_active_appliance_stops_it_at_once() -> None:
+    """Without waiting for a timer."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.held(clock.since_boot() - 0.001, 5)
+        assert role.orders == [5, "suspended"]
+
+    run(work)
+
+
+def test_a_new_epoch_ends_the_state_of_the_old_one() -> None:
+    """Another appliance may have been active in between, so no process may keep its memory."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.held(clock.since_boot() + 60, 7)
+        assert role.orders == [5, "passive", 7]
+
+    run(work)
+
+
+def test_the_end_of_the_lease_is_reported_once() -> None:
+    """A second end changes nothing."""
+
+    async def work(role: Role) -> None:
+        role.watch.held(clock.since_boot() + 60, 5)
+        role.watch.ended()
+        role.watch.ended()
+        assert role.orders == [5, "passive"]
+
+    run(work)
+
+
+def test_the_time_counts_while_the_machine_sleeps() -> None:
+    """The timer of the loop stops with the machine, so it is set again by the clock that does not."""
+
+    async def work(role: Role) -> None:
+        machine = VirtualClock()
+        with clock.using(machine):
+            role.watch.held(clock.since_boot() + 0.05, 5)
+            machine.sleep(3600.0)
+            await role.until_stopped()
+
+    run(work)
+
+
+def test_a_single_appliance_is_always_active() -> None:
+    """It has no lease that could end."""
+
+    async def work(role: Role) -> None:
+        role.watch.ended()
+        assert role.watch.active and role.orders == []
+
+    run(work, member=False)

@@ -1,0 +1,272 @@
+"""The right to answer alone: the lease, control's replication and the witness, with messages in all orders."""
+
+import asyncio
+import contextlib
+import socket
+from collections import deque
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from appliance.base import clock
+from appliance.channel import messages
+from appliance.features.standby import replication
+from appliance.features.standby.lease_client import LeaseClient
+from appliance.features.standby.membership import Membership
+from appliance.features.standby.process import LeaseProcess
+from appliance.features.standby.replication import Replication
+from appliance.features.standby.replication_frames import Stored
+from appliance.features.standby.replication_sender import ReplicationLag
+from appliance.features.standby.witness import EXPIRY, AppliancePeer, LeaseRecord, Witness, WitnessGate
+from tests.support.examples import examples
+from tests.support.virtual_clock import VirtualClock
+
+pytestmark = pytest.mark.nightly
+
+ADDRESSES = {"a": "10.0.0.2", "b": "10.0.0.3"}
+KEYS = {"a": b"\xaa" * 32, "b": b"\xbb" * 32}
+MEMBERSHIP = Membership(
+    name="a", other="b", address=ADDRESSES["a"], other_address=ADDRESSES["b"], fixed="10.0.0.100",
+    witness="10.0.0.1", witness_port=7411, witness_key=KEYS["a"].hex(), peer_key="cc" * 32, certificate="", key="",
+    other_certificate="",
+)  # fmt: skip
+STEPS = (
+    "change", "ship", "acknowledge", "connect", "disconnect", "time", "witness", "answer", "lose", "report",
+    "to lease", "to control", "restart", "settle", "settle", "away", "back", "back",
+)  # fmt: skip
+
+
+class Feed:
+    """The changes for the standby; the test ships them."""
+
+    size = 0
+
+    def release(self, _number: int) -> None:
+        """Forget changes that the standby has."""
+
+
+class Store:
+    """A database that writes at once."""
+
+    history = "history"
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def follow(self, _notice: object, _room: int) -> Feed:
+        return Feed()
+
+    async def settled(self) -> None:
+        """Return at once."""
+
+
+class Pair:
+    """The active appliance `a`, its standby `b`, and the witness, with every message in a queue of the test."""
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch, machine: VirtualClock) -> None:
+        self.machine = machine
+        patch.setattr(replication, "replication_context", lambda *_, **__: None)
+        record = LeaseRecord(1, "", ("a", "b"), "boot")
+        self.witness = Witness(
+            record=record, save=lambda _: None, admit=lambda _: None, boot="boot", clock=clock.since_boot
+        )
+        peers = {name: AppliancePeer(ADDRESSES[name], KEYS[name]) for name in ADDRESSES}
+        self.gate = WitnessGate(self.witness, peers, "nonce")
+        self.requests, self.answers = deque[bytes](), deque[bytes]()
+        self.to_lease, self.to_control = deque[Any](), deque[Any]()
+        here, self.supervisor = socket.socketpair()
+        self.lease = LeaseProcess(MEMBERSHIP, here.detach(), folder / "epoch")
+        parts: Any = self.lease
+        parts.send = lambda _from, datagram, to: self.requests.append(datagram) if to[1] == 7411 else None
+        parts.child = SimpleNamespace(tell=self.to_control.append)
+        self.database = Store()
+        self.standby = 0  # the last change on the standby's disk
+        self.acknowledgements = deque[int]()
+        self.answered = 0
+        self.waiting: set[asyncio.Task[None]] = set()
+        self.control: Replication
+        self.client: LeaseClient
+
+    def start_control(self, *, taken_over: bool) -> None:
+        """Start control: it has no link to the standby, and the lease no report."""
+        for task in self.waiting:
+            task.cancel()
+        self.waiting.clear()
+        self.to_lease.clear()
+        self.to_control.clear()
+        self.acknowledgements.clear()
+        self.client = LeaseClient()
+        client: Any = self.client
+        client.send = self.to_lease.append
+        store: Any = self.database
+        self.control = Replication(
+            MEMBERSHIP, self.client, store, 2, wait="standby", taken_over=taken_over, folder=Path()
+        )
+        self.lease.control_linked()
+        self.control.begin()
+
+    def step(self, name: str) -> None:  # noqa: PLR0912  a branch for each thing that can happen
+        """Let one thing happen."""
+        sender: Any = self.control.sender
+        match name:
+            case "change":
+                self.database.number += 1
+                self.waiting.add(asyncio.ensure_future(self._answer(self.database.number)))
+            case "connect":
+                sender.link = sender.link or SimpleNamespace(cancel=lambda: None)
+            case "disconnect":
+                sender.link = None
+                self.acknowledgements.clear()
+            case "ship" if sender.link is not None:
+                self.standby = max(self.standby, self.database.number)
+                sender.note_sent(self.standby)
+                self.acknowledgements.append(self.standby)
+            case "acknowledge" if self.acknowledgements:
+                sender.take(Stored(2, self.database.history, self.acknowledgements.popleft()))
+            case "time":
+                self.machine.advance(0.31)
+                self.lease.tick()
+            case "witness" if self.requests:
+                answer = self.gate.answer(self.requests.popleft(), ADDRESSES["a"])
+                assert answer is not None
+                self.answers.append(answer)
+            case "answer" if self.answers:
+                self.lease.witness_sent(self.answers.popleft(), "10.0.0.1")
+            case "lose" if self.answers:
+                self.answers.popleft()
+            case "report":
+                self.control.report()
+            case "to lease" if self.to_lease:
+                self.lease.control_said(self.to_lease.popleft())
+            case "to control" if self.to_control:
+                message = self.to_control.popleft()
+                if isinstance(message, messages.LeaseState):
+                    self.client.heard(message)
+            case "restart":
+                self.start_control(taken_over=False)
+            case "settle":
+                for each in ("time", "witness", "answer", "witness", "answer"):
+                    self.step(each)
+                while self.to_control:
+                    self.step("to control")
+                self.step("report")
+                while self.to_lease:
+                    self.step("to lease")
+            case "away":
+                for each in ("disconnect", "change", "settle", "settle", "settle"):
+                    self.step(each)
+            case "back":
+                for each in ("connect", "ship", "acknowledge", "report", "to lease"):
+                    self.step(each)
+
+    async def _answer(self, number: int) -> None:
+        await self.control.stored()
+        self.answered = max(self.answered, number)
+
+    async def turn(self) -> None:
+        """Let the tasks run, then check the promise."""
+        for _ in range(3):
+            await asyncio.sleep(0)
+        if "b" in self.in_sync():
+            assert self.answered <= self.standby, f"change {self.answered} is answered, b has {self.standby}"
+
+    def in_sync(self) -> set[str]:
+        """Return the appliances in sync."""
+        assert self.witness.record is not None
+        return set(self.witness.record.in_sync)
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for task in self.waiting:
+            task.cancel()
+        self.supervisor.close()
+        parts: Any = self.lease
+        parts.peers.close()
+        parts.asking.close()
+        parts.supervisor.close()
+
+
+async def run(pair: Pair, steps: list[str]) -> None:
+    """Become active, then take these steps."""
+    pair.machine.advance(EXPIRY)
+    pair.start_control(taken_over=True)
+    for step in ["settle"] * 8 + steps:
+        pair.step(step)
+        await pair.turn()
+
+
+# Control restarts after the order to add the standby: it must not learn an earlier permission again.
+@example(
+    steps=[
+        "change",
+        "change",
+        "time",
+        "witness",
+        "back",
+        "settle",
+        "restart",
+        "change",
+        "answer",
+        "to control",
+    ]
+)
+@settings(max_examples=examples(600))
+@given(st.lists(st.sampled_from(STEPS), min_size=10, max_size=60))
+def test_a_change_answered_alone_is_not_missing_on_a_standby_in_sync(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[str]
+) -> None:
+    """In whatever order messages, acknowledgements, losses and restarts of control come."""
+    machine = VirtualClock()
+    with pytest.MonkeyPatch.context() as patch, clock.using(machine):
+        pair = Pair(tmp_path_factory.mktemp("pair"), patch, machine)
+        try:
+            asyncio.run(run(pair, steps))
+        finally:
+            pair.close()
+
+
+def test_it_answers_alone_and_waits_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The steps above reach both: the removal of an absent standby, and its return."""
+    machine = VirtualClock()
+
+    async def story() -> None:
+        await run(pair, ["change", *["settle"] * 8])
+        assert pair.answered == 1
+        assert pair.in_sync() == {"a"}
+        for step in ("connect", "ship", "acknowledge", *["settle"] * 8):
+            pair.step(step)
+            await pair.turn()
+        assert pair.in_sync() == {"a", "b"}
+        pair.step("change")
+        await pair.turn()
+        assert pair.answered == 1, "it waits for the standby again"
+        for step in ("ship", "acknowledge"):
+            pair.step(step)
+        await pair.turn()
+        assert pair.answered == 2
+
+    with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
+        asyncio.run(story())
+
+
+def test_a_standby_has_the_time_that_a_large_value_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The lease learns of a wait only when a living standby would have stored the bytes."""
+
+    async def waits(size: int) -> float:
+        pair.start_control(taken_over=False)
+        now = asyncio.get_running_loop().time()
+        sender: Any = pair.control.sender
+        sender.lag = lambda: ReplicationLag(True, 1, size, now, "")
+        pair.control.report()
+        return float(clock.since_boot() - pair.to_lease[-1].waiting_since)
+
+    machine = VirtualClock()
+    with clock.using(machine), contextlib.closing(Pair(tmp_path, monkeypatch, machine)) as pair:
+        assert asyncio.run(waits(100)) == pytest.approx(0.0, abs=1e-3)
+        assert asyncio.run(waits(30 << 20)) == pytest.approx(-1.5, abs=1e-3)

@@ -1,0 +1,61 @@
+"""A standby that a power cut may have robbed of its last changes does not take over with them missing."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from appliance.features.standby import replica_sync
+from appliance.features.standby.replica import Replica
+from appliance.features.standby.replica_sync import ReplicaSync
+from appliance.store.state_file import SCHEMA
+from tests.support.processes import LIMIT
+
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+
+
+@pytest.fixture
+def replica(tmp_path: Path) -> Iterator[Replica]:
+    """Yield an empty replica."""
+    made = Replica(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    yield made
+    made.close()
+
+
+async def complete(replica: Replica, folder: Path, boot: str, *, followed: bool, seconds: float) -> bool:
+    """Whether the appliance may take over within this time."""
+    done = asyncio.Event()
+    task = asyncio.create_task(ReplicaSync(replica, folder, boot).run(lambda: followed, done.set))
+    try:
+        await asyncio.wait_for(done.wait(), seconds)
+    except TimeoutError:
+        return False
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+    return True
+
+
+async def test_a_restarted_process_may_take_over_at_once(replica: Replica, tmp_path: Path) -> None:
+    """The kernel has what a killed process stored; a new standby has nothing to lose."""
+    for _ in range(2):
+        assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
+
+
+async def test_after_a_reboot_it_waits_for_the_active_appliance(replica: Replica, tmp_path: Path) -> None:
+    """Until it has followed the active one, or none has appeared for long, the last changes may be missing."""
+    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
+    assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
+    assert not await complete(replica, tmp_path, "boot 2", followed=False, seconds=0.5)
+    assert await complete(replica, tmp_path, "boot 2", followed=True, seconds=LIMIT)
+    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)
+
+
+async def test_two_appliances_without_power_start_again(
+    replica: Replica, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If no active appliance appears, both lost their power, and one of them must serve the robot."""
+    assert await complete(replica, tmp_path, "boot 1", followed=False, seconds=LIMIT)
+    monkeypatch.setattr(replica_sync, "WAIT_SECONDS", 0.2)
+    assert await complete(replica, tmp_path, "boot 2", followed=False, seconds=LIMIT)

@@ -1,0 +1,75 @@
+"""Tests of `appliance.features.standby.service_watch`: when an active appliance does not serve."""
+
+import pytest
+
+from appliance.features.standby.service_watch import (
+    OBSTACLE_SECONDS,
+    RESTART_SECONDS,
+    SILENT_SECONDS,
+    START_SECONDS,
+    STEADY_SECONDS,
+    ServiceWatch,
+)
+
+
+def serving() -> ServiceWatch:
+    """Return the watch of an appliance that is active at 100 s, and serves from 102 s on."""
+    watch = ServiceWatch()
+    assert watch.fault(100.0, active=True) == ""
+    watch.linked()
+    watch.reported(102.0, "", keeps_state=False)
+    return watch
+
+
+def test_a_start_has_some_seconds() -> None:
+    """After that, another appliance should serve. A passive appliance owes nothing."""
+    watch = ServiceWatch()
+    assert watch.fault(90.0, active=False) == watch.fault(100.0, active=True) == ""
+    assert watch.fault(100.0 + START_SECONDS, active=True) == ""
+    assert watch.fault(100.1 + START_SECONDS, active=True) == "control has not been ready for 5.1 s"
+    assert watch.fault(200.0, active=False) == ""
+
+
+def test_a_lease_that_comes_back_before_control() -> None:
+    """After a lapse, control was killed. The other appliance takes over sooner, but lacks the state of monitors."""
+    for keeps_state in (True, False):
+        watch = serving()
+        watch.reported(102.5, "", keeps_state=keeps_state)
+        assert watch.fault(103.0, active=False) == ""
+        assert ("just started" in watch.fault(103.3, active=True, present=False)) is not keeps_state
+        watch.given_away()
+        watch.reported(105.0, "", keeps_state=keeps_state)
+        assert watch.fault(105.0 + SILENT_SECONDS, active=True) == ""
+        assert watch.fault(105.1 + SILENT_SECONDS, active=True)
+
+
+def test_a_control_that_hangs_and_one_that_starts_again() -> None:
+    """A hanging control is noticed before the supervisor kills it; a killed one has more time."""
+    watch = serving()
+    assert watch.fault(102.0 + SILENT_SECONDS, active=True) == ""
+    assert watch.fault(102.1 + SILENT_SECONDS, active=True) == "control has not reported for 4.1 s"
+    watch.linked()
+    assert watch.fault(102.0 + RESTART_SECONDS, active=True) == ""
+    assert "not been ready" in watch.fault(102.1 + RESTART_SECONDS, active=True)
+
+
+def test_an_obstacle_that_lasts() -> None:
+    """Control reports a full disk repeatedly. If the disk is free again in time, the lease stays."""
+    watch = serving()
+    for now in (103.0, 102.9 + OBSTACLE_SECONDS):
+        watch.reported(now, "full", keeps_state=False)
+        assert watch.fault(now, active=True) == ""
+    assert watch.fault(103.1 + OBSTACLE_SECONDS, active=True) == "full"
+    watch.reported(105.0, "", keeps_state=False)
+    assert watch.fault(105.0, active=True) == ""
+
+
+@pytest.mark.parametrize(("seconds", "factor"), [(STEADY_SECONDS - 1, 2), (STEADY_SECONDS + 1, 1)])
+def test_two_appliances_do_not_pass_the_lease_back_and_forth(seconds: float, factor: int) -> None:
+    """If one serves for a short time only, its limits are doubled the next time, until it has served for longer."""
+    watch = serving()
+    watch.reported(102.0 + seconds, "", keeps_state=False)
+    watch.given_away()
+    assert watch.fault(200.0, active=False) == watch.fault(200.0, active=True) == ""
+    assert watch.fault(200.0 + factor * START_SECONDS, active=True) == ""
+    assert watch.fault(200.1 + factor * START_SECONDS, active=True)

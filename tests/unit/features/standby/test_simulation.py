@@ -1,0 +1,33 @@
+"""The simulation finds no broken promise in the product, and finds each mutant of its rules."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.unit.features.standby.mutants import MUTANTS, product_of
+from tests.unit.features.standby.simulation import History, Violation
+
+
+@pytest.mark.parametrize("first", range(0, 300, 50))
+def test_no_history_breaks_a_promise(first: int) -> None:
+    """Each of these seeds is a history of faults; the command of the module runs more."""
+    for seed in range(first, first + 50):
+        History(seed).run()
+
+
+@pytest.mark.parametrize("name", MUTANTS)
+def test_each_mutant_of_a_rule_is_found(name: str, tmp_path: Path) -> None:
+    """The history of its seed breaks a promise with the mutant, and none with the product."""
+    mutant = MUTANTS[name]
+    History(mutant.seed, faults=mutant.faults).run()
+    with pytest.raises(Violation):
+        History(mutant.seed, product_of(mutant, tmp_path), faults=mutant.faults).run()
+
+
+def test_a_seed_gives_the_same_history_again() -> None:
+    """A finding can be repeated."""
+    traces: list[list[str]] = [[], []]
+    for trace in traces:
+        History(7, on_event=trace.append).run()
+    assert traces[0] == traces[1]
+    assert {event.partition(" ")[0] for event in traces[0]} >= {"granted", "renewed", "active", "started"}

@@ -1,0 +1,225 @@
+"""Tests of `appliance.features.standby.takeover_check`: obstacles to a takeover are found before it, and their ends noticed."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.base.actors import DISK
+from appliance.configuration.settings import Settings
+from appliance.features.standby.membership import Membership
+from appliance.features.standby.takeover_check import TakeoverCheck
+from appliance.specifications.specification_files import Sources
+from appliance.specifications.specification_revisions import text_of
+from appliance.store.state_file import IncarnationRow, MonitorRevisionRow, RevisionRow, StateStore
+from tests.support.appliance import OPEN_POLICY
+from tests.support.engines import InlineDatabase
+from tests.support.site_key import LINE, signed
+from tests.support.standby_site import memberships
+from tests.unit.specifications.monitor_desk import TEXTS, here
+
+pytestmark = [pytest.mark.anyio, pytest.mark.nightly]
+SECONDS = 60
+
+
+class Standby:
+    """The files of a standby; `store` writes its state as the replication does."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        (home / "control").mkdir()
+        self.monitors = home / "monitors"
+        self.monitors.mkdir()
+        self.policy = home / "policy.ini"
+        self.policy.write_text(OPEN_POLICY)
+        self.store = StateStore(home / "control", failed=pytest.fail, kind=InlineDatabase)
+        self.membership = memberships(home)[0]["b"]
+        self.compilations = 0
+        self.store.save_revision(self.revision(OPEN_POLICY))
+
+    def revision(self, text: str, signature: str = "") -> RevisionRow:
+        number = len(self.store.revisions()) + 1
+        return RevisionRow(number, text, f"revision {number}", 0.0, "alice", "", signature)
+
+    def save_specification(self, text: str, who: str = "alice") -> None:
+        number = len(self.store.monitor_revisions()) + 1
+        sources = text_of(Sources({"one.rv": text}))
+        self.store.save_monitor_revision(MonitorRevisionRow(number, sources, 0.0, who, ""))
+
+    async def compiled(self, sources: Sources, site_keys: Any) -> Any:
+        self.compilations += 1
+        return await here(sources, site_keys)
+
+    @contextlib.asynccontextmanager
+    async def checked(
+        self, *, again: float = 3600.0, membership: Membership | None = None, **settings: Any
+    ) -> AsyncIterator["Checked"]:
+        """Run the check; it repeats itself after `again` seconds."""
+        await self.store.settled()
+        given: dict[str, Any] = {
+            "listen": "127.0.0.1:0",
+            "isolation": "none",
+            "monitors": self.monitors,
+        } | settings
+        whole = Settings(state=self.home, policy=self.policy, **given)
+        checked = Checked(
+            TakeoverCheck(whole, membership or self.membership, self.compiled, again=again), self.store
+        )
+        task = asyncio.create_task(checked.check.run(checked.changed.set))
+        try:
+            async with asyncio.timeout(SECONDS):
+                yield checked
+        finally:
+            task.cancel()
+            await asyncio.wait([task])
+
+
+class Checked:
+    """A running check, and its results."""
+
+    def __init__(self, check: TakeoverCheck, store: StateStore) -> None:
+        self.check = check
+        self.changed = asyncio.Event()
+        self._store = store
+
+    async def next_obstacle(self) -> str:
+        await self.changed.wait()
+        self.changed.clear()
+        assert self.check.obstacle is not None
+        return self.check.obstacle
+
+    async def replicate(self) -> None:
+        await self._store.settled()
+        self.check.news.set()
+
+
+@pytest.fixture
+def standby(tmp_path: Path) -> Iterator[Standby]:
+    made = Standby(tmp_path)
+    yield made
+    made.store.close()
+
+
+async def test_a_standby_without_obstacles(standby: Standby) -> None:
+    """The result is empty; before the first check it is not known."""
+    standby.save_specification(TEXTS["a"])
+    async with standby.checked() as checked:
+        assert checked.check.obstacle is None
+        assert await checked.next_obstacle() == ""
+
+
+async def test_other_site_keys(standby: Standby) -> None:
+    """The policy of the active appliance must have a signature that this one accepts; so must its specifications."""
+    async with standby.checked(site_keys=[LINE]) as checked:
+        assert "revision 1:1:1: error: it has no signature of the site" in await checked.next_obstacle()
+        standby.store.save_revision(standby.revision(OPEN_POLICY, signed(OPEN_POLICY)))
+        await checked.replicate()
+        assert await checked.next_obstacle() == ""
+        standby.save_specification(TEXTS["a"])
+        await checked.replicate()
+        assert "one.rv:1:1: error: it has no signature of the site" in await checked.next_obstacle()
+
+
+async def test_a_policy_and_a_specification_that_this_version_cannot_load(standby: Standby) -> None:
+    """The first finding is the reason; the next revision of the active appliance removes it."""
+    standby.store.save_revision(standby.revision(f"{OPEN_POLICY}[Tomorrow]\n"))
+    async with standby.checked() as checked:
+        assert "revision 2:9:" in await checked.next_obstacle()
+        standby.store.save_revision(standby.revision(OPEN_POLICY))
+        standby.save_specification(TEXTS["nonsense"])
+        await checked.replicate()
+        assert "one.rv:1:" in await checked.next_obstacle()
+        standby.save_specification(TEXTS["a"])
+        await checked.replicate()
+        assert await checked.next_obstacle() == ""
+
+
+async def test_state_that_this_version_does_not_understand(standby: Standby) -> None:
+    """The reason names the remedy: the same version on both appliances."""
+    row = IncarnationRow(
+        "k", "/n", "10.0.0.7", "http://10.0.0.7:1/", "10.0.0.7", 1, 2, False, "dreaming", 0.0
+    )
+    standby.store.save_incarnation(row)
+    async with standby.checked(again=0.05) as checked:
+        obstacle = await checked.next_obstacle()
+        assert "'dreaming' is not a valid Life" in obstacle
+        assert obstacle.endswith("update this appliance to the same version")
+        standby.store.forget_incarnation("k")
+        assert await checked.next_obstacle() == ""
+
+
+async def test_an_unreadable_folder_of_specifications(standby: Standby) -> None:
+    """A takeover reads it while the active appliance has no specifications; it is checked again from time to time."""
+    standby.monitors.rmdir()
+    async with standby.checked(again=0.05) as checked:
+        assert await checked.next_obstacle() == (
+            f"{standby.monitors}: the folder of specifications does not exist"
+        )
+        standby.monitors.mkdir()
+        assert await checked.next_obstacle() == ""
+
+
+async def test_an_unreadable_policy(standby: Standby) -> None:
+    """Only a standby that has no replicated policy yet would read its own file."""
+    standby.policy.unlink()
+    async with standby.checked() as checked:
+        assert await checked.next_obstacle() == ""
+    standby.store.database.delete("policy_revision", revision=1)
+    async with standby.checked(again=0.05) as checked:
+        assert f"{standby.policy}: the policy cannot be read" in await checked.next_obstacle()
+        standby.policy.write_text(OPEN_POLICY)
+        assert await checked.next_obstacle() == ""
+
+
+async def test_a_monitor_to_enable_that_does_not_exist(standby: Standby) -> None:
+    """The start refuses it if no operator loaded the specifications."""
+    standby.save_specification(TEXTS["a"], who=DISK)
+    async with standby.checked(enable="a,other") as checked:
+        assert "no monitor is named other; there are: a" in await checked.next_obstacle()
+
+
+async def test_a_port_in_use(standby: Standby) -> None:
+    """The port is free again once its user has ended, and the check does not keep it."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        async with standby.checked(again=0.05, listen=f"127.0.0.1:{port}") as checked:
+            assert f"127.0.0.1:{port} cannot be listened on" in await checked.next_obstacle()
+            taken.close()
+            assert await checked.next_obstacle() == ""
+            socket.create_server(("127.0.0.1", port)).close()
+
+
+async def test_a_damaged_certificate(standby: Standby) -> None:
+    """Without the certificate of the link, a takeover would fail."""
+    damaged = msgspec.structs.replace(standby.membership, certificate="")
+    async with standby.checked(membership=damaged) as checked:
+        assert "the certificates of the two appliances cannot be used" in await checked.next_obstacle()
+
+
+async def test_the_same_specifications_are_compiled_once(standby: Standby) -> None:
+    standby.save_specification(TEXTS["a"])
+    async with standby.checked() as checked:
+        assert await checked.next_obstacle() == ""
+        standby.store.save_revision(standby.revision(f"{OPEN_POLICY}[Tomorrow]\n"))
+        await checked.replicate()
+        await checked.next_obstacle()
+        standby.store.save_revision(standby.revision(OPEN_POLICY))
+        await checked.replicate()
+        assert await checked.next_obstacle() == ""
+    assert standby.compilations == 1
+
+
+async def test_the_check_changes_nothing(standby: Standby) -> None:
+    """The state is the same after it, although the check reads it while it is written."""
+    before = standby.store.database.number
+    async with standby.checked() as checked:
+        await checked.next_obstacle()
+    assert standby.store.database.number == before
+    assert {path.name for path in (standby.home / "control").iterdir()} <= {
+        "state.db", "state.db-wal", "state.db-shm", "state.ahead", "standby.pem", "standby-key.pem",
+    }  # fmt: skip

@@ -1,0 +1,249 @@
+"""Tests of recording takeovers and of replicating checkpoints of the audit log, with real logs, keys and states."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import structlog
+
+from appliance.audit.proof.copies import SignedCheckpoint, newest_checkpoint
+from appliance.audit.search.query import Filter
+from appliance.audit.search.search import search
+from tests.support.appliance_pair import Member, World, play
+from tests.support.waiting import eventually
+
+pytestmark = pytest.mark.nightly
+
+
+def records(member: Member, event: str) -> list[dict[str, Any]]:
+    """Return the details of the records of an event, the oldest first; `reason` is added."""
+    found = search(member.path, Filter(event=event), newest_first=False).entries
+    return [{**one.record.detail, "reason": one.record.reason} for one in found]
+
+
+def after(tmp_path: Path, story: Callable[[Member, Member], Awaitable[None]]) -> tuple[Member, Member]:
+    async def timeless(a: Member, b: Member, _world: World) -> None:
+        await story(a, b)
+
+    return play(tmp_path, timeless)
+
+
+async def sealed_by_b(a: Member, b: Member) -> SignedCheckpoint:
+    """Let b be active and replicate to a; return b's checkpoint."""
+    async with b.active(1):
+        await b.decide(3, 1)
+        await b.sealed()
+    b.replicate_to(a)
+    checkpoint = b.replicated()
+    assert checkpoint is not None
+    return checkpoint
+
+
+def test_a_takeover_names_the_last_replicated_checkpoint(tmp_path: Path) -> None:
+    named: list[SignedCheckpoint] = []
+
+    async def story(a: Member, b: Member) -> None:
+        named.append(await sealed_by_b(a, b))
+        await a.recorder.took_over(4)
+
+    a, b = after(tmp_path, story)
+    (record,) = records(a, "took over")
+    assert record.pop("reason").startswith(
+        "a is active from epoch 4; the last replicated checkpoint of b is "
+    )
+    assert record == {
+        "epoch": 4,
+        "appliance": "a",
+        "other": "b",
+        "checkpoint": msgspec.to_builtins(named[0]),
+        "previous": {"epoch": 1, "appliance": "b"},
+    }
+    assert named[0].key == b.key.public_key().public_bytes_raw().hex()
+
+
+def test_the_first_takeover_says_that_no_checkpoint_was_replicated(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        await a.recorder.took_over(1)
+
+    (record,) = records(after(tmp_path, story)[0], "took over")
+    assert (record["checkpoint"], record["previous"]) == (None, None)
+    assert record["reason"] == "a is active from epoch 1; no checkpoint of b was replicated"
+
+
+def test_a_checkpoint_of_its_own_log_is_not_named(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            await a.sealed()
+        own = a.replicated()
+        assert own is not None
+        a.store.save_setting("audit checkpoint of b", own.as_json())
+        await a.recorder.took_over(2)
+
+    record = records(after(tmp_path, story)[0], "took over")[1]
+    assert record["checkpoint"] is None
+    assert record["reason"].endswith("the replicated checkpoint of b is of this appliance's own log")
+
+
+@pytest.mark.parametrize(
+    ("written", "forged"),
+    [
+        ('"sequence":', '"sequence":1'), ('"number":', '"number":1'),
+        ('"number":', '"number":99999999999999999999'), ('"number":', '"number":-'), ('"log":"', '"log":"x'),
+        ('"hash":"', '"hash":"0'), ('"signature":"', '"signature":"00'), ('"signature":"', '"signature":"x'),
+        ('"key":"', '"key":"00'), ("{", "["),
+    ],
+)  # fmt: skip
+def test_a_lying_appliance_gets_no_checkpoint_named(tmp_path: Path, written: str, forged: str) -> None:
+    async def story(a: Member, b: Member) -> None:
+        text = (await sealed_by_b(a, b)).as_json()
+        a.store.save_setting("audit checkpoint of b", text.replace(written, forged, 1))
+        await a.recorder.took_over(2)
+
+    (record,) = records(after(tmp_path, story)[0], "took over")
+    assert record["checkpoint"] is None
+    assert "the replicated checkpoint of b is not valid: " in record["reason"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[" * 100_000, '"\\ud800"', "null", '{"epoch": -1, "appliance": "b"}']
+)
+def test_a_state_without_a_last_takeover_has_no_previous_one(tmp_path: Path, text: str) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        a.store.save_setting("last takeover", text)
+        await a.recorder.took_over(1)
+
+    assert records(after(tmp_path, story)[0], "took over")[0]["previous"] is None
+
+
+def test_a_restart_within_an_epoch_repeats_no_record(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        for epoch in (1, 1, 2, 2):
+            await a.recorder.took_over(epoch)
+
+    a, _b = after(tmp_path, story)
+    assert [one["epoch"] for one in records(a, "took over")] == [1, 2]
+
+
+def test_the_own_log_knows_the_takeover_before(tmp_path: Path) -> None:
+    """If the state lacks the last takeover, because a crash came first, the own log's last one is named."""
+
+    async def story(a: Member, _b: Member) -> None:
+        await a.recorder.took_over(5)
+        a.store.save_setting("last takeover", '{"epoch": 3, "appliance": "b"}')
+        await a.recorder.took_over(6)
+
+    a, _b = after(tmp_path, story)
+    assert records(a, "took over")[1]["previous"] == {"epoch": 5, "appliance": "a"}
+
+
+def test_the_state_has_a_takeover_only_once_its_record_is_on_disk(tmp_path: Path) -> None:
+    """While the log cannot be written, the state does not claim a takeover that a power failure could lose."""
+
+    async def story(a: Member, _b: Member) -> None:
+        a.path.rename(a.path.with_name("away"))
+        await a.recorder.took_over(1)
+        assert "last takeover" not in a.store.settings()
+        a.path.with_name("away").rename(a.path)
+        assert await a.log.wait_durable() is None
+        await a.recorder.took_over(1)
+        assert a.store.settings()["last takeover"] == '{"epoch":1,"appliance":"a"}'
+
+    a, _b = after(tmp_path, story)
+    assert [one["epoch"] for one in records(a, "took over")] == [1]
+
+
+def test_the_takeover_is_sealed_and_replicated_at_once(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1, sealed=False):
+            ((place),) = [one.sequence for one in search(a.path, Filter(event="took over")).entries]
+            await asyncio.to_thread(
+                eventually,
+                lambda: (kept := a.replicated()) and kept.sequence >= place,
+                "the takeover is sealed",
+            )
+
+    after(tmp_path, story)
+
+
+def test_each_signed_checkpoint_is_replicated(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            for _ in range(3):
+                await a.decide(2, 1)
+                await a.sealed()  # waits for it
+
+    after(tmp_path, story)
+
+
+def test_an_earlier_checkpoint_is_replicated_at_the_start(tmp_path: Path) -> None:
+    signed: list[SignedCheckpoint] = []
+
+    async def story(a: Member, _b: Member) -> None:
+        await a.decide(2, 1)
+        assert await a.log.wait_signed() is None
+        first = newest_checkpoint(a.path)
+        assert first is not None
+        signed.append(first)
+        a.silence()
+        async with a.active(1, sealed=False):
+            await asyncio.to_thread(
+                eventually, lambda: a.replicated() == first, "the first one is replicated"
+            )
+
+    a, _b = after(tmp_path, story)
+    assert newest_checkpoint(a.path) == signed[0]  # those after it have no signature
+
+
+def test_a_hand_over_returns_when_the_state_has_the_sealed_log(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            await a.decide(2, 1)
+        await a.hand_over(1)
+        (place,) = [one.sequence for one in search(a.path, Filter(event="handed over")).entries]
+        kept = a.replicated()
+        assert kept is not None
+        assert kept.sequence >= place
+
+    a, _b = after(tmp_path, story)
+    (record,) = records(a, "handed over")
+    assert record == {"epoch": 1, "appliance": "a", "to": "b", "reason": "a handed over to b in epoch 1"}
+
+
+def test_a_log_that_cannot_be_read_does_not_end_the_replication(tmp_path: Path) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            with structlog.testing.capture_logs() as printed:
+                a.path.rename(a.path.with_name("away"))
+                a.signed.set()
+                await asyncio.to_thread(
+                    eventually,
+                    lambda: [one for one in printed if "not replicated" in one["event"]],
+                    "an error",
+                )
+                a.path.with_name("away").rename(a.path)
+            await asyncio.to_thread(eventually, lambda: a.log.failed is None, "the log is written")
+            await a.decide(2, 1)
+            await a.sealed()
+
+    after(tmp_path, story)
+
+
+def test_an_older_checkpoint_replaces_no_newer_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def story(a: Member, _b: Member) -> None:
+        async with a.active(1):
+            older = a.replicated()
+            await a.decide(2, 1)
+            await a.sealed()
+        newer = a.replicated()
+        assert older is not None
+        assert newer is not None
+        monkeypatch.setattr(
+            "appliance.features.standby.takeover_record.newest_checkpoint", lambda _path: older
+        )
+        await a.hand_over(1)
+        assert a.replicated() == newer
+
+    after(tmp_path, story)

@@ -1,0 +1,586 @@
+"""Tests of verifying two logs and the takeovers between them.
+
+The attacker is root on one appliance, with its signing key and its signer's memory: each forged log alone is valid.
+"""
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from appliance.audit.log.log_database import LogUnreadableError
+from appliance.audit.log.signatures import pinned_key_path, write_public_key
+from appliance.audit.proof.verification import verify
+from appliance.features.standby.membership import path_of, save_membership
+from appliance.features.standby.takeover_verification import (
+    PairVerification,
+    TakeoverFindingKind,
+    VerifiedLog,
+    verify_alone,
+    verify_takeovers,
+)
+from appliance.signing.signed_statements import parse_checkpoint
+from tests.support.appliance_pair import Member, Story, World, four_takeovers, play
+from tests.support.audit import decision
+from tests.support.command import rosrv
+from tests.support.forgery import write_anew
+from tests.support.standby_site import memberships
+
+pytestmark = pytest.mark.nightly
+
+# ruff: noqa: S608  the attacker's statements are built from fixed words
+
+Kind = TakeoverFindingKind
+
+
+class Pair(NamedTuple):
+    """Copies of two closed logs, and their keys."""
+
+    a: Path
+    b: Path
+    key_a: Ed25519PrivateKey
+    key_b: Ed25519PrivateKey
+
+    def forge_a(self, change: str) -> None:
+        """Change a's log as root there."""
+        write_anew(self.a, self.key_a, self.a.parent / "signer", change)
+
+    def forge_b(self, change: str) -> None:
+        """Change b's log as root there."""
+        write_anew(self.b, self.key_b, self.b.parent / "signer", change)
+
+
+def build(folder: Path, story: Story) -> Pair:
+    """Return the logs of two appliances after a story."""
+    a, b = play(folder, story)
+    return Pair(a.path, b.path, a.key, b.key)
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> Pair:
+    """Return the logs of an honest pair; tests change copies."""
+    return build(tmp_path_factory.mktemp("honest"), four_takeovers)
+
+
+@pytest.fixture
+def pair(honest: Pair, tmp_path: Path) -> Pair:
+    """Return a copy of the honest pair."""
+    for name, path in (("a", honest.a), ("b", honest.b)):
+        shutil.copytree(path.parent.parent, tmp_path / name)
+    return honest._replace(a=tmp_path / "a/control/audit.db", b=tmp_path / "b/control/audit.db")
+
+
+def verified(a: Path, b: Path) -> PairVerification:
+    """Verify two logs and the takeovers between them."""
+    pair = verify_takeovers(VerifiedLog(a, verify(a)), VerifiedLog(b, verify(b)))
+    assert pair.ok == (not pair.findings and all(log.ok for log in pair.logs))
+    return pair
+
+
+def found(pair: Pair) -> list[tuple[Kind, int]]:
+    """Return the findings between two logs that are both valid on their own."""
+    result = verified(pair.a, pair.b)
+    assert [log.findings for log in result.logs] == [[], []]
+    turned = verified(pair.b, pair.a)
+    assert sorted(turned.findings, key=str) == sorted(
+        result.findings, key=str
+    )  # the order of the logs does not matter
+    return [(one.kind, one.epoch) for one in result.findings]
+
+
+def read(path: Path, query: str) -> list[Any]:
+    """Return rows of a log."""
+    with closing(sqlite3.connect(path)) as connection:
+        return connection.execute(query).fetchall()
+
+
+def execute(path: Path, *statements: str) -> None:
+    """Run SQL on a log's file."""
+    with closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+
+
+def setting(field: str, value: str, epoch: int, event: str = "took over") -> str:
+    """Return SQL that changes a field in the detail of the takeover of an epoch."""
+    return (
+        f"UPDATE record SET detail = CAST(json_set(CAST(detail AS TEXT), '$.{field}', {value}) AS BLOB)"
+        f" WHERE event = '{event}' AND json_extract(CAST(detail AS TEXT), '$.epoch') = {epoch}"
+    )
+
+
+def removing(epoch: int) -> str:
+    """Return SQL that removes the takeover of an epoch."""
+    return f"DELETE FROM record WHERE event = 'took over' AND CAST(detail AS TEXT) LIKE '%\"epoch\":{epoch}%'"
+
+
+# --- an honest pair -----------------------------------------------------------------------------------------------
+
+
+def test_an_honest_pair_is_proven(pair: Pair) -> None:
+    """Four takeovers of a pair whose clocks differ by an hour have no finding, and each result is as it happened."""
+    result = verified(pair.a, pair.b)
+    assert result.ok, result.findings
+    rows = [(one.epoch, one.appliance, one.other, one.link, one.overlap) for one in result.takeovers]
+    assert rows == [
+        (1, "a", "b", "none", "unknown"),
+        (2, "b", "a", "proven", "excluded"),
+        (4, "a", "b", "proven", "excluded"),
+        (5, "b", "a", "proven", "unknown"),
+    ]
+
+
+def test_a_standby_that_was_never_active_has_no_log(pair: Pair, tmp_path: Path) -> None:
+    """The other log is verified alone; it is a finding if that log names the missing one."""
+
+    async def first_hour(a: Member, _b: Member, _world: World) -> None:
+        async with a.active(1):
+            await a.decide(3, 10)
+
+    fresh = build(tmp_path / "fresh", first_hour)
+    for log, findings in ((fresh.a, []), (pair.a, [(Kind.LOG_MISSING, 4)])):
+        result = verify_alone(VerifiedLog(log, verify(log)), "b")
+        assert [(one.kind, one.epoch) for one in result.findings] == findings
+        assert result.ok is not bool(findings)
+    states = fresh.a.parents[1], fresh.b.parents[1]
+    fresh.b.unlink()
+    command = "audit", "verify", "--state", str(states[0]), "--other", str(states[1])
+    assert rosrv(*command).returncode == 2  # a wrong directory
+    save_membership(path_of(states[1]), memberships(tmp_path)[0]["b"])
+    done = rosrv(*command)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (
+        0, "b has no log yet, because it was never active: there is no takeover to verify.",
+    )  # fmt: skip
+
+
+def test_the_tail_is_counted(pair: Pair) -> None:
+    """The tail has the records after the named checkpoint until the next takeover; later checkpoints seal it."""
+    second, third = verified(pair.a, pair.b).takeovers[1:3]
+    ((next_takeover,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
+    assert second.tail == next_takeover - 1 - second.through >= 5
+    assert second.tail_signed == second.tail
+    ((handed_over,),) = read(pair.b, "SELECT sequence FROM record WHERE event = 'handed over'")
+    assert third.through == handed_over
+    assert third.tail <= 1  # the record of the checkpoint itself
+
+
+def test_signatures_before_the_named_checkpoint_seal_no_tail(pair: Pair) -> None:
+    """If the other log has lost its later signatures, none of its tail counts as sealed."""
+    lost = msgspec.structs.replace(verify(pair.a), signed_through=3)
+    result = verify_takeovers(VerifiedLog(pair.a, lost), VerifiedLog(pair.b, verify(pair.b)))
+    assert [one.tail_signed for one in result.takeovers if one.other == "a"] == [0, 0]
+
+
+def test_an_unsigned_tail_is_counted(tmp_path: Path) -> None:
+    """Records of an appliance that never came back are in the tail, and no checkpoint seals them."""
+
+    async def story(a: Member, b: Member, world: World) -> None:
+        async with a.active(1):
+            await a.decide(3, 3)
+            await a.sealed()
+            a.replicate_to(b)
+            await a.decide(4, 3)
+        world.passes(3)
+        async with b.active(2):
+            await b.decide(3, 3)
+            await b.sealed()
+
+    made = build(tmp_path, story)
+    result = verified(made.a, made.b)
+    assert result.ok
+    assert result.takeovers[1].tail >= 4
+    assert result.takeovers[1].tail_signed == 0
+
+
+def begun_after(path: Path, removed: int) -> VerifiedLog:
+    """Remove the first records of a log, with the result of a verification before it, as retention leaves it."""
+    result = msgspec.structs.replace(verify(path), removed=removed)
+    execute(path, f"DELETE FROM record WHERE sequence <= {removed}")
+    return VerifiedLog(path, result)
+
+
+def test_retention_leaves_the_rest_proven(pair: Pair) -> None:
+    """A named checkpoint whose records retention removed is not a finding, and is reported as removed."""
+    first = verified(pair.a, pair.b).takeovers[1]
+    result = verify_takeovers(begun_after(pair.a, first.through), VerifiedLog(pair.b, verify(pair.b)))
+    assert result.ok, result.findings
+    assert [(one.epoch, one.link) for one in result.takeovers] == [
+        (2, "removed"),
+        (4, "proven"),
+        (5, "proven"),
+    ]
+
+
+def test_a_takeover_removed_by_retention_is_not_missing(pair: Pair) -> None:
+    """A takeover that retention can have removed is not missing; one after the first that is left is."""
+    pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "a"}\')', 5))
+    assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
+    b = VerifiedLog(pair.b, verify(pair.b))
+    within = verify_takeovers(begun_after(pair.a, 1), b)
+    assert [(one.kind, one.epoch) for one in within.findings] == [(Kind.TAKEOVER_MISSING, 3)]
+    ((place,),) = read(pair.a, "SELECT max(sequence) FROM record WHERE event = 'took over'")
+    assert verify_takeovers(begun_after(pair.a, place - 1), b).findings == []
+    assert verify_takeovers(begun_after(pair.a, place), b).findings == []
+
+
+def test_records_after_the_verified_part_are_not_read(pair: Pair) -> None:
+    """A takeover that was written after the verification is not part of the result."""
+    result = verify(pair.b)
+    ((place,),) = read(pair.b, "SELECT max(sequence) FROM record WHERE event = 'took over'")
+    part = msgspec.structs.replace(result, last=place - 1)
+    epochs = [
+        one.epoch
+        for one in verify_takeovers(VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, part)).takeovers
+    ]
+    assert epochs == [1, 2, 4]
+
+
+def test_the_tail_reaches_beyond_an_unsealed_takeover(tmp_path: Path) -> None:
+    """A takeover that the other appliance did not get to know of belongs to the tail, and no checkpoint seals it."""
+
+    async def story(a: Member, b: Member, world: World) -> None:
+        async with a.active(1):
+            a.replicate_to(b)
+        a.silence()
+        async with a.active(2, sealed=False):
+            await a.decide(5, 5)
+        world.passes(3)
+        async with b.active(3):
+            await b.decide(3, 3)
+
+    made = build(tmp_path, story)
+    result = verified(made.a, made.b)
+    assert result.ok, result.findings
+    last = result.takeovers[-1]
+    assert last.tail == result.logs[0].last - last.through > 5
+    assert last.tail_signed == 0
+
+
+def test_the_findings_are_limited(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A forged log cannot make an endless result."""
+    pair.forge_b(removing(2))
+    assert len(verified(pair.a, pair.b).findings) > 1
+    monkeypatch.setattr("appliance.features.standby.takeover_verification._MOST_FINDINGS", 1)
+    assert len(verified(pair.a, pair.b).findings) == 1
+
+
+def test_logs_without_a_takeover_have_no_link(tmp_path: Path) -> None:
+    """Two logs of appliances that never were a pair have no takeover to report."""
+
+    async def story(a: Member, b: Member, _world: World) -> None:
+        await a.decide(3, 3)
+        await b.decide(3, 3)
+
+    made = build(tmp_path, story)
+    result = verified(made.a, made.b)
+    assert result.ok
+    assert result.takeovers == []
+
+
+# --- tampering ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", ["decision = 'deny'", "time = time - 1", "host = '10.0.0.99'"])
+def test_a_rewritten_log(pair: Pair, change: str) -> None:
+    """A record changed before a named checkpoint, with everything signed again, contradicts the other log."""
+    pair.forge_b(f"UPDATE record SET {change} WHERE sequence = 5")
+    assert found(pair) == [(Kind.REWRITTEN, 4)]
+
+
+def test_a_removed_decision(pair: Pair) -> None:
+    """A decision removed before a named checkpoint, with everything signed again, contradicts the other log."""
+    pair.forge_a("DELETE FROM record WHERE sequence = 6")
+    assert found(pair) == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
+
+
+def test_a_cut_log(pair: Pair) -> None:
+    """A log whose end was cut off with its checkpoints lacks the checkpoint that the other log names."""
+    third = verified(pair.a, pair.b).takeovers[2]
+    execute(
+        pair.b,
+        f"DELETE FROM record WHERE sequence >= {third.through}",
+        f"DELETE FROM checkpoint WHERE sequence >= {third.through}",
+    )
+    assert found(pair) == [(Kind.TRUNCATED, 4)]
+
+
+def test_a_missing_log(pair: Pair) -> None:
+    """A log that is not there is an error that names its path."""
+    result = verify(pair.b)
+    pair.b.unlink()
+    with pytest.raises(LogUnreadableError, match=str(pair.b)):
+        verify_takeovers(VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, result))
+
+
+def test_a_removed_takeover(pair: Pair) -> None:
+    """A takeover removed from a log that was signed again is named: the takeover after it names it."""
+    pair.forge_b(removing(2))
+    assert (Kind.TAKEOVER_MISSING, 2) in found(pair)
+
+
+def test_a_removed_unsealed_takeover(pair: Pair) -> None:
+    """A takeover that no named checkpoint seals is missed all the same."""
+    pair.forge_b(setting("previous", 'json(\'{"epoch": 3, "appliance": "b"}\')', 5))
+    assert found(pair) == [(Kind.TAKEOVER_MISSING, 3)]
+
+
+def test_a_log_of_another_pair(pair: Pair, tmp_path: Path) -> None:
+    """The log of another pair, although valid on its own, does not have the named checkpoints."""
+    stranger = build(tmp_path / "stranger", four_takeovers)
+    kinds = found(pair._replace(b=stranger.b))
+    assert (Kind.LOG_REPLACED, 4) in kinds
+    assert (Kind.LOG_REPLACED, 2) in kinds
+
+
+def test_one_log_given_twice(pair: Pair) -> None:
+    """A copy of the same log is not the log of the other appliance."""
+    assert found(pair._replace(b=pair.a)) == [(Kind.SAME_LOG, 0)]
+
+
+def test_a_log_signed_with_another_key(pair: Pair) -> None:
+    """A log that was signed again with a new key, also beside the log, is not by the key that takeovers name."""
+    key = Ed25519PrivateKey.generate()
+    write_anew(pair.b, key, pair.b.parent / "signer", "UPDATE record SET reason = reason")
+    write_public_key(pinned_key_path(pair.b), key.public_key().public_bytes_raw())
+    assert found(pair) == [(Kind.WRONG_KEY, 4)]
+
+
+def test_a_forged_signature_in_a_takeover(pair: Pair) -> None:
+    """A checkpoint in a takeover that the other key did not sign is not believed."""
+    pair.forge_b(setting("checkpoint.signature", "'" + "00" * 64 + "'", 5))
+    assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
+
+
+def test_a_forged_checkpoint_in_a_takeover(pair: Pair) -> None:
+    """A takeover whose checkpoint was changed accuses the other log of nothing."""
+    pair.forge_b(setting("checkpoint.hash", "'" + "00" * 32 + "'", 5))
+    assert found(pair) == [(Kind.SIGNATURE_WRONG, 5)]
+
+
+def test_a_different_checkpoint_with_the_same_hash(pair: Pair) -> None:
+    """A checkpoint that was replaced in the log by one of another time is found."""
+    number, sequence, text = read(pair.a, "SELECT number, sequence, text FROM checkpoint ORDER BY number")[-2]
+    named = verified(pair.a, pair.b).takeovers[-1]
+    assert sequence == named.through
+    changed = parse_checkpoint(text)._replace(time=1).text()
+    with closing(sqlite3.connect(pair.a)) as connection:
+        connection.execute(
+            "UPDATE checkpoint SET text = ?, signature = ? WHERE number = ?",
+            (changed, pair.key_a.sign(changed), number),
+        )
+        connection.execute("DELETE FROM checkpoint WHERE number > ?", (number,))
+        connection.commit()
+    findings = [(one.kind, one.epoch) for one in verified(pair.a, pair.b).findings]
+    assert findings == [(Kind.CHECKPOINT_CHANGED, 5)]
+
+
+def test_a_takeover_with_an_earlier_epoch(pair: Pair) -> None:
+    """An epoch that was set back contradicts the epochs that the named checkpoint seals."""
+    pair.forge_b(setting("epoch", "3", 5))
+    assert (Kind.EPOCH_ORDER, 3) in found(pair)
+    names = [one.message for one in verified(pair.a, pair.b).findings]
+    assert any("seals the takeover of epoch 4" in message for message in names), names
+
+
+def test_an_epoch_in_both_logs(pair: Pair) -> None:
+    """Two appliances with the same epoch are named."""
+    pair.forge_b(setting("epoch", "4", 5))
+    assert "epoch 4: both logs have a takeover of epoch 4" in [
+        one.message for one in verified(pair.a, pair.b).findings
+    ]
+
+
+@pytest.mark.parametrize("epoch", [1, 2])
+def test_epochs_that_do_not_increase_in_a_log(pair: Pair, epoch: int) -> None:
+    """An epoch that is repeated or smaller than an earlier one of its log is named."""
+    pair.forge_b(setting("epoch", str(epoch), 5))
+    message = next(
+        one.message for one in verified(pair.a, pair.b).findings if "comes after epoch 2" in one.message
+    )
+    assert message.startswith(f"epoch {epoch}: record ")
+
+
+def test_a_previous_takeover_from_the_future(pair: Pair) -> None:
+    """A takeover that names itself or a later one as the one before it is named."""
+    pair.forge_b(setting("previous.epoch", "5", 5))
+    assert found(pair) == [(Kind.EPOCH_ORDER, 5)]
+
+
+@pytest.mark.parametrize(("field", "name"), [("other", "c"), ("appliance", "a")])
+def test_a_wrong_name(pair: Pair, field: str, name: str) -> None:
+    """A takeover from an appliance that is not the other one, or under its name, is named."""
+    pair.forge_b(setting(field, f"'{name}'", 5))
+    assert (Kind.WRONG_NAME, 5) in found(pair)
+
+
+@pytest.mark.parametrize("value", ["-1", "'five'", "9223372036854775808.5"])
+def test_an_unreadable_takeover(pair: Pair, value: str) -> None:
+    """A takeover without the fields of its event is a finding, not a crash."""
+    pair.forge_b(setting("epoch", value, 5))
+    assert (Kind.UNREADABLE, 0) in found(pair)
+
+
+@pytest.mark.parametrize(("field", "value"), [("epoch", "1"), ("to", "'c'")])
+def test_a_hand_over_that_does_not_fit(pair: Pair, field: str, value: str) -> None:
+    """A hand-over of an epoch that the appliance did not have, or to an unknown one, is named."""
+    pair.forge_b(setting(field, value, 2, "handed over"))
+    assert Kind.EPOCH_ORDER in {kind for kind, _epoch in found(pair)}
+    assert any("hands it over to" in one.message for one in verified(pair.a, pair.b).findings)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE record SET time = 'noon' WHERE event = 'took over'",
+        "UPDATE record SET time = NULL WHERE event = 'decision'",
+        "UPDATE record SET hash = 5000000000000",
+        "UPDATE checkpoint SET text = 7",
+        "ALTER TABLE record DROP COLUMN time",
+        "DROP TABLE checkpoint",
+    ],
+)
+def test_a_replaced_table(pair: Pair, statement: str) -> None:
+    """Tables with values of other types are findings, not a crash."""
+    execute(
+        pair.a,
+        "CREATE TABLE loose AS SELECT * FROM record",
+        "DROP TABLE record",
+        "ALTER TABLE loose RENAME TO record",
+        "CREATE TABLE loose AS SELECT * FROM checkpoint",
+        "DROP TABLE checkpoint",
+        "ALTER TABLE loose RENAME TO checkpoint",
+        statement,
+    )
+    result = verified(pair.a, pair.b)
+    assert not result.ok
+    assert not result.logs[0].ok
+
+
+def test_a_log_that_changes_after_its_verification(pair: Pair) -> None:
+    """Hashes that are replaced by other values between two steps are a finding, not a crash."""
+    results = VerifiedLog(pair.a, verify(pair.a)), VerifiedLog(pair.b, verify(pair.b))
+    execute(
+        pair.a,
+        "CREATE TABLE loose AS SELECT * FROM record",
+        "DROP TABLE record",
+        "ALTER TABLE loose RENAME TO record",
+        "UPDATE record SET hash = 7",
+    )
+    found_now = verify_takeovers(*results).findings
+    assert [(one.kind, one.epoch) for one in found_now] == [(Kind.REWRITTEN, 2), (Kind.REWRITTEN, 5)]
+
+
+@pytest.mark.parametrize("side", ["a", "b"])
+def test_a_fault_of_either_log_is_one_of_the_pair(pair: Pair, side: str) -> None:
+    """A log that is not valid on its own makes the pair invalid."""
+    execute(getattr(pair, side), "UPDATE record SET reason = 'x' WHERE sequence = 3")
+    assert not verified(pair.a, pair.b).ok
+
+
+def test_an_older_copy(pair: Pair, tmp_path: Path) -> None:
+    """A copy of a log from before the last takeovers is named as too short."""
+    shutil.copytree(pair.b.parent, tmp_path / "older")
+    older = pair._replace(b=tmp_path / "older" / "audit.db")
+    execute(older.b, "DELETE FROM record WHERE sequence > 3", "DELETE FROM checkpoint WHERE sequence > 3")
+    assert (Kind.TRUNCATED, 4) in found(older)
+
+
+# --- overlapping epochs -------------------------------------------------------------------------------------------
+
+
+def overlapping(folder: Path, both: float, *, lasting: float = 60, clock_set: str = "") -> Pair:
+    """Return the logs of a pair in which a decides for `both` seconds while b is active for `lasting` seconds."""
+
+    async def story(a: Member, b: Member, world: World) -> None:
+        async with a.active(1):
+            await a.decide(5, 5)
+            await a.sealed()
+            a.replicate_to(b)
+        async with b.active(2):
+            if both:
+                await a.decide(1, both)
+            world.passes(1)
+            if clock_set:
+                (a if clock_set == "a" else b).trail.happened("clock set forward", "by a person", seconds=9)
+            await b.decide(5, lasting)
+            await b.sealed()
+        b.replicate_to(a)
+        async with a.active(3):
+            await a.decide(2, 2)
+            await a.sealed()
+
+    return build(folder, story)
+
+
+@pytest.mark.parametrize(
+    ("both", "lasting", "findings"),
+    [
+        (0, 60, []),
+        (4, 60, []),
+        (10, 60, [(Kind.OVERLAP, 2)]),
+        (10, 50_000, []),
+        (30, 50_000, [(Kind.OVERLAP, 2)]),
+    ],
+)
+def test_decisions_of_both_at_once(tmp_path: Path, both: float, lasting: float, findings: list[Any]) -> None:
+    """An appliance that decided for longer than the tolerance while the other one was active is found."""
+    made = overlapping(tmp_path, both, lasting=lasting)
+    assert found(made) == findings
+    assert verified(made.a, made.b).takeovers[1].overlap == ("found" if findings else "excluded")
+
+
+@pytest.mark.parametrize("who", ["a", "b"])
+def test_a_clock_that_was_set_proves_no_overlap(tmp_path: Path, who: str) -> None:
+    """Durations are not compared over a recorded change of either clock, and the result says that it is unknown."""
+    made = overlapping(tmp_path, 10, clock_set=who)
+    assert found(made) == []
+    assert verified(made.a, made.b).takeovers[1].overlap == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "event", "findings"),
+    [
+        (6, "", [(Kind.OVERLAP, 1)]),
+        (4, "", []),  # a call that was under way
+        (6, "clock set forward", []),
+        (6, "switchover failed", []),
+    ],
+)
+def test_decisions_after_a_hand_over(tmp_path: Path, seconds: float, event: str, findings: list[Any]) -> None:
+    """Decisions long after a hand-over are found, unless a failed hand-over or a change of the clock is recorded."""
+
+    async def story(a: Member, b: Member, _world: World) -> None:
+        async with a.active(1):
+            await a.decide(2, 2)
+        await a.hand_over(1)
+        if event:
+            a.trail.happened(event, "for a reason")
+        await a.decide(2, seconds)
+        await a.hand_over(1)
+        a.replicate_to(b)
+        async with b.active(2):
+            await b.decide(2, 2)
+
+    assert found(build(tmp_path, story)) == findings
+
+
+def test_denials_that_retention_wrote_again_are_old(tmp_path: Path) -> None:
+    """A denial that retention writes again after a hand-over was not decided then."""
+
+    async def story(a: Member, b: Member, world: World) -> None:
+        async with a.active(1):
+            await a.decide(5, 5)
+        await a.hand_over(1)
+        a.log.record(decision(a.log, time=1, detail={"call": "x", "kept": {"sequence": 3}}))
+        a.replicate_to(b)
+        world.passes(1)
+        async with b.active(2):
+            await b.sealed()
+
+    assert found(build(tmp_path, story)) == []

@@ -1,0 +1,556 @@
+"""The witness: it grants one lease at a time, keeps it on the disk, and answers only authenticated, fresh requests."""
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.features.standby import witness as program
+from appliance.features.standby.witness import (
+    ANSWER,
+    EXPIRY,
+    LONGEST,
+    REQUEST,
+    AppliancePeer,
+    BoundedLog,
+    DiskCheck,
+    LeaseFile,
+    LeaseFirewall,
+    LeaseRecord,
+    Witness,
+    WitnessError,
+    WitnessGate,
+    WitnessSettings,
+    chosen_backend,
+    main,
+    seal,
+    sockets_with,
+    unseal,
+)
+
+KEYS = {"a": b"a" * 32, "b": b"b" * 32}
+PEERS = {"a": AppliancePeer("10.0.0.2", KEYS["a"]), "b": AppliancePeer("10.0.0.3", KEYS["b"])}
+BOTH = ("a", "b")
+FIRST = LeaseRecord(1, "", BOTH, "")
+
+
+class Robot:
+    """A witness with a clock, a disk and a firewall, each of which a test can make fail."""
+
+    def __init__(self, record: LeaseRecord | None = FIRST, boot: str = "one") -> None:
+        self.now = 100.0
+        self.disk = record
+        self.admits: list[str] = []
+        self.disk_full = self.firewall_fails = False
+        self.witness = Witness(
+            record=record, save=self.save, admit=self.admit, boot=boot, clock=lambda: self.now
+        )
+        self.gate = WitnessGate(self.witness, PEERS, "nonce")
+
+    def save(self, record: LeaseRecord) -> None:
+        """Save, unless the disk is full."""
+        if self.disk_full:
+            raise WitnessError("the disk is full")
+        self.disk = record
+
+    def admit(self, name: str) -> None:
+        """Admit, unless the firewall fails."""
+        if self.firewall_fails:
+            raise WitnessError("nft: no")
+        self.admits.append(name)
+
+    def asks(self, name: str, operation: str, epoch: int = 1) -> str:
+        """Return the reason of the refusal, or nothing."""
+        return self.witness.handle(name, operation, epoch, "b" if name == "a" else "a")
+
+    def expired(self) -> "Robot":
+        """Let the lease expire."""
+        self.now += EXPIRY
+        return self
+
+
+def granted() -> Robot:
+    """Return a robot whose lease `a` has, with epoch 2."""
+    robot = Robot().expired()
+    assert robot.asks("a", "claim") == ""
+    return robot
+
+
+def test_the_first_grant_comes_one_expiry_after_the_start() -> None:
+    """R4: both are shut out until then."""
+    robot = Robot()
+    assert robot.admits == [""]
+    robot.now += EXPIRY - 0.01
+    assert "no appliance holds the lease" in robot.asks("a", "claim")
+    robot.now += 0.02
+    assert robot.asks("a", "claim") == ""
+    assert robot.admits == ["", "a"]
+    assert robot.disk == LeaseRecord(2, "a", BOTH, "one")
+
+
+def test_a_claim_waits_until_the_last_renewal_has_expired() -> None:
+    """R1: while the holder renews, a claim is refused."""
+    robot = granted()
+    robot.now += 1
+    assert robot.asks("a", "renew", 2) == ""
+    robot.now += 1
+    assert robot.asks("b", "claim", 2) == "a holds the lease for another 0.2 s"
+    assert robot.expired().asks("b", "claim", 2) == ""
+    assert robot.asks("a", "renew", 2) == "b holds epoch 3"
+
+
+def test_only_an_appliance_in_sync_gets_the_lease() -> None:
+    """R1 and R2: a removed appliance is refused until the holder adds it again."""
+    robot = granted()
+    assert robot.asks("b", "remove", 2) == "a holds epoch 2"
+    assert robot.asks("a", "remove", 2) == ""
+    assert robot.disk is not None and robot.disk.in_sync == ("a",)
+    assert robot.expired().asks("b", "claim", 2) == "b is not in sync"
+    assert robot.asks("a", "add", 2) == ""
+    assert robot.asks("b", "claim", 2) == ""
+
+
+def test_a_released_lease_is_granted_at_once() -> None:
+    """A planned switchover waits for no expiry."""
+    robot = granted()
+    assert robot.asks("b", "release", 2) == "a holds epoch 2"
+    assert robot.asks("a", "release", 2) == ""
+    assert robot.asks("b", "claim", 2) == ""
+
+
+def test_an_epoch_never_falls() -> None:
+    """An old epoch of the holder is refused; a witness that knows less than an appliance grants nothing."""
+    robot = granted().expired()
+    assert robot.asks("a", "claim", 2) == ""
+    assert robot.asks("a", "renew", 2) == "a holds epoch 3"
+    assert "run witness.py begin" in robot.expired().asks("b", "claim", 9)
+
+
+def test_a_full_disk_grants_nothing_and_keeps_the_holder() -> None:
+    """Renewals continue without the disk."""
+    robot = granted()
+    robot.disk_full = True
+    assert robot.asks("a", "renew", 2) == ""
+    assert robot.asks("a", "remove", 2) == "the disk is full"
+    assert robot.expired().asks("b", "claim", 2) == "the disk is full"
+    assert robot.admits == ["", "a"]
+    assert robot.asks("a", "renew", 2) == ""
+
+
+def test_a_failing_firewall_grants_nothing() -> None:
+    """The earlier holder keeps the lease, and its renewal writes the rules again."""
+    robot = granted().expired()
+    robot.firewall_fails = True
+    assert robot.asks("b", "claim", 2) == "nft: no"
+    assert robot.disk == LeaseRecord(2, "a", BOTH, "one")
+    assert robot.asks("a", "renew", 2) == "nft: no", "the state of the rules is unknown"
+    robot.firewall_fails = False
+    assert robot.asks("a", "renew", 2) == ""
+    assert robot.admits == ["", "a", "a"]
+
+
+def test_a_restart_of_the_witness_alone_changes_no_rule() -> None:
+    """Within one boot the holder stays admitted; after a reboot only its renewal admits it."""
+    record = LeaseRecord(2, "a", BOTH, "one")
+    assert Robot(record, "one").admits == ["a"]
+    robot = Robot(record, "two")
+    assert robot.admits == [""]
+    assert robot.asks("a", "renew", 2) == ""
+    assert robot.admits == ["", "a"]
+    assert robot.disk == LeaseRecord(2, "a", BOTH, "two")
+
+
+def test_without_a_lease_both_are_shut_out() -> None:
+    """Every request is refused with the command that helps."""
+    robot = Robot(None).expired()
+    for operation in program.OPERATIONS:
+        assert "witness.py begin" in robot.asks("a", operation)
+    assert robot.admits == [""]
+    robot.witness.enforce_again()
+    assert robot.admits == ["", ""]
+
+
+def test_rules_that_another_program_removed_are_written_again() -> None:
+    """The holder stays admitted."""
+    robot = granted()
+    robot.witness.enforce_again()
+    assert robot.admits == ["", "a", "a"]
+
+
+# ---- Datagrams
+
+
+def request(name: str = "a", key: bytes | None = None, **body: object) -> bytes:
+    full = {"boot": "nonce", "session": "mine", "number": 1, "do": "claim", "epoch": 1} | body
+    return seal(REQUEST, name, key or KEYS[name], full)
+
+
+def answered(robot: Robot, datagram: bytes, address: str = "10.0.0.2") -> dict[str, object] | None:
+    """Return the authenticated answer."""
+    answer = robot.gate.answer(datagram, address)
+    return None if answer is None else unseal(ANSWER, KEYS["a"], answer)
+
+
+def test_an_answer_repeats_session_and_number() -> None:
+    """It has the lease as it is after the request."""
+    assert answered(Robot().expired(), request()) == {
+        "boot": "nonce", "session": "mine", "number": 1, "ok": True, "reason": "", "epoch": 2, "holder": "a",
+        "in_sync": ["a", "b"], "expired": False, "trouble": "",
+    }  # fmt: skip
+
+
+def test_a_look_changes_nothing() -> None:
+    """It says whether the lease has expired."""
+    robot = Robot().expired()
+    answers = [
+        answered(robot, request(do=operation, number=number, epoch=epoch))
+        for number, (operation, epoch) in enumerate((("look", 1), ("claim", 1), ("look", 2)), 1)
+    ]
+    assert [one and (one["ok"], one["epoch"], one["expired"]) for one in answers] == [
+        (True, 1, True), (True, 2, False), (True, 2, False),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("datagram", "address"),
+    [
+        (b"", "10.0.0.2"),
+        (b"\xff" * LONGEST, "10.0.0.2"),
+        (request() + b" " * LONGEST, "10.0.0.2"),
+        (request(key=KEYS["b"]), "10.0.0.2"),
+        (request(), "10.0.0.3"),
+        (request()[:-1] + b"]", "10.0.0.2"),
+        (seal(ANSWER, "a", KEYS["a"], {"boot": "nonce"}), "10.0.0.2"),
+        (request(number=-1), "10.0.0.2"),
+        (request(number=True), "10.0.0.2"),
+        (request(number=1 << 60), "10.0.0.2"),
+        (request(epoch="1"), "10.0.0.2"),
+        (request(do="begin"), "10.0.0.2"),
+        (request(do=["claim"]), "10.0.0.2"),
+        (request(session="x" * 33), "10.0.0.2"),
+        (request(more=1), "10.0.0.2"),
+    ],
+)
+def test_a_request_that_is_not_authentic_and_well_formed_gets_no_answer(
+    datagram: bytes, address: str
+) -> None:
+    """It is counted, and changes nothing."""
+    robot = Robot().expired()
+    assert robot.gate.answer(datagram, address) is None
+    assert robot.gate.rejected == 1
+    assert robot.admits == [""]
+
+
+def test_a_replayed_request_changes_nothing() -> None:
+    """Its answer has the last number, with which a restarted appliance goes on."""
+    robot = granted()
+    removal, addition = (
+        request(do="remove", epoch=2, number=5),
+        request(do="add", epoch=2, number=4, session="old"),
+    )
+    assert answered(robot, removal) is not None
+    for old in (removal, addition):
+        assert robot.disk is not None and robot.disk.in_sync == ("a",)
+        answer = answered(robot, old)
+        assert answer is not None and answer["stale"] is True and answer["last"] == 5
+
+
+def test_only_a_new_request_moves_the_socket_of_an_appliance() -> None:
+    """A forged, replayed or earlier datagram names no sender whose port the witness would prefer."""
+    robot = granted()
+    seen = []
+    for datagram, address in (
+        (request(do="renew", epoch=2, number=5), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=5), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=4), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6, boot="earlier"), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6, key=KEYS["b"]), "10.0.0.2"),
+        (request(do="renew", epoch=2, number=6), "10.0.0.3"),
+        (request(do="renew", epoch=2, number=6), "10.0.0.2"),
+    ):
+        robot.gate.answer(datagram, address)
+        seen.append(robot.gate.fresh)
+    assert seen == ["a", "", "", "", "", "", "a"]
+
+
+def test_a_request_to_an_earlier_start_changes_nothing() -> None:
+    """The answer has the nonce of this start."""
+    robot = Robot().expired()
+    answer = answered(robot, request(boot="earlier"))
+    assert answer == {"boot": "nonce", "session": "mine", "number": 1, "stale": True, "last": 0}
+    assert robot.admits == [""]
+
+
+# ---- The file
+
+
+def test_the_lease_survives_on_the_disk(tmp_path: Path) -> None:
+    """It is readable only by its owner. A change needs no free space: the file stays, with its size."""
+    file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    assert not file.has_room()
+    stats = []
+    for record in (LeaseRecord(7, "a", ("a",), "x"), LeaseRecord(8, "b", BOTH, "x")):
+        file.write(record)
+        assert file.read() == record
+        stats.append((tmp_path / "lease").stat())
+    before, after = stats
+    assert (after.st_ino, after.st_size, after.st_mode & 0o777) == (before.st_ino, before.st_size, 0o600)
+
+
+@pytest.mark.parametrize(("end", "epoch"), [(0, 7), (100, 7), (4096, 8), (4196, 8), (8192, 8)])
+def test_a_crash_leaves_the_old_lease_or_the_new_one(tmp_path: Path, end: int, epoch: int) -> None:
+    """A change overwrites two copies in turn; `end` is where the power was cut."""
+    path, made = tmp_path / "lease", []
+    file = LeaseFile(str(path), BOTH)
+    for number in (7, 8):
+        file.write(LeaseRecord(number, "a" * (number == 8), BOTH, "x"))
+        made.append(path.read_bytes())
+    path.write_bytes(made[1][:end] + made[0][end:])
+    assert file.read().epoch == epoch
+
+
+def test_the_lease_of_an_earlier_version_is_read_and_gets_room(tmp_path: Path) -> None:
+    """The file had one copy and no padding."""
+    file, record = LeaseFile(str(tmp_path / "lease"), BOTH), LeaseRecord(7, "a", BOTH, "x")
+    file.write(record)
+    (tmp_path / "lease").write_bytes((tmp_path / "lease").read_bytes()[:4096].rstrip())
+    assert file.read() == record and not file.has_room()
+    file.write(record._replace(epoch=8))
+    assert file.read().epoch == 8 and file.has_room()
+
+
+def test_a_disk_that_cannot_be_written_is_reported_in_each_answer(tmp_path: Path) -> None:
+    """Before the next takeover needs it; also a disk that does not answer, and a file without room."""
+    now = [0.0]
+    file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    disk = DiskCheck(file, lambda: now[0])
+    assert "has no room for the next change" in disk.trouble()
+    file.write(FIRST)
+    disk.check()
+    assert disk.trouble() == ""
+    (tmp_path / "lease.check").unlink()
+    (tmp_path / "lease.check").symlink_to("/dev/full")
+    disk.check()
+    assert (
+        disk.trouble() == f"the disk of the lease {tmp_path}/lease cannot be written: No space left on device"
+    )
+    robot = granted()
+    robot.witness.trouble = disk.trouble()
+    answer = answered(robot, request(do="look", epoch=2))
+    assert answer is not None and answer["trouble"] == disk.trouble()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: b"",
+        lambda text: text[:-1],
+        lambda text: text.replace(b'"epoch": 7', b'"epoch": 8'),
+        lambda text: b"\xff" + text,
+    ],
+)
+def test_a_damaged_lease_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    """The error has the file, the reason and the command."""
+    file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    file.write(LeaseRecord(7, "a", BOTH, "x"))
+    (tmp_path / "lease").write_bytes(damage((tmp_path / "lease").read_bytes()))
+    with pytest.raises(WitnessError, match=r"lease cannot be used: .*begin --in-sync NAMES --epoch N"):
+        file.read()
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        LeaseRecord(-1, "a", BOTH, ""),
+        LeaseRecord(1, "a", ("a", "c"), ""),
+        LeaseRecord(1, "", (), ""),
+        LeaseRecord(1, "b", ("a",), ""),
+    ],
+)
+def test_a_lease_of_other_appliances_is_refused(tmp_path: Path, record: LeaseRecord) -> None:
+    """A valid checksum is not enough."""
+    file = LeaseFile(str(tmp_path / "lease"), BOTH)
+    file.write(record)
+    with pytest.raises(WitnessError):
+        file.read()
+
+
+def test_a_save_that_fails_keeps_the_lease() -> None:
+    """A full disk is reported with the file."""
+    with pytest.raises(WitnessError, match="cannot be saved"):
+        LeaseFile("/dev/full/lease", BOTH).write(LeaseRecord(1, "", BOTH, ""))
+
+
+# ---- Settings and commands
+
+
+@pytest.fixture
+def settings(tmp_path: Path) -> Path:
+    """Return a valid settings file."""
+    path = tmp_path / "witness.json"
+    path.write_text(
+        json.dumps(
+            {
+                "listen": "10.0.0.1:7411",
+                "fixed": "10.0.0.100",
+                "ports": ["11311", "20000-20999"],
+                "appliances": {
+                    "a": {"address": "10.0.0.2", "key": "aa" * 32},
+                    "b": {"address": "10.0.0.3", "key": "bb" * 32},
+                },
+                "state": str(tmp_path / "state/lease"),
+            }
+        )
+    )
+    path.chmod(0o600)
+    return path
+
+
+def test_begin_writes_a_lease_with_a_greater_epoch(
+    settings: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It refuses an epoch that was used, and names that the settings do not have."""
+    command = ["begin", "--settings", str(settings)]
+    assert main([*command, "--in-sync", "a,b", "--epoch", "5"]) == 0
+    file = LeaseFile(str(settings.parent / "state/lease"), BOTH)
+    assert file.read() == LeaseRecord(5, "", BOTH, "")
+    for wrong, option in (("a 5", "--epoch"), ("c 9", "--in-sync"), (" 9", "--in-sync"), ("a -1", "--epoch")):
+        names, epoch = wrong.split(" ")
+        assert main([*command, f"--in-sync={names}", f"--epoch={epoch}"]) == 1
+        assert capsys.readouterr().err.startswith(f"witness.py: {option}: ")
+    assert file.read().epoch == 5
+
+
+def test_begin_waits_until_the_witness_is_stopped(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A running witness would write its own lease again."""
+    with LeaseFile(str(settings.parent / "state/lease"), BOTH):
+        assert main(["begin", "--settings", str(settings), "--in-sync", "a", "--epoch", "5"]) == 1
+    assert "systemctl stop rosrv-witness" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ('"aa', '"bb', "a key of its own"),
+        ("10.0.0.3", "10.0.0.2", "different addresses"),
+        ("10.0.0.3", "127.0.0.1", "cannot be an address"),
+        ("10.0.0.3", "fd00::1", "fd00::1"),
+        ('"aaaa', '"zzaa', "64 hexadecimal digits"),
+        ('"11311"', '"0"', "not a port or a range"),
+        ('"11311", "20000-20999"', "", "ports is empty"),
+        ('"fixed"', '"fix"', "'fixed' is missing"),
+        ('"a"', '"../a"', "is not valid"),
+        ("{", "", ""),
+    ],
+)
+def test_wrong_settings_are_rejected_with_the_reason(
+    settings: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, reason: str
+) -> None:
+    """No rule is written."""
+    text = settings.read_text()
+    changed = text.replace(old, new)
+    if old == '"aa':
+        changed = text.replace("aa" * 32, "bb" * 32)
+    settings.write_text(changed)
+    assert main(["shut", "--settings", str(settings)]) == 1
+    error = capsys.readouterr().err
+    assert f"the settings {settings} cannot be used: " in error and reason in error
+
+
+def test_keys_that_others_can_read_are_rejected(settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The error has the command that fixes it."""
+    settings.chmod(0o640)
+    assert main(["serve", "--settings", str(settings)]) == 1
+    assert f"chmod 600 {settings}" in capsys.readouterr().err
+
+
+def test_the_log_is_bounded() -> None:
+    """After some lines only their number is printed."""
+    lines: list[str] = []
+    now = [0.0]
+    log = BoundedLog(lines.append, lambda: now[0])
+    for number in range(100):
+        log.add(str(number))
+    now[0] = 11.0
+    log.add("later")
+    assert lines == [f"{number}\n" for number in range(20)] + ["80 more lines were left out\n", "later\n"]
+
+
+def test_the_backend_is_nft_from_linux_4_18() -> None:
+    """Without either program the error says which to install."""
+    assert chosen_backend("4.18.0-25-generic", lambda name: name) == "nft"
+    assert chosen_backend("4.4.0-210", lambda name: name) == "iptables"
+    assert chosen_backend("6.1", {"iptables-restore": "/sbin/iptables-restore"}.get) == "iptables"
+    with pytest.raises(WitnessError, match="apt install nftables"):
+        chosen_backend("6.1", lambda name: None)
+
+
+def test_connections_are_found_in_the_tables_of_the_kernel() -> None:
+    """Java's sockets have mapped addresses; listening and closed sockets are left out."""
+    row = "   0: {} {} {} 00000000:00000000 00:00000000 00000000 0 0 1"
+    mapped = "0000000000000000FFFF0000"
+    table = "\n".join(
+        [
+            "head",
+            row.format("0100000A:D431", "0200000A:2C2F", "01"),
+            row.format("0100000A:D432", "0200000A:2C2F", "0A"),
+            row.format("0100000A:D433", "0300000A:2C2F", "01"),
+        ]
+    )
+    table6 = "\n".join(
+        [
+            "head",
+            row.format(mapped + "0100000A:D434", mapped + "0200000A:2C2F", "08"),
+            row.format("0" * 32 + ":D434", "1" * 32 + ":1", "01"),
+        ]
+    )
+    assert sockets_with({"10.0.0.2"}, [table, table6]) == [
+        ("10.0.0.1", 0xD431, "10.0.0.2", 11311),
+        ("10.0.0.1", 0xD434, "10.0.0.2", 11311),
+    ]
+
+
+# ---- The file runs on the robot as it is
+
+
+SOURCE = Path(program.__file__).read_text()
+
+
+@pytest.mark.nightly
+def test_it_runs_on_python_3_5() -> None:
+    """Its syntax and its library are those of Python 3.5: Ubuntu 16.04."""
+    ast.parse(SOURCE, feature_version=(3, 5))
+    command = [str(Path(sys.executable).with_name("vermin")), "--no-tips", "--target=3.5-", program.__file__]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_it_imports_only_the_standard_library() -> None:
+    """It is copied to the robot alone."""
+    imported = {
+        name.partition(".")[0]
+        for node in ast.walk(ast.parse(SOURCE))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert imported <= sys.stdlib_module_names
+
+
+def test_rules_that_change_before_they_are_first_read_are_not_taken_for_ours() -> None:
+    """Another program flushes the filter between our change and our reading of it."""
+    settings = WitnessSettings(
+        ("10.0.0.1", 7411), "10.0.0.100", ("11311",),
+        {name: AppliancePeer(f"10.0.0.{number}", KEYS[name]) for number, name in enumerate("ab", 2)}, "/lease", {}, "",
+    )  # fmt: skip
+    firewall = LeaseFirewall(settings, "iptables", lambda _command, _text: "*filter\nCOMMIT\n")
+    firewall.admit("a")
+    assert not firewall.intact()
