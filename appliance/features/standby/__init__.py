@@ -1,1 +1,1 @@
-"""TODO: appliance/features/standby."""
+"""The standby: two appliances, of which the robot admits one, by a lease that the robot's own computer holds."""

@@ -118,7 +118,7 @@ def _files(plan: PairPlan, body: dict[str, Any]) -> tuple[KitFile, ...]:
         "fixed": plan.fixed,
         "master": str(plan.master_port),
     }
-    package = files("appliance.standby")
+    package = files("appliance.features.standby")
     found = [
         KitFile("witness.py", package.joinpath("witness.py").read_text("utf-8"), 0o755),
         KitFile("witness.json", json.dumps(body, indent=2) + "\n", 0o600),

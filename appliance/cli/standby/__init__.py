@@ -1,1 +1,0 @@
-"""`rosrv standby`: two appliances, of which one stands by."""
