@@ -18,8 +18,8 @@ from multiprocessing.process import BaseProcess
 import structlog
 from rosrv_fleet.robots import Robots
 
-from appliance.bundles.poller import Poller
-from appliance.bundles.process import EVENTS, PollLoop
+from appliance.bundles.poller import EVENTS, Poller
+from appliance.bundles.process import PollLoop
 from appliance.bundles.verified_bundles import VerifiedBundles
 from appliance.channel.messages import BundleOffered, BundleStated, RefusedBundle
 from appliance.collector.connection import robot_connection

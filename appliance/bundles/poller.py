@@ -26,6 +26,8 @@ from appliance.bundles.verified_bundles import (
 from appliance.channel.messages import BundleOffered, BundlePollReported, BundleStated
 from appliance.collector.connection import CollectorConnection, CollectorError
 
+EVENTS = "v1/bundles/events"
+"""The path of the collector's event stream."""
 REPORT = "v1/bundles/report"
 """The path of the collector for reports."""
 

@@ -16,16 +16,13 @@ import structlog
 
 from appliance.base import clock
 from appliance.base.input_files import read_given
-from appliance.bundles.poller import Poller
+from appliance.bundles.poller import EVENTS, Poller
 from appliance.bundles.verified_bundles import VerifiedBundles
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
 from appliance.collector.connection import CollectorConnection, CollectorError, robot_connection
 from appliance.configuration.settings import Fleet, load_resolved
-
-EVENTS = "v1/bundles/events"
-"""The path of the collector's event stream."""
 
 _log = structlog.get_logger()
 _TICK_SECONDS = 1.0
