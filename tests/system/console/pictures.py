@@ -28,12 +28,17 @@ from tests.system.console.reader import Reader
 
 _PICTURES = REPOSITORY / "docs" / "pictures"
 _POLICY = """\
+[Groups]
+arm-pc   = 127.0.0.11
+cameras  = 127.0.0.12
+operator = 127.0.0.14
+
 [Nodes]
 default = *
 
 [Publishers]
 default = *
-/arm/command = 127.0.0.11            # the robot's own computer
+/arm/command = arm-pc                # the robot's own computer
 
 [Subscribers]
 default = *
@@ -61,7 +66,7 @@ def main() -> None:
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         config = Path(folder) / "appliance.yaml"
-        config.write_text(CONFIG)
+        config.write_text(f"{CONFIG}name: arm-3\n")
         options = ("--config", str(config), "--monitors", str(REPOSITORY / "monitors"))
         browser = launch(driver, need_program("chromium", "chromium"))
         with Appliance(policy=_POLICY, options=options) as appliance, Robot(appliance.master_uri) as robot:
