@@ -306,7 +306,7 @@ WALL_CLOCK = {
         "base/age_clock.py", "base/clock.py", "base/shipped.py", "control/operators/clock_check.py",
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/front/moments.py", "channel/alarms.py", "audit/search/filter_options.py", "cli/evidence_verbs.py",
+        "api/front/moments.py", "audit/search/filter_options.py", "cli/evidence_verbs.py",
         "cli/monitor/offline.py", "features/recorder/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
         "features/recorder/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
     ],

@@ -6,7 +6,7 @@ from fastapi import Depends, Request, Security
 from fastapi.security import HTTPBearer
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.control import ControlLink
+from appliance.api.front.control import ControlAwayError, ControlLink
 from appliance.api.front.problems import ProblemError
 from appliance.api.front.request_gate import BEARER
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
@@ -77,6 +77,14 @@ _STANDBY_SECONDS = 2  # until a client may ask a standby again
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
     """Return control's answer. Raises `ProblemError` for a rejection, `ControlAwayError` without an answer."""
     return answered(await control.ask(request, bearer))
+
+
+async def ask_optional(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A | None:
+    """Return control's answer; None for a rejection, such as a standby's, or without an answer."""
+    try:
+        return await ask(control, request, bearer)
+    except (ControlAwayError, ProblemError):
+        return None
 
 
 def answered(answer: AdminAnswer[A]) -> A:

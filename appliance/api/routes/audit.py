@@ -18,10 +18,9 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.front.access import Bearer
-from appliance.api.front.control import ControlAwayError
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
-from appliance.api.front.route_roles import Operator, Viewer, ask, reads_contents
+from appliance.api.front.route_roles import Operator, Viewer, ask, ask_optional, reads_contents
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
 from appliance.api.front.streams import StreamResponse, Streams, Work, in_thread, peer_of
@@ -313,13 +312,10 @@ def _add_one(router: Routes, services: Services, desk: LogReader) -> None:
         record = readable_by(shown.entry, bearer).record
         first = await desk.read(bearer, recorded_in_full, desk.path, shown.entry)
         in_full = None if first is None else readable_by(first, bearer)
-        try:
-            policy = await ask(services.control, PolicyWanted(), bearer)
-        except (ControlAwayError, ProblemError):  # such as on a standby
-            if asks_policy(record):
-                raise
-            policy = None
-        known = policy if asks_policy(record) else None
+        needed = asks_policy(record)
+        control = services.control
+        policy = await (ask if needed else ask_optional)(control, PolicyWanted(), bearer)
+        known = policy if needed else None
         async with services.judging.turn(bearer):
             words = await asyncio.to_thread(host_in_words, policy)
             return await asyncio.to_thread(explained, record, known, in_full, words)
