@@ -64,6 +64,8 @@ with xmlrpc.client.ServerProxy(sys.argv[1]) as master:
 def main() -> None:
     """Start both robots, and take the pictures."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    if REPOSITORY.is_relative_to("/opt"):
+        raise SystemExit(f"{REPOSITORY}: the demonstration hides /opt; run this from a checkout elsewhere")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         config = Path(folder) / "appliance.yaml"
         config.write_text(f"{CONFIG}name: arm-3\n")
