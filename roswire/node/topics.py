@@ -52,6 +52,7 @@ class NodeSubscription:
         self.problems: dict[str, str] = {}
         self.connected: dict[str, Mapping[str, str]] = {}  # the header of each publisher that is connected
         self.updates = 0  # how many lists of publishers came
+        self._connection = asyncio.Event()
         self._link = link
         self._received = received
         self._tasks = OwnedTasks()
@@ -67,6 +68,11 @@ class NodeSubscription:
         for uri in wanted:
             if uri not in self._followed:
                 self._followed[uri] = self._tasks.start(self._follow(uri))
+
+    async def headers(self) -> list[Mapping[str, str]]:
+        """Return the headers of the publishers as soon as one has connected."""
+        await self._connection.wait()
+        return [*self.connected.values()]
 
     async def close(self) -> None:
         """End all connections."""
@@ -106,6 +112,7 @@ class NodeSubscription:
             header, data = await exchange_headers(reader, writer, fields, limits.header_seconds)
             self._check(uri, header)
             self.connected[uri] = header
+            self._connection.set()
             self.problems.pop(uri, None)
             frames = FrameParser(limits.message_bytes)
             while True:

@@ -17,7 +17,9 @@ from websockets.uri import parse_uri
 
 from appliance.features.doors.connections import ConnectionLimits, DoorConnections
 from appliance.features.doors.door_node import DoorNode
+from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.rosapi import MasterSight, Rosapi
 from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
 from appliance.features.doors.session import DoorSession, SessionOptions
@@ -52,7 +54,8 @@ class WebSocketClient:
                 elif isinstance(event, Frame) and event.opcode is Opcode.TEXT:
                     self.frames.put_nowait(json.loads(bytes(event.data)))
                 elif isinstance(event, Frame) and event.opcode is Opcode.BINARY:
-                    self.frames.put_nowait(cbor2.loads(bytes(event.data)))
+                    data = bytes(event.data)
+                    self.frames.put_nowait(data if self.socket.subprotocol else cbor2.loads(data))
             self.flush()
         self.socket.receive_eof()
 
@@ -99,18 +102,20 @@ class DoorWorld:
         self.master = ScriptedMaster(self.network)
         self.limits = ConnectionLimits()
         self.sessions: list[DoorSession] = []
-        self.queues: list[ViewerQueue[str]] = []
+        self.queues: list[ViewerQueue[Any]] = []
         self.options = SessionOptions(origins=("https://robot.example",))
         self.types = KnownTypes(standard_definitions(), ValueLimits())
         self.nodes: list[RosNode] = []
         self.node: RosNode
         self.door: DoorNode
+        self.lookout: Lookout
 
     async def start(self) -> None:
         """Start the door."""
         self.node = await self.robot("10.0.0.2", "/door_alice")
-        rosapi = Rosapi(MasterSight(self.node, lambda: (7, 8)), self.types)
-        self.door = DoorNode(self.node, self.types, rosapi.answer, most_topics=50)
+        sight = MasterSight(self.node, lambda: (7, 8))
+        self.door = DoorNode(self.node, self.types, Rosapi(sight, self.types).answer, most_topics=50)
+        self.lookout = Lookout(sight, self.types, self.door.learn)
         connections = DoorConnections(self.serve, self.limits)
         self.network.listen(DOOR[0], connections.serve, DOOR[1])
 
@@ -125,14 +130,19 @@ class DoorWorld:
 
     async def serve(self, reader: asyncio.StreamReader, writer: Any) -> None:
         """Serve one client."""
-        queue: ViewerQueue[str] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20)
+        queue: ViewerQueue[Any] = ViewerQueue(message_bytes=1 << 20, reply_bytes=1 << 20)
         self.queues.append(queue)
         session = DoorSession(
             reader,
             writer,
             door=self.door,
-            protocols=lambda _name: Rosbridge("/door_alice", RosbridgeLimits(), queue),
-            subprotocols=(),
+            lookout=self.lookout,
+            protocols=lambda name: (
+                Rosbridge("/door_alice", RosbridgeLimits(), queue)
+                if name is None
+                else Foxglove("/door_alice", FoxgloveLimits(), queue)
+            ),
+            subprotocols=SUBPROTOCOLS,
             options=self.options,
         )
         self.sessions.append(session)

@@ -7,7 +7,7 @@ any host; the door decides nothing.
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 from weakref import WeakValueDictionary
@@ -25,10 +25,12 @@ from appliance.features.doors.requests import (
     DoorRequest,
     OfferService,
     PublishMessage,
+    ReadParameters,
     SubscribeTopic,
     UnadvertiseTopic,
     UnsubscribeTopic,
     WithdrawService,
+    WriteParameter,
 )
 from appliance.features.doors.values import MessageCodec
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
@@ -38,23 +40,35 @@ from roswire.node.tcpros_streams import ANY
 
 _LINGER_SECONDS = 10.0
 _REPLAY_SECONDS = 1.0  # not longer: an old command must not reach a robot
+_LEARN_SECONDS = 1.0
+_MOST_PARAMETERS = 1000  # of one request
 _ANSWER_SECONDS = 60.0  # for a client that answers a call of its service
 
 BuiltIn = Callable[[CallOfService], "Awaitable[Raw] | None"]
 """Answers a call of a service that the door itself has; None if the service is not one of these."""
 
 
-class DoorClient(Protocol):
-    """A connection, as the node uses it."""
-
+class _Subscriber(Protocol):
     def heard(self, message: DoorMessage) -> None:
         """Take a message of a subscribed topic."""
+
+
+class _Learner:
+    def heard(self, message: DoorMessage) -> None:
+        """Ignore a message: only the header of its publisher is wanted."""
+
+
+class DoorClient(_Subscriber, Protocol):
+    """A connection, as the node uses it."""
 
     def answered(self, call: int, values: Raw | bytes) -> None:
         """Take the answer to a call."""
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         """Take the refusal of a call."""
+
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+        """Take the values of parameters."""
 
     def ask(self, service: str, values: Raw) -> str:
         """Take a call of an offered service, and return its id. Raises `PeerError`."""
@@ -89,7 +103,7 @@ class DoorNode:
         self._types = types
         self._built_in = built_in
         self._publications: dict[str, _Publication] = {}
-        self._heard: dict[str, set[DoorClient]] = {}
+        self._heard: dict[str, set[_Subscriber]] = {}
         self._offers: dict[str, _Offer] = {}
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
         self._tasks = OwnedTasks()
@@ -120,6 +134,10 @@ class DoorNode:
                 await self._withdraw(service)
             case AnswerCall():
                 self._answer(request)
+            case ReadParameters():
+                client.parameters(await self._parameters(request.names), request.reply_to)
+            case WriteParameter():
+                await self._write_parameter(request)
 
     async def forget(self, client: DoorClient) -> None:
         """Release all that a connection used."""
@@ -182,12 +200,12 @@ class DoorNode:
             raise ProtocolError(f"{request.topic} is not advertised by this client")
         values = request.values
         known.publication.publish(
-            known.codec.writer.from_json(values, _now()) if isinstance(values, Raw) else values
+            known.codec.writer.from_json(values, present_time()) if isinstance(values, Raw) else values
         )
 
     # --- subscriptions ---
 
-    async def _subscribe(self, request: SubscribeTopic, client: DoorClient) -> None:
+    async def _subscribe(self, request: SubscribeTopic, client: _Subscriber) -> None:
         topic = request.topic
         async with self._lock(f"subscriber {topic}"):
             if topic in self._heard:
@@ -210,7 +228,7 @@ class DoorNode:
         for client in self._heard.get(topic, ()):
             client.heard(message)
 
-    def _unsubscribe(self, topic: str, client: DoorClient) -> None:
+    def _unsubscribe(self, topic: str, client: _Subscriber) -> None:
         clients = self._heard.get(topic)
         if clients is not None:
             clients.discard(client)
@@ -243,7 +261,7 @@ class DoorNode:
         sent, received, definitions = self._types.service(name)
         if definitions.service_md5sum(name) != md5sum:
             raise DefinitionError(f"{request.service} has another version of this type", name[:200])
-        body = sent.writer.from_json(_named(request.values, sent.writer.fields), _now())
+        body = sent.writer.from_json(_named(request.values, sent.writer.fields), present_time())
         return received.json(await self.node.call_service(request.service, md5sum, body, seconds))
 
     async def _offer(self, request: OfferService, client: DoorClient) -> None:
@@ -288,10 +306,44 @@ class DoorNode:
             future.set_exception(ServiceFailedError(bytes(request.values)[:1000].decode("utf-8", "replace")))
             return
         try:
-            future.set_result(offer.response.writer.from_json(request.values, _now()))
+            future.set_result(offer.response.writer.from_json(request.values, present_time()))
         except PeerError as error:
             future.set_exception(ServiceFailedError(str(error)))
             raise
+
+    # --- parameters ---
+
+    async def _parameters(self, names: Sequence[str]) -> dict[str, Any]:
+        """Return the values of parameters; those that do not exist are left out."""
+        if not names:
+            listed = await self.node.master("getParamNames")
+            names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+        if len(names) > _MOST_PARAMETERS:
+            raise LimitExceededError(f"{len(names)} parameters; name at most {_MOST_PARAMETERS} of them")
+        return {
+            name: await self.node.master("getParam", name)
+            for name in names
+            if await self.node.master("hasParam", name)
+        }
+
+    async def _write_parameter(self, request: WriteParameter) -> None:
+        if request.value is None:
+            await self.node.master("deleteParam", request.name)
+        else:
+            await self.node.master("setParam", request.name, msgspec.json.decode(request.value))
+
+    async def learn(self, topic: str) -> None:
+        """Subscribe to a topic for a moment, to learn its definition. Raises `RosError`."""
+        learner = _Learner()
+        await self._subscribe(SubscribeTopic(topic), learner)
+        try:
+            async with asyncio.timeout(_LEARN_SECONDS):
+                for header in await self.node.subscribers[topic].headers():
+                    self._types.learn(header)
+        except TimeoutError:
+            return  # no publisher answers: the topic stays without a definition
+        finally:
+            self._unsubscribe(topic, learner)
 
     def _check_room(self, topics: dict[str, Any]) -> None:
         if len(topics) >= self._most_topics:
@@ -319,6 +371,7 @@ def _named(values: Raw, names: list[str]) -> bytes:
     return msgspec.json.encode(dict(zip(names, given, strict=False)))
 
 
-def _now() -> Now:
+def present_time() -> Now:
+    """Return the system time."""
     seconds, nanoseconds = divmod(clock.wall_ns(), 1_000_000_000)
     return seconds, nanoseconds

@@ -97,6 +97,23 @@ class AnswerCall:
     reply_to: ClientId = None
 
 
+@dataclass(frozen=True, slots=True)
+class ReadParameters:
+    """Read parameters by name; without names, all of them."""
+
+    names: tuple[str, ...]
+    reply_to: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WriteParameter:
+    """Set a parameter to a JSON value; None deletes it."""
+
+    name: str
+    value: msgspec.Raw | None
+    reply_to: str | None = None
+
+
 DoorRequest: TypeAlias = (
     AdvertiseTopic
     | UnadvertiseTopic
@@ -107,6 +124,8 @@ DoorRequest: TypeAlias = (
     | OfferService
     | WithdrawService
     | AnswerCall
+    | ReadParameters
+    | WriteParameter
 )
 Frame: TypeAlias = str | bytes
 """A WebSocket message: text or binary."""

@@ -5,7 +5,6 @@ out which ROS this is, and it fails at once. A call that the policy denies fails
 """
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
@@ -15,6 +14,7 @@ from msgspec import Raw, Struct
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.message_writer import Now
 from appliance.features.doors.requests import CallOfService
+from appliance.features.doors.surroundings import VisibleGraph
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError, ProtocolError, quoted
 from roswire.message_text import PRIMITIVES, MessageDefinition
@@ -25,21 +25,6 @@ _PREFIX = "/rosapi/"
 _ACTION_TOPICS = ("cancel", "feedback", "goal", "result", "status")
 _TIME_TYPES = ("time", "duration")
 _EXAMPLES = {"bool": "False", "string": "", "float32": "0.0", "float64": "0.0"}
-
-
-@dataclass(frozen=True, slots=True)
-class VisibleGraph:
-    """The names of nodes by topic and service, and the type of each topic."""
-
-    publishers: Mapping[str, Sequence[str]]
-    subscribers: Mapping[str, Sequence[str]]
-    services: Mapping[str, Sequence[str]]
-    types: Mapping[str, str]
-
-    @property
-    def topics(self) -> list[str]:
-        """Return the names of all topics, sorted."""
-        return sorted({*self.publishers, *self.subscribers})
 
 
 class Sight(Protocol):

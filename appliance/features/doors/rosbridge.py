@@ -10,7 +10,7 @@ A frame of the client goes in; requests to the node of the door and frames for t
 5. No fragments are sent: no client library reads them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -53,6 +53,7 @@ from appliance.features.doors.rosbridge_frames import (
     json_frame,
     publish_frame,
 )
+from appliance.features.doors.surroundings import Surroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted
 from roswire.names import resolve
@@ -92,6 +93,8 @@ class _Call:
 
 class Rosbridge:
     """The protocol of one connection; `node` is the name of the door's node, against which names are resolved."""
+
+    wants_surroundings = False
 
     def __init__(self, node: str, limits: RosbridgeLimits, queue: ViewerQueue[str]) -> None:
         self.queue = queue
@@ -301,6 +304,12 @@ class Rosbridge:
         if call is not None:
             fields = {"op": "service_response", "service": call.service, "values": values, "result": True}
             self.queue.reply(json_frame(fields, call.reply_to))
+
+    def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None:
+        """Do nothing: this protocol has parameters as services of rosapi."""
+
+    def surroundings(self, _seen: Surroundings) -> None:
+        """Do nothing: clients of this protocol call rosapi."""
 
     def ask(self, service: str, values: Raw) -> str:
         """Send the client a call of its service, and return the id of the call.

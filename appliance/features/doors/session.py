@@ -11,9 +11,10 @@ The front process identifies the client, and passes its connection here as a str
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
+from typing import Any, Protocol
 
 from msgspec import Raw
 from websockets.exceptions import ProtocolError as WebSocketError
@@ -27,13 +28,16 @@ from websockets.typing import Origin, Subprotocol
 
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.requests import DoorRequest, Frame
+from appliance.features.doors.surroundings import Surroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
 from roswire.node.network import ByteWriter
 
 _READ_BYTES = 1 << 16
 _CLOSING_SECONDS = 2.0
+_WATCH_SECONDS = 2.0  # between two looks at the surroundings
 _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
 
 
@@ -51,6 +55,10 @@ class SessionOptions:
 class ClientProtocol(Protocol):
     """The protocol that a client speaks, without I/O. Its methods may raise `ViewerStalledError`."""
 
+    @property
+    def wants_surroundings(self) -> bool:
+        """Whether the client gets the topics and services that the door sees."""
+
     def receive(self, frame: Frame) -> Sequence[DoorRequest]:
         """Return the requests of a frame."""
 
@@ -59,6 +67,12 @@ class ClientProtocol(Protocol):
 
     def answered(self, number: int, values: Raw | bytes) -> None:
         """Answer a call."""
+
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+        """Send the values of parameters."""
+
+    def surroundings(self, seen: Surroundings) -> None:
+        """Announce what the door sees; only if `wants_surroundings`."""
 
     def ask(self, service: str, values: Raw) -> str:
         """Send a call of an offered service, and return its id."""
@@ -89,6 +103,7 @@ class DoorSession:
         writer: ByteWriter,
         *,
         door: DoorNode,
+        lookout: Lookout,
         protocols: Protocols,
         subprotocols: Sequence[str],
         options: SessionOptions,
@@ -96,6 +111,7 @@ class DoorSession:
         self.end = ""
         self._reader, self._writer = reader, writer
         self._door = door
+        self._lookout = lookout
         self._protocols = protocols
         self._subprotocols = subprotocols
         self._options = options
@@ -154,7 +170,9 @@ class DoorSession:
     async def _serve(self) -> None:
         sending = asyncio.ensure_future(self._send())
         receiving = asyncio.ensure_future(self._receive())
-        tasks = (sending, receiving)
+        tasks = [sending, receiving]
+        if self._protocol.wants_surroundings:
+            tasks.append(asyncio.ensure_future(self._watch()))
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -167,6 +185,12 @@ class DoorSession:
         for end in ends:
             if isinstance(end, Exception):
                 raise end
+
+    async def _watch(self) -> None:
+        while True:
+            seen = await self._lookout.look()
+            self._tell(partial(self._protocol.surroundings, seen))
+            await asyncio.sleep(_WATCH_SECONDS)
 
     # --- frames of the client ---
 
@@ -261,6 +285,10 @@ class DoorSession:
     def answered(self, call: int, values: Raw | bytes) -> None:
         """Queue the answer to a call."""
         self._tell(lambda: self._protocol.answered(call, values))
+
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+        """Queue the values of parameters."""
+        self._tell(lambda: self._protocol.parameters(values, reply_to))
 
     def failed(self, request: DoorRequest, reason: str) -> None:
         """Queue the refusal of a call."""

@@ -10,7 +10,8 @@ from msgspec import Raw
 
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.requests import CallOfService
-from appliance.features.doors.rosapi import Rosapi, VisibleGraph
+from appliance.features.doors.rosapi import Rosapi
+from appliance.features.doors.surroundings import VisibleGraph
 from appliance.features.doors.values import ValueLimits
 from roswire.errors import PeerError
 from roswire.node import MasterDenialError

@@ -1,0 +1,436 @@
+"""Foxglove's WebSocket protocol of one connection, without I/O: `foxglove.websocket.v1`, also named `foxglove.sdk.v1`.
+
+Channels carry the bytes of ROS messages unchanged, in the encoding `ros1`. The rules of `rosbridge.py` also hold here.
+The door announces what its identity may see, and refuses in words: a status with the level error, or
+`serviceCallFailure`. It has no assets and no updates of parameters, and does not announce these capabilities.
+"""
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import UNSET, Meta, Raw, Struct, UnsetType
+
+from appliance.features.doors.known_types import DoorMessage
+from appliance.features.doors.requests import (
+    AdvertiseTopic,
+    CallOfService,
+    DoorRequest,
+    Frame,
+    PublishMessage,
+    ReadParameters,
+    SubscribeTopic,
+    UnadvertiseTopic,
+    UnsubscribeTopic,
+    WriteParameter,
+)
+from appliance.features.doors.surroundings import SeenService, SeenTopic, Surroundings
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.errors import PeerError, quoted
+from roswire.names import resolve
+
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+_ERROR = 2
+_MESSAGE_DATA = struct.Struct("<BIQ")  # opcode 1, subscription, time in nanoseconds
+_CLIENT_DATA = struct.Struct("<BI")  # opcode 1, channel
+_SERVICE_CALL = struct.Struct(
+    "<BIII"
+)  # opcode 2 (request) or 3 (response), service, call, length of the encoding
+_ASSET_RESPONSE = struct.Struct("<BIBI")  # opcode 4, request, status, length of the error
+_ENCODINGS = ("ros1", "json")
+
+_Number = Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]
+_Name = Annotated[str, Meta(max_length=1024)]
+_Id = Annotated[str, Meta(max_length=1024)] | None
+
+
+@dataclass(frozen=True, slots=True)
+class FoxgloveLimits:
+    """Upper bounds for one connection."""
+
+    subscriptions: int = 1000
+    channels: int = 200  # of the client
+    calls: int = 100
+    depth: int = 10  # messages of a subscription that wait for a slow client
+
+
+class _Operation(Struct, tag_field="op"):
+    pass
+
+
+class _Subscription(Struct):
+    id: _Number
+    channelId: _Number  # noqa: N815  the protocol's name
+
+
+class _Subscribe(_Operation, tag="subscribe"):
+    subscriptions: list[_Subscription]
+
+
+class _Unsubscribe(_Operation, tag="unsubscribe"):
+    subscriptionIds: list[_Number]  # noqa: N815  the protocol's name
+
+
+class _Channel(Struct):
+    id: _Number
+    topic: _Name
+    encoding: _Name
+    schemaName: _Name  # noqa: N815  the protocol's name
+
+
+class _Advertise(_Operation, tag="advertise"):
+    channels: list[_Channel]
+
+
+class _Unadvertise(_Operation, tag="unadvertise"):
+    channelIds: list[_Number]  # noqa: N815  the protocol's name
+
+
+class _GetParameters(_Operation, tag="getParameters"):
+    parameterNames: list[_Name]  # noqa: N815  the protocol's name
+    id: _Id = None
+
+
+class _Parameter(Struct):
+    name: _Name
+    value: Raw | UnsetType = UNSET
+
+
+class _SetParameters(_Operation, tag="setParameters"):
+    parameters: list[_Parameter]
+    id: _Id = None
+
+
+class _SubscribeGraph(_Operation, tag="subscribeConnectionGraph"):
+    pass
+
+
+class _UnsubscribeGraph(_Operation, tag="unsubscribeConnectionGraph"):
+    pass
+
+
+class _FetchAsset(_Operation, tag="fetchAsset"):
+    requestId: _Number  # noqa: N815  the protocol's name
+    uri: str = ""
+
+
+_Operations = (
+    _Subscribe
+    | _Unsubscribe
+    | _Advertise
+    | _Unadvertise
+    | _GetParameters
+    | _SetParameters
+    | _SubscribeGraph
+    | _UnsubscribeGraph
+    | _FetchAsset
+)
+_DECODER: msgspec.json.Decoder[_Operations] = msgspec.json.Decoder(_Operations)
+
+
+class _FoxgloveError(PeerError):
+    """A frame that cannot be carried out."""
+
+
+class Foxglove:
+    """The protocol of one connection; `node` is the name of the door's node."""
+
+    wants_surroundings = True
+
+    def __init__(self, node: str, limits: FoxgloveLimits, queue: ViewerQueue[int]) -> None:
+        self.queue = queue
+        self._node = node
+        self._limits = limits
+        self._ids: dict[SeenTopic | SeenService, int] = {}  # never used for anything else
+        self._topics: dict[int, SeenTopic] = {}  # the announced channels
+        self._services: dict[int, SeenService] = {}
+        self._subscriptions: dict[int, str] = {}  # the topic, by the client's number
+        self._by_topic: dict[str, set[int]] = {}
+        self._channels: dict[int, tuple[str, str]] = {}  # of the client: topic and encoding
+        self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
+        self._number = 0
+        self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # the last one that the client got
+        self._seen: Surroundings | None = None
+        self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
+            _Subscribe: self._subscribe,
+            _Unsubscribe: self._unsubscribe,
+            _Advertise: self._advertise,
+            _Unadvertise: self._unadvertise,
+            _GetParameters: self._get_parameters,
+            _SetParameters: self._set_parameters,
+            _SubscribeGraph: self._subscribe_graph,
+            _UnsubscribeGraph: self._unsubscribe_graph,
+            _FetchAsset: self._fetch_asset,
+        }
+        self._tell(
+            "serverInfo",
+            name="rosrv door",
+            capabilities=["clientPublish", "parameters", "services", "connectionGraph"],
+            supportedEncodings=[*_ENCODINGS],
+            metadata={"ROS_DISTRO": "noetic"},
+        )
+
+    def _tell(self, op: str, **fields: Any) -> None:
+        self.queue.reply(msgspec.json.encode({"op": op} | fields).decode())
+
+    # --- frames of the client ---
+
+    def receive(self, frame: Frame) -> list[DoorRequest]:
+        """Return the requests of a frame; replies go to the queue. Raises `ViewerStalledError`."""
+        try:
+            if isinstance(frame, bytes):
+                return self._binary(frame)
+            operation = _DECODER.decode(frame)
+            return self._carry_out[type(operation)](operation)
+        except (PeerError, ValueError, RecursionError) as error:
+            self._refuse(f"the operation is refused: {error}")
+            return []
+
+    def _subscribe(self, operation: _Subscribe) -> list[DoorRequest]:
+        requests: list[DoorRequest] = []
+        for one in operation.subscriptions:
+            seen = self._topics.get(one.channelId)
+            if seen is None:
+                self._refuse(f"the channel {one.channelId} is not announced")
+            elif one.id in self._subscriptions:
+                self._refuse(f"the subscription {one.id} exists; unsubscribe it first")
+            elif len(self._subscriptions) >= self._limits.subscriptions:
+                self._refuse(
+                    f"{len(self._subscriptions)} subscriptions; at most {self._limits.subscriptions}"
+                )
+            else:
+                self._subscriptions[one.id] = seen.topic
+                self._by_topic.setdefault(seen.topic, set()).add(one.id)
+                self.queue.configure(one.id, depth=self._limits.depth, interval=0.0, queued=False)
+                requests.append(SubscribeTopic(seen.topic, seen.type))
+        return requests
+
+    def _unsubscribe(self, operation: _Unsubscribe) -> list[DoorRequest]:
+        return [request for one in operation.subscriptionIds for request in self._end_subscription(one)]
+
+    def _end_subscription(self, number: int) -> list[DoorRequest]:
+        topic = self._subscriptions.pop(number, None)
+        if topic is None:
+            self._refuse(f"there is no subscription {number}")
+            return []
+        self.queue.remove(number)
+        self._by_topic[topic].discard(number)
+        if self._by_topic[topic]:
+            return []
+        del self._by_topic[topic]
+        return [UnsubscribeTopic(topic)]
+
+    def _advertise(self, operation: _Advertise) -> list[DoorRequest]:
+        requests: list[DoorRequest] = []
+        for one in operation.channels:
+            if one.encoding not in _ENCODINGS:
+                self._refuse(f"the encoding {quoted(one.encoding)}; use {' or '.join(_ENCODINGS)}")
+            elif one.id in self._channels:
+                self._refuse(f"the channel {one.id} exists; unadvertise it first")
+            elif len(self._channels) >= self._limits.channels:
+                self._refuse(
+                    f"{len(self._channels)} channels of this client; at most {self._limits.channels}"
+                )
+            else:
+                topic = resolve(one.topic, self._node)
+                self._channels[one.id] = topic, one.encoding
+                requests.append(AdvertiseTopic(topic, one.schemaName.replace("/msg/", "/"), reply_to=one.id))
+        return requests
+
+    def _unadvertise(self, operation: _Unadvertise) -> list[DoorRequest]:
+        topics = {self._channels.pop(one)[0] for one in operation.channelIds if one in self._channels}
+        used = {topic for topic, _encoding in self._channels.values()}
+        return [UnadvertiseTopic(topic) for topic in sorted(topics - used)]
+
+    def _binary(self, frame: bytes) -> list[DoorRequest]:
+        if frame[:1] == b"\x01" and len(frame) >= _CLIENT_DATA.size:
+            _opcode, number = _CLIENT_DATA.unpack_from(frame)
+            if number not in self._channels:
+                raise _FoxgloveError(f"the channel {number} is not advertised by this client")
+            topic, encoding = self._channels[number]
+            return [PublishMessage(topic, _values(encoding, frame[_CLIENT_DATA.size :]))]
+        if frame[:1] == b"\x02" and len(frame) >= _SERVICE_CALL.size:
+            return self._call(frame)
+        raise _FoxgloveError(
+            f"a binary frame of {len(frame)} bytes that begins with {frame[:1].hex() or 'nothing'}"
+        )
+
+    def _call(self, frame: bytes) -> list[DoorRequest]:
+        _opcode, service, call, length = _SERVICE_CALL.unpack_from(frame)
+        start = _SERVICE_CALL.size + length
+        encoding = frame[_SERVICE_CALL.size : start][:20].decode("ascii", "replace")
+        seen = self._services.get(service)
+        reason = ""
+        if seen is None:
+            reason = f"the service {service} is not announced"
+        elif start > len(frame) or encoding != "ros1":
+            reason = f"the encoding {quoted(encoding)} of a service call; use ros1"
+        elif len(self._calls) >= self._limits.calls:
+            reason = f"{len(self._calls)} calls of this client wait for answers; repeat it later"
+        if reason or seen is None:
+            self._fail_call(service, call, reason)
+            return []
+        self._number += 1
+        self._calls[self._number] = service, call
+        return [CallOfService(seen.service, self._number, frame[start:])]
+
+    def _get_parameters(self, operation: _GetParameters) -> list[DoorRequest]:
+        return [ReadParameters(tuple(operation.parameterNames), operation.id)]
+
+    def _set_parameters(self, operation: _SetParameters) -> list[DoorRequest]:
+        requests: list[DoorRequest] = [
+            WriteParameter(one.name, None if one.value is UNSET else one.value, operation.id)
+            for one in operation.parameters
+        ]
+        if operation.id is not None:
+            requests.append(ReadParameters(tuple(one.name for one in operation.parameters), operation.id))
+        return requests
+
+    def _subscribe_graph(self, _operation: _SubscribeGraph) -> list[DoorRequest]:
+        self._graph = {"publishedTopics": {}, "subscribedTopics": {}, "advertisedServices": {}}
+        if self._seen is not None:
+            self._send_graph(self._seen)
+        return []
+
+    def _unsubscribe_graph(self, _operation: _UnsubscribeGraph) -> list[DoorRequest]:
+        self._graph = None
+        return []
+
+    def _fetch_asset(self, operation: _FetchAsset) -> list[DoorRequest]:
+        reason = b"this door has no assets"
+        self.queue.reply(_ASSET_RESPONSE.pack(4, operation.requestId, 1, len(reason)) + reason)
+        return []
+
+    # --- answers and refusals ---
+
+    def _refuse(self, text: str) -> None:
+        self._tell("status", level=_ERROR, message=text)
+
+    def _fail_call(self, service: int, call: int, text: str) -> None:
+        self._tell("serviceCallFailure", serviceId=service, callId=call, message=text)
+
+    def failed(self, request: DoorRequest, reason: str) -> None:
+        """Refuse a request in words, and forget what it began. Raises `ViewerStalledError`."""
+        match request:
+            case CallOfService():
+                service, call = self._calls.pop(request.call, (0, 0))
+                self._fail_call(service, call, reason)
+                return
+            case AdvertiseTopic(topic):
+                self._channels = {one: row for one, row in self._channels.items() if row[0] != topic}
+            case SubscribeTopic(topic):
+                for number in [*self._by_topic.get(topic, ())]:
+                    self._end_subscription(number)
+        self._refuse(reason)
+
+    def answered(self, number: int, values: Raw | bytes) -> None:
+        """Answer a call of the client. Raises `ViewerStalledError`."""
+        if number in self._calls:
+            service, call = self._calls.pop(number)
+            head = _SERVICE_CALL.pack(3, service, call, len(_ENCODINGS[0])) + _ENCODINGS[0].encode("ascii")
+            self.queue.reply(head + bytes(values))
+
+    def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
+        """Send the values of parameters. Raises `ViewerStalledError`."""
+        rows = [{"name": name, "value": value} for name, value in values.items()]
+        self._tell("parameterValues", parameters=rows, **({} if reply_to is None else {"id": reply_to}))
+
+    def ask(self, service: str, _values: Raw) -> str:
+        """Refuse a call: a client of this protocol offers no services."""
+        raise _FoxgloveError(f"the client does not offer {service}")
+
+    def give_up(self, _call: str) -> None:
+        """Do nothing: the client has no calls."""
+
+    # --- what the door sees ---
+
+    def surroundings(self, seen: Surroundings) -> None:
+        """Announce what is new, and withdraw what is gone. Raises `ViewerStalledError`."""
+        if seen.denial and (self._seen is None or self._seen.denial != seen.denial):
+            self._refuse(seen.denial)
+        first, self._seen = self._seen is None, seen
+        topics = {self._id(one): one for one in seen.topics}
+        services = {self._id(one): one for one in seen.services}
+        if gone := [one for one in self._topics if one not in topics]:
+            self._tell("unadvertise", channelIds=gone)
+        new = [one for one in topics if one not in self._topics]
+        if new or first:
+            self._tell("advertise", channels=[_channel(one, topics[one]) for one in new])
+        if gone := [one for one in self._services if one not in services]:
+            self._tell("unadvertiseServices", serviceIds=gone)
+        if new := [one for one in services if one not in self._services]:
+            self._tell("advertiseServices", services=[_service(one, services[one]) for one in new])
+        self._topics, self._services = topics, services
+        if self._graph is not None:
+            self._send_graph(seen)
+
+    def _id(self, seen: SeenTopic | SeenService) -> int:
+        return self._ids.setdefault(seen, len(self._ids) + 1)
+
+    def _send_graph(self, seen: Surroundings) -> None:
+        now: dict[str, dict[str, Sequence[str]]] = {
+            "publishedTopics": dict(seen.graph.publishers),
+            "subscribedTopics": dict(seen.graph.subscribers),
+            "advertisedServices": dict(seen.graph.services),
+        }
+        before, self._graph = self._graph or now, now
+        keys = {
+            "publishedTopics": "publisherIds", "subscribedTopics": "subscriberIds", "advertisedServices": "providerIds",
+        }  # fmt: skip
+        changed = {
+            part: [
+                {"name": name, ids: [*nodes]}
+                for name, nodes in now[part].items()
+                if before[part].get(name) != nodes
+            ]
+            for part, ids in keys.items()
+        }
+        topics = {*now["publishedTopics"], *now["subscribedTopics"]}
+        removed = sorted({*before["publishedTopics"], *before["subscribedTopics"]} - topics)
+        services = sorted({*before["advertisedServices"]} - {*now["advertisedServices"]})
+        if any(changed.values()) or removed or services:
+            self._tell("connectionGraphUpdate", **changed, removedTopics=removed, removedServices=services)
+
+    def message(self, message: DoorMessage, now: float) -> None:
+        """Queue a message for each subscription to its topic; `now` is a monotonic time in seconds."""
+        for number in self._by_topic.get(message.topic, ()):
+            self.queue.put(number, message, len(message.body), now)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """Return the next frame for the client; None if nothing may be sent now."""
+        taken = self.queue.take(now)
+        if taken is None or taken[0] is None:
+            return None if taken is None else taken[1]
+        number, message = taken
+        return _MESSAGE_DATA.pack(1, number, message.received) + bytes(message.body)
+
+    def next_time(self) -> float | None:
+        """Return the time of the next frame that waits; None if none waits."""
+        return self.queue.next_time()
+
+
+def _values(encoding: str, data: bytes) -> Raw | bytes:
+    return Raw(data) if encoding == "json" else data
+
+
+def _channel(number: int, seen: SeenTopic) -> dict[str, Any]:
+    return {
+        "id": number,
+        "topic": seen.topic,
+        "encoding": "ros1",
+        "schemaName": seen.type,
+        "schema": seen.definition,
+        "schemaEncoding": "ros1msg",
+    }
+
+
+def _service(number: int, seen: SeenService) -> dict[str, Any]:
+    return {
+        "id": number,
+        "name": seen.service,
+        "type": seen.type,
+        "requestSchema": seen.request,
+        "responseSchema": seen.response,
+    }

@@ -1,0 +1,48 @@
+"""The surroundings of a door, as its identity may see them: the graph, and the types of topics and services."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class VisibleGraph:
+    """The names of nodes by topic and service, and the type of each topic."""
+
+    publishers: Mapping[str, Sequence[str]]
+    subscribers: Mapping[str, Sequence[str]]
+    services: Mapping[str, Sequence[str]]
+    types: Mapping[str, str]
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the names of all topics, sorted."""
+        return sorted({*self.publishers, *self.subscribers})
+
+
+@dataclass(frozen=True, slots=True)
+class SeenTopic:
+    """A topic, its type, and the full text of the type."""
+
+    topic: str
+    type: str
+    definition: str
+
+
+@dataclass(frozen=True, slots=True)
+class SeenService:
+    """A service, its type, and the texts of request and response."""
+
+    service: str
+    type: str
+    request: str
+    response: str
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """The result of a look; `denial` has the reason if the policy allows none."""
+
+    graph: VisibleGraph
+    topics: Sequence[SeenTopic]
+    services: Sequence[SeenService]
+    denial: str = ""

@@ -1,0 +1,238 @@
+"""Foxglove's protocol: channels of what the door sees, messages as their own bytes, refusals in words."""
+
+import asyncio
+import json
+import struct
+from typing import Any
+
+import pytest
+
+from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.requests import PublishMessage, SubscribeTopic
+from appliance.features.doors.surroundings import SeenTopic, Surroundings, VisibleGraph
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.definitions import Definitions
+from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
+from roswire.standard import standard_definitions
+from tests.support.door_world import DoorWorld, WebSocketClient, door_world
+
+pytestmark = pytest.mark.anyio
+OWN = Definitions.from_files({"own/Load.msg": "geometry_msgs/Point32 at\nfloat32 weight"})
+
+
+async def next_op(client: WebSocketClient, op: str) -> Any:
+    """Return the next text frame with this operation."""
+    while True:
+        frame = await client.next()
+        if isinstance(frame, dict) and frame["op"] == op:
+            return frame
+
+
+def sees(
+    world: DoorWorld, *, topics: dict[str, tuple[str, str]], services: dict[str, str] | None = None
+) -> None:
+    """State the graph that the master shows: type and publisher of topics, providers of services."""
+    world.master.answers["getSystemState"] = [
+        [[topic, [node]] for topic, (_kind, node) in topics.items()],
+        [["/cmd_vel", ["/base"]]],
+        [[service, [node]] for service, node in (services or {}).items()],
+    ]
+    world.master.answers["getTopicTypes"] = [[topic, kind] for topic, (kind, _node) in topics.items()]
+
+
+async def publishes(robot: RosNode, topic: str, kind: str, definitions: Definitions) -> Any:
+    return await robot.advertise(topic, MessageType.defined(definitions, kind), latched=False, queue=10)
+
+
+@pytest.mark.parametrize("subprotocol", SUBPROTOCOLS)
+async def test_a_viewer_gets_channels_with_definitions_and_the_bytes_of_messages(subprotocol: str) -> None:
+    """Also of a type that no package of ROS defines: its definition comes from the publisher."""
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+        definitions = standard_definitions().extended(OWN)
+        load = await publishes(robot, "/load", "own/Load", definitions)
+        await publishes(robot, "/text", "std_msgs/String", definitions)
+        sees(world, topics={"/load": ("own/Load", "/robot"), "/text": ("std_msgs/String", "/robot")})
+        client = await world.client(subprotocols=["other", subprotocol])
+        assert client.socket.subprotocol == subprotocol
+        info = await next_op(client, "serverInfo")
+        assert info["capabilities"] == ["clientPublish", "parameters", "services", "connectionGraph"]
+        channels = {one["topic"]: one for one in (await next_op(client, "advertise"))["channels"]}
+        assert channels["/load"]["schema"] == definitions.full_text("own/Load")
+        assert (
+            channels["/load"]["encoding"] == "ros1" and channels["/text"]["schemaName"] == "std_msgs/String"
+        )
+        subscription = {"id": 7, "channelId": channels["/load"]["id"]}
+        client.send({"op": "subscribe", "subscriptions": [subscription]})
+        await asyncio.sleep(1)
+        load.publish(b"\x01" * 16)
+        frame = await client.next()
+        opcode, number, stamp = struct.unpack_from("<BIQ", frame)
+        assert (opcode, number, frame[13:]) == (1, 7, b"\x01" * 16) and stamp > 0
+        client.send({"op": "unsubscribe", "subscriptionIds": [7]})
+        sees(world, topics={"/text": ("std_msgs/String", "/robot")})
+        gone = await next_op(client, "unadvertise")
+        assert gone["channelIds"] == [channels["/load"]["id"]]
+
+
+async def test_a_viewer_publishes_bytes_and_json() -> None:
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+        sees(world, topics={})
+        heard: list[bytes] = []
+        await robot.subscribe("/text", lambda body, _header: heard.append(body))
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        for number, encoding in ((1, "ros1"), (2, "json")):
+            channel = {"id": number, "topic": "/text", "encoding": encoding, "schemaName": "std_msgs/String"}
+            client.send({"op": "advertise", "channels": [channel]})
+        await asyncio.sleep(1)
+        client.send(struct.pack("<BI", 1, 1) + b"\x02\0\0\0hi")
+        client.send(struct.pack("<BI", 1, 2) + b'{"data":"hi"}')
+        client.send(struct.pack("<BI", 1, 2) + b'{"datum":"hi"}')
+        assert "unknown field `datum`" in (await next_op(client, "status"))["message"]
+        assert heard == [b"\x02\0\0\0hi"] * 2
+        client.send({"op": "unadvertise", "channelIds": [1, 2]})
+        await asyncio.sleep(15)
+        assert world.master.publishers["/text"] == []
+
+
+async def test_a_viewer_calls_services_and_reads_parameters() -> None:
+    async with door_world() as world:
+        robot = await world.robot("10.0.0.3", "/robot")
+
+        async def answer(request: bytes) -> bytes:
+            if request == b"\x00":
+                raise ServiceFailedError("the arm is blocked")
+            return b"\x01\0\0\0\0"
+
+        await robot.offer("/brake", ServiceType.defined(standard_definitions(), "std_srvs/SetBool"), answer)
+        sees(world, topics={}, services={"/brake": "/robot", "/gone": "/other"})
+        world.master.answers |= {"getParamNames": ["/a"], "hasParam": True, "getParam": [1, 2.5]}
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        (service,) = (await next_op(client, "advertiseServices"))["services"]
+        assert (service["name"], service["requestSchema"]) == ("/brake", "bool data")
+        for call, request in enumerate((b"\x01", b"\x00")):
+            client.send(struct.pack("<BIII", 2, service["id"], call, 4) + b"ros1" + request)
+        frame = await client.next()
+        assert frame == struct.pack("<BIII", 3, service["id"], 0, 4) + b"ros1" + b"\x01\0\0\0\0"
+        failure = await next_op(client, "serviceCallFailure")
+        assert failure["callId"] == 1 and failure["message"] == "the arm is blocked"
+        client.send({"op": "getParameters", "parameterNames": [], "id": "p"})
+        values = await next_op(client, "parameterValues")
+        assert values == {
+            "op": "parameterValues",
+            "id": "p",
+            "parameters": [{"name": "/a", "value": [1, 2.5]}],
+        }
+        world.master.denials["setParam"] = "denied by [Parameters] /a (site.ini:9)"
+        client.send({"op": "setParameters", "parameters": [{"name": "/a", "value": 1}], "id": "q"})
+        assert (await next_op(client, "status"))["message"] == "denied by [Parameters] /a (site.ini:9)"
+
+
+async def test_a_viewer_follows_the_graph() -> None:
+    async with door_world() as world:
+        sees(world, topics={"/text": ("std_msgs/String", "/robot")}, services={"/gone": "/other"})
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        client.send({"op": "subscribeConnectionGraph"})
+        update = await next_op(client, "connectionGraphUpdate")
+        assert update["publishedTopics"] == [{"name": "/text", "publisherIds": ["/robot"]}]
+        assert update["subscribedTopics"] == [{"name": "/cmd_vel", "subscriberIds": ["/base"]}]
+        assert update["advertisedServices"] == [{"name": "/gone", "providerIds": ["/other"]}]
+        sees(world, topics={"/text": ("std_msgs/String", "/other")})
+        update = await next_op(client, "connectionGraphUpdate")
+        assert update["publishedTopics"] == [{"name": "/text", "publisherIds": ["/other"]}]
+        assert update["removedServices"] == ["/gone"] and update["subscribedTopics"] == []
+        client.send({"op": "unsubscribeConnectionGraph"})
+        sees(world, topics={})
+        await asyncio.sleep(10)
+        assert "connectionGraphUpdate" not in [
+            client.frames.get_nowait()["op"] for _ in range(client.frames.qsize())
+        ]
+
+
+async def test_a_denied_look_is_one_status_in_words() -> None:
+    async with door_world() as world:
+        world.master.denials["getSystemState"] = "denied by [Commands] getSystemState (site.ini:4)"
+        client = await world.client(subprotocols=SUBPROTOCOLS)
+        await asyncio.sleep(60)
+        frames = [client.frames.get_nowait() for _ in range(client.frames.qsize())]
+        assert [frame["op"] for frame in frames] == ["serverInfo", "status", "advertise"]
+        assert frames[1]["level"] == 2 and "site.ini:4" in frames[1]["message"]
+
+
+def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int]]:
+    """Return a connection that has announced the channel 1."""
+    queue: ViewerQueue[int] = ViewerQueue()
+    foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
+    graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})
+    foxglove.surroundings(Surroundings(graph, [SeenTopic("/t", "a/B", "int8 x")], []))
+    while foxglove.next_frame(0.0) is not None:
+        pass
+    return foxglove, queue
+
+
+@pytest.mark.parametrize(
+    ("frame", "words"),
+    [
+        ("{", "refused"),
+        ("[]", "Expected `object`"),
+        ("[" * 100_000, "refused"),
+        ('{"op":"nonsense"}', "Invalid value 'nonsense'"),
+        ('{"op":"subscribe","subscriptions":[{"id":-1,"channelId":1}]}', ">= 0"),
+        ('{"op":"subscribe","subscriptions":[{"id":1e99,"channelId":1}]}', "refused"),
+        ('{"op":"subscribe","subscriptions":[{"id":4294967296,"channelId":1}]}', "<= 4294967295"),
+        ('{"op":"subscribe","subscriptions":[{"id":1,"channelId":9}]}', "the channel 9 is not announced"),
+        ('{"op":"unsubscribe","subscriptionIds":[5]}', "there is no subscription 5"),
+        (
+            '{"op":"advertise","channels":[{"id":1,"topic":"/a","encoding":"cdr","schemaName":"a/B"}]}',
+            "'cdr'",
+        ),
+        (
+            '{"op":"advertise","channels":[{"id":1,"topic":" /a","encoding":"ros1","schemaName":"a/B"}]}',
+            "' /a'",
+        ),
+        ('{"op":"subscribeParameterUpdates","parameterNames":[]}', "Invalid value"),
+        (b"", "begins with nothing"),
+        (b"\x01\x01", "a binary frame of 2 bytes"),
+        (b"\x07" + bytes(20), "begins with 07"),
+        (b"\x01" + b"\xff" * 4, "the channel 4294967295 is not advertised"),
+    ],
+)
+def test_a_frame_that_breaks_the_protocol_is_refused(frame: str | bytes, words: str) -> None:
+    foxglove, _queue = viewer()
+    assert foxglove.receive(frame) == []
+    answer = json.loads(foxglove.next_frame(0.0) or "")
+    assert answer["op"] == "status" and answer["level"] == 2 and words in answer["message"]
+
+
+@pytest.mark.parametrize("service", [1, 4_294_967_295])
+def test_a_call_of_an_unknown_service_fails_in_words(service: int) -> None:
+    foxglove, _queue = viewer()
+    assert foxglove.receive(struct.pack("<BIII", 2, service, 3, 0xFFFFFFFF)) == []
+    answer = json.loads(foxglove.next_frame(0.0) or "")
+    assert (
+        answer["op"] == "serviceCallFailure"
+        and answer["callId"] == 3
+        and "not announced" in answer["message"]
+    )
+
+
+def test_an_asset_is_an_error_at_once() -> None:
+    foxglove, _queue = viewer()
+    foxglove.receive('{"op":"fetchAsset","uri":"package://x/y.stl","requestId":5}')
+    assert foxglove.next_frame(0.0) == struct.pack("<BIBI", 4, 5, 1, 23) + b"this door has no assets"
+
+
+def test_subscriptions_and_channels_are_bounded() -> None:
+    foxglove, queue = viewer(subscriptions=3, channels=2)
+    many = [{"id": number, "channelId": 1} for number in range(1000)]
+    assert len(foxglove.receive(json.dumps({"op": "subscribe", "subscriptions": many}))) == 3
+    channels = [
+        {"id": one, "topic": f"/c{one}", "encoding": "ros1", "schemaName": "a/B"} for one in range(1000)
+    ]
+    assert len(foxglove.receive(json.dumps({"op": "advertise", "channels": channels}))) == 2
+    (publish,) = foxglove.receive(b"\x01\x01\0\0\0abc")
+    assert publish == PublishMessage("/c1", b"abc")
+    foxglove.failed(SubscribeTopic("/t", "a/B"), "denied by [Subscribers] /t (site.ini:7)")
+    assert len(foxglove.receive(json.dumps({"op": "subscribe", "subscriptions": many[:3]}))) == 3
+    assert queue.dropped == 0
