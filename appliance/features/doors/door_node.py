@@ -302,14 +302,14 @@ class DoorNode:
         future = offer.calls.get(request.call) if offer is not None else None
         if offer is None or future is None or future.done():
             raise ProtocolError(f"no call of {request.service} waits for this answer")
-        if not request.ok:
-            future.set_exception(ServiceFailedError(bytes(request.values)[:1000].decode("utf-8", "replace")))
-            return
         try:
+            # As in rosbridge, values that fit are the answer even if `result` is false: clients return that for success.
             future.set_result(offer.response.writer.from_json(request.values, present_time()))
         except PeerError as error:
-            future.set_exception(ServiceFailedError(str(error)))
-            raise
+            reason = str(error) if request.ok else bytes(request.values)[:1000].decode("utf-8", "replace")
+            future.set_exception(ServiceFailedError(reason))
+            if request.ok:
+                raise
 
     # --- parameters ---
 

@@ -260,8 +260,8 @@ class Rosapi:
     # --- parameters and time ---
 
     async def _get_param(self, given: _Arguments) -> dict[str, Any]:
-        if given.default and not await self._sight.parameter("hasParam", given.name):
-            return {"value": _as_text(_as_value(given.default))}
+        if not await self._sight.parameter("hasParam", given.name):
+            return {"value": _as_text(_as_value(given.default)) if given.default else "null"}
         return {"value": _as_text(await self._sight.parameter("getParam", given.name))}
 
     async def _set_param(self, given: _Arguments) -> dict[str, Any]:
@@ -275,7 +275,8 @@ class Rosapi:
         return {"global_name": str(await self._sight.parameter("searchParam", given.name) or "")}
 
     async def _delete_param(self, given: _Arguments) -> dict[str, Any]:
-        await self._sight.parameter("deleteParam", given.name)
+        if await self._sight.parameter("hasParam", given.name):
+            await self._sight.parameter("deleteParam", given.name)
         return {}
 
     async def _param_names(self, _given: _Arguments) -> dict[str, Any]:

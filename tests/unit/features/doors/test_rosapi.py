@@ -47,7 +47,7 @@ class StatedSight:
         match call, arguments:
             case "getParam", (str(name),) if name in self.parameters:
                 return self.parameters[name]
-            case "hasParam", (str(name),):
+            case "hasParam", (str(name),) if name != "/secret":
                 return name in self.parameters
             case "setParam", (str(name), value):
                 self.parameters[name] = value
@@ -96,6 +96,8 @@ async def ask(rosapi: Rosapi, service: str, values: str = "{}") -> Any:
         ("get_param", '{"name":"/rosdistro"}', {"value": '"noetic"'}),
         ("get_param", '{"name":"/gains"}', {"value": '{"p":1.5,"on":true}'}),
         ("get_param", '{"name":"/none","default":"5"}', {"value": "5"}),
+        ("get_param", '{"name":"/none"}', {"value": "null"}),
+        ("delete_param", '{"name":"/none"}', {}),
         ("has_param", '{"name":"/none"}', {"exists": False}),
         ("get_param_names", "[]", {"names": ["/rosdistro", "/gains"]}),
         ("get_time", "{}", {"time": {"secs": 7, "nsecs": 8}}),
@@ -146,7 +148,7 @@ async def test_parameters_are_set_as_json_or_as_a_string(rosapi: Rosapi) -> None
         ("/rosapi_node/get_ros_version", "{}", "a service of ROS 2; this robot has ROS 1"),
         ("/rosapi/nonsense", "{}", "rosapi has no service '/rosapi/nonsense'"),
         ("/rosapi/get_param", '{"name":"/secret"}', "denied by [Parameters] (site.ini:9)"),
-        ("/rosapi/delete_param", '{"name":"/x"}', "denied by [Parameters] (site.ini:9)"),
+        ("/rosapi/delete_param", '{"name":"/gains"}', "denied by [Parameters] (site.ini:9)"),
         ("/rosapi/topic_type", '{"topic":7}', "Expected `str`, got `int` - at `$.topic`"),
         ("/rosapi/topic_type", "[" * 100_000, "arguments of a call of rosapi"),
         ("/rosapi/message_details", '{"type":"own/Type"}', "does not know this message type"),

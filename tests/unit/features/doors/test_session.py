@@ -106,7 +106,7 @@ async def test_a_service_of_a_client_is_answered_or_fails_when_the_client_leaves
         robot, client = await world.robot("10.0.0.3", "/robot"), await world.client()
         client.send({"op": "advertise_service", "service": "/grip", "type": "std_srvs/SetBool"})
         await asyncio.sleep(1)
-        calls = [asyncio.ensure_future(robot.call_service("/grip", "*", b"\x01", 100)) for _ in range(3)]
+        calls = [asyncio.ensure_future(robot.call_service("/grip", "*", b"\x01", 100)) for _ in range(5)]
         asked = [await client.next() for _ in calls]
         assert asked[0]["args"] == {"data": True}
         answer = {"op": "service_response", "service": "/grip", "id": asked[0]["id"]}
@@ -116,9 +116,14 @@ async def test_a_service_of_a_client_is_answered_or_fails_when_the_client_leaves
         with pytest.raises(ServiceFailedError, match="unknown field `succes`"):
             await calls[1]
         assert "unknown field `succes`" in (await client.next())["msg"]
+        client.send(answer | {"id": asked[2]["id"], "values": {"message": "it slips"}, "result": False})
+        assert await calls[2] == b"\x00" + string("it slips")
+        client.send(answer | {"id": asked[3]["id"], "values": "the arm is gone", "result": False})
+        with pytest.raises(ServiceFailedError, match="the arm is gone"):
+            await calls[3]
         client.writer.close()
         with pytest.raises(ServiceFailedError, match="offers the service no longer"):
-            await calls[2]
+            await calls[4]
         await asyncio.sleep(1)
         assert world.master.services == {}
 

@@ -1,0 +1,93 @@
+"""A door on real sockets: `python -m tests.support.real_door MASTER_URI ADDRESS PORT [FILE.srv …]` serves until killed.
+
+It is assembled as the door process will be: each connection comes as a descriptor from another part, which listens.
+"""
+
+import asyncio
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from appliance.features.doors.connections import ConnectionLimits, DoorConnections
+from appliance.features.doors.door_node import DoorNode, present_time
+from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
+from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.rosapi import MasterSight, Rosapi
+from appliance.features.doors.rosbridge import Rosbridge, RosbridgeLimits
+from appliance.features.doors.session import ClientProtocol, DoorSession, SessionOptions
+from appliance.features.doors.values import ValueLimits
+from appliance.features.doors.viewer_queue import ViewerQueue
+from roswire.definitions import Definitions
+from roswire.node import NodeLimits, RosNode, SourceNetwork
+from roswire.node.network import ByteWriter
+from roswire.standard import standard_definitions
+
+NAME = "/door"
+
+
+def protocol_of(subprotocol: str | None) -> ClientProtocol:
+    """Return the protocol that a client speaks."""
+    if subprotocol is None:
+        return Rosbridge(NAME, RosbridgeLimits(), ViewerQueue())
+    return Foxglove(NAME, FoxgloveLimits(), ViewerQueue())
+
+
+@asynccontextmanager
+async def real_door(
+    master_uri: str, source: str, port: int = 0, definitions: Definitions | None = None
+) -> AsyncIterator[int]:
+    """Serve a door for a block; yields the port of its WebSocket at the source address."""
+    node = RosNode(
+        NAME, master_uri, SourceNetwork(source), limits=NodeLimits(), shut_down=lambda _reason: None
+    )
+    await node.start()
+    defined = standard_definitions()
+    types = KnownTypes(defined.extended(definitions) if definitions else defined, ValueLimits())
+    sight = MasterSight(node, present_time)
+    door = DoorNode(node, types, Rosapi(sight, types).answer, most_topics=2000)
+    lookout = Lookout(sight, types, door.learn)
+
+    async def serve(reader: asyncio.StreamReader, writer: ByteWriter) -> None:
+        await DoorSession(
+            reader,
+            writer,
+            door=door,
+            lookout=lookout,
+            protocols=protocol_of,
+            subprotocols=SUBPROTOCOLS,
+            options=SessionOptions(),
+        ).run()
+
+    connections = DoorConnections(serve, ConnectionLimits())
+    with socket.create_server((source, port)) as listener:
+        listener.setblocking(False)
+        accepting = asyncio.ensure_future(_accept(listener, connections))
+        try:
+            yield listener.getsockname()[1]
+        finally:
+            accepting.cancel()
+            await connections.close()
+            await door.close()
+
+
+async def _accept(listener: socket.socket, connections: DoorConnections) -> None:
+    """Pass each connection on as a descriptor, as the front process does."""
+    while True:
+        connection, _address = await asyncio.get_running_loop().sock_accept(listener)
+        with connection:
+            connections.adopt(os.dup(connection.fileno()))
+
+
+async def main(master_uri: str, source: str, port: str, *files: str) -> None:
+    """Serve until killed; the last two parts of each file's path name its type."""
+    texts = {"/".join(Path(file).parts[-2:]): Path(file).read_text(encoding="utf-8") for file in files}
+    async with real_door(master_uri, source, int(port), Definitions.from_files(texts)):
+        await asyncio.get_running_loop().create_future()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))
