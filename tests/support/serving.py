@@ -79,7 +79,7 @@ def serving(
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(
-            RegistrationCalls(registry, graph, enactor, arrivals, relay, mediation, gate, parameters),
+            RegistrationCalls(registry, graph, enactor, arrivals, relay, mediation, parameters),
             LookupCalls(
                 registry,
                 graph,

@@ -76,7 +76,6 @@ def assemble(base: Foundation) -> Parts:
         arrivals,
         ends.relay,
         core.mediation,
-        core.gate,
         parameters,
     )
     publisher = OwnPublisher(

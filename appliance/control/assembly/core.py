@@ -63,7 +63,7 @@ def make_core(base: Foundation) -> Core:
         return parameters.tree
 
     graph = RosGraph(registry, grants, mediation, tree, may_read_value=rights.may_read_value)
-    limits = HostLimits(settings.limits.nodes_per_host, settings.limits.topics_per_host)
+    limits = HostLimits(settings.limits.topics_per_host)
     return Core(
         policy=policy,
         registry=registry,

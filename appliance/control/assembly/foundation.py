@@ -159,7 +159,7 @@ async def make_foundation(
         site_keys=settings.site_keys,
     )
     policies.start(restarted=restarted or pair is not None)
-    registry = Registry()
+    registry = Registry(settings.limits.nodes_per_host)
     quota_class.set(HostQuotaClass(lambda: policies.current, registry.registrations_of))
     return Foundation(
         settings=settings,

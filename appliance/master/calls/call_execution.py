@@ -35,7 +35,7 @@ from appliance.master.calls.gate import CallGate, NameConflict, contested
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterWrite
 from appliance.master.calls.registration import given_up
 from appliance.master.endpoints.node_ports import NoPortError
-from appliance.master.graph.registry import Kind, Registry
+from appliance.master.graph.registry import HostFullError, Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reconcile.arrivals import NodeElsewhereError
 from appliance.master.reconcile.enactor import Enactor
@@ -50,7 +50,15 @@ from roswire.xmlrpc import Value
 
 _log = structlog.get_logger()
 _REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
-_FAILURES = (NoPortError, NodeElsewhereError, LimitReachedError, PeerError, EncodingError, CallFailedError)
+_FAILURES = (
+    HostFullError,
+    NoPortError,
+    NodeElsewhereError,
+    LimitReachedError,
+    PeerError,
+    EncodingError,
+    CallFailedError,
+)
 
 
 class ServedRequest(NamedTuple):
@@ -254,7 +262,7 @@ class Execution:
     def _failed(self, attempt: Attempt, error: Exception) -> Answer:
         caller, call = attempt.caller, attempt.call
         match error:
-            case NoPortError() | LimitReachedError():
+            case HostFullError() | NoPortError() | LimitReachedError():
                 record = self.trail.happened(
                     "limit exceeded",
                     str(error),

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import Attempt, CallVerb, Identity
 from appliance.master.graph.own_node import OWN, PARAMETERS, ROSOUT, rosout_may_have
-from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
+from appliance.master.graph.registry import HostFullError, Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
@@ -36,7 +36,6 @@ class NameConflict:
 class HostLimits:
     """The limits of one host, and of all hosts together, in the registry."""
 
-    nodes: int = 500
     registrations: int = NAMES.bounds.host
     registrations_in_all: int = NAMES.bounds.whole
 
@@ -125,8 +124,10 @@ class CallGate:
         denial = self._too_many_names(host)
         if denial is not None:
             return denial
-        if self._is_one_too_many(caller, api) and self._registry.evictable_of(host) is None:
-            return _no(f"{host} has {self._limits.nodes} nodes, the limit for one host")
+        try:
+            self._registry.room_for(caller.caller_id, host, api.text)
+        except HostFullError as error:
+            return _no(str(error))
         return None
 
     def _too_many_names(self, host: Address) -> Decision | None:
@@ -147,20 +148,6 @@ class CallGate:
         return _no(
             f"{who} has {mine} registrations, and {left} are left for all other hosts: a host may have"
             f" {_TIMES_THE_REST} times as many as are left"
-        )
-
-    def to_make_room(self, caller: Caller, api: ApiUri) -> Incarnation | None:
-        """Return a node of the caller's host to evict, if a new node would exceed the host's limit.
-
-        Only an unused or lost node is evicted. Return None if there is no need, or no such node.
-        """
-        return self._registry.evictable_of(caller.peer.host) if self._is_one_too_many(caller, api) else None
-
-    def _is_one_too_many(self, caller: Caller, api: ApiUri) -> bool:
-        host = caller.peer.host
-        return (
-            self._registry.nodes_of(host) >= self._limits.nodes
-            and self._registry.find(caller.caller_id, host, api.text) is None
         )
 
 

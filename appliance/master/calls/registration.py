@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.call import Attempt
-from appliance.master.calls.gate import CallGate
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import RosGraph
@@ -33,7 +32,6 @@ class RegistrationCalls:
     arrivals: Arrivals
     relay: RelayControl
     mediation: Mediation
-    gate: CallGate
     parameters: ParameterCalls
 
     async def register_publisher(
@@ -137,14 +135,7 @@ class RegistrationCalls:
         return holder if meant else None
 
     async def _registering(self, caller: Caller, api: ApiUri) -> Incarnation:
-        """Return the registering incarnation.
-
-        If the host is at its limit, a new incarnation replaces an unused or lost incarnation of the host.
-        """
         await self.enactor.entries.room(caller.peer.host)
-        evicted = self.gate.to_make_room(caller, api)
-        if evicted is not None:
-            self.enactor.carry_out(self.graph.forgotten(evicted))
         return await self.arrivals.incarnation_for(caller, api)
 
 

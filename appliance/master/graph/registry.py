@@ -36,6 +36,10 @@ PUBLISHER_PATH = "/publisher/"
 """The path of the node API of the appliance's own publisher, on the listener of the master-side endpoints."""
 
 
+class HostFullError(Exception):
+    """A host has as many nodes as it may have, and each is in use."""
+
+
 class Kind(enum.StrEnum):
     """The kind of a registration."""
 
@@ -186,7 +190,8 @@ Durable = SaveNode | EraseNode | SaveRegistration | EraseRegistration
 class Registry:
     """All known incarnations, by key, by name and by topic."""
 
-    def __init__(self) -> None:
+    def __init__(self, nodes_of_host: int = 500) -> None:
+        self._most_of_host = nodes_of_host
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
@@ -259,7 +264,19 @@ class Registry:
         """Return the number of known incarnations of a host, for the limit per host."""
         return self._nodes_of.get(host, 0)
 
-    def evictable_of(self, host: Address) -> Incarnation | None:
+    def room_for(self, name: str, host: Address, api_text: str) -> Incarnation | None:
+        """Return the incarnation that a registering one replaces at its host's limit; None if there is room for both.
+
+        Only an unused or lost incarnation is replaced. Raises `HostFullError` if the host has none.
+        """
+        if self.nodes_of(host) < self._most_of_host or self.find(name, host, api_text) is not None:
+            return None
+        evicted = self._evictable_of(host)
+        if evicted is None:
+            raise HostFullError(f"{host} has {self._most_of_host} nodes, the limit for one host")
+        return evicted
+
+    def _evictable_of(self, host: Address) -> Incarnation | None:
         """Return the first incarnation of a host to evict: an evictable one, or otherwise the first that was lost."""
         mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
         idle = next((incarnation for incarnation in mine if incarnation.evictable), None)
@@ -271,7 +288,7 @@ class Registry:
 
         This is an incarnation of the same host, or otherwise an evictable incarnation of another host.
         """
-        return self.evictable_of(host) or next(
+        return self._evictable_of(host) or next(
             (incarnation for incarnation in self._by_key.values() if incarnation.evictable), None
         )
 

@@ -46,8 +46,9 @@ class Arrivals:
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
         """Return the calling incarnation. If it is unknown, make and save a new incarnation with its ports.
 
-        Raises `NoPortError`, without any change, if the range of ports is exhausted or control has no descriptors left,
-        and `NodeElsewhereError` if the node runs on another host.
+        At its host's limit, the new incarnation replaces an unused or lost one of the host. Raises `HostFullError`
+        if there is none, `NoPortError` if the range of ports is exhausted or control has no descriptors left, and
+        `NodeElsewhereError` if the node runs on another host; no incarnation is made then.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self.registry.find(*identity)
@@ -83,6 +84,9 @@ class Arrivals:
             )
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
+        identity = (caller.caller_id, caller.peer.host, api.text)
+        if not caller.own and (evicted := self.registry.room_for(*identity)) is not None:
+            self.enactor.carry_out(self.graph.forgotten(evicted))
         outer_port, relay_port, *more = self._open_ports(caller.peer.host)
         incarnation = Incarnation(
             key=new_key(),

@@ -132,15 +132,16 @@ def joined(registry: Registry, number: int, name: str) -> Incarnation:
 
 
 @pytest.mark.parametrize(
-    ("limits", "words"),
+    ("registry", "limits", "words"),
     [
-        (HostLimits(nodes=3), "10.1.0.1 has 3 nodes, the limit for one host"),
-        (HostLimits(registrations=3), "10.1.0.1 has 3 registrations, the limit for one host"),
+        (Registry(3), HostLimits(), "10.1.0.1 has 3 nodes, the limit for one host"),
+        (Registry(), HostLimits(registrations=3), "10.1.0.1 has 3 registrations, the limit for one host"),
     ],
 )
-def test_a_host_has_a_limit_of_nodes_and_registrations(limits: HostLimits, words: str) -> None:
+def test_a_host_has_a_limit_of_nodes_and_registrations(
+    registry: Registry, limits: HostLimits, words: str
+) -> None:
     policy = compile_policy("[Nodes]\ndefault = *\n[Publishers]\ndefault = *\n", file="test.ini")
-    registry = Registry()
     gate = CallGate(lambda: policy, registry, limits)
     for number in range(3):
         node = joined(registry, 1, f"/n{number}")

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.master.graph.registry import Incarnation, Kind, Life, NodeRegistration, Registry, new_key
+from appliance.master.graph.registry import (
+    HostFullError,
+    Incarnation,
+    Kind,
+    Life,
+    NodeRegistration,
+    Registry,
+    new_key,
+)
 from roswire.uris import parse_node_uri
 from tests.support.examples import examples
 
@@ -81,16 +89,18 @@ def check(registry: Registry, known: list[Incarnation]) -> None:
 
 
 def test_the_node_that_was_lost_first_makes_room() -> None:
-    registry = Registry()
+    registry = Registry(3)
     known = [incarnation(number) for number in (0, 2, 4)]
     for one in known:
         registry.add(one)
         registry.register(one, Kind.PUBLICATION, "/x", "t")
-    assert registry.evictable_of(HOSTS[0]) is None
+    with pytest.raises(HostFullError, match="has 3 nodes, the limit for one host"):
+        registry.room_for("/new", HOSTS[0], "http://new:1/")
     registry.overshadow(known[2], 5.0)
     registry.overshadow(known[1], 7.0)
-    assert registry.evictable_of(HOSTS[0]) is known[2]
-    assert registry.evictable_of(HOSTS[1]) is None
+    assert registry.room_for("/new", HOSTS[0], "http://new:1/") is known[2]
+    assert registry.room_for(known[0].name, HOSTS[0], known[0].api_text) is None
+    assert registry.room_for("/new", HOSTS[1], "http://new:1/") is None
 
 
 def test_a_node_without_registrations_makes_room_first() -> None:
@@ -105,7 +115,7 @@ def test_a_node_without_registrations_makes_room_first() -> None:
     for one in (idle, busy):
         registry.unregister(one, Kind.PUBLICATION, "/x")
     busy.calls = 1
-    assert registry.evictable_of(HOSTS[0]) is idle
+    assert registry.evictable_for(HOSTS[0]) is idle
     assert registry.evictable_for(HOSTS[1]) is idle
     registry.forget(idle)
     assert registry.evictable_for(HOSTS[1]) is None
