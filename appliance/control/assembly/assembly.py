@@ -1,6 +1,7 @@
 """Assemble RVMaster from its core, its endpoints, the specifications and the calls."""
 
 from dataclasses import dataclass
+from functools import partial
 
 from appliance.channel import messages
 from appliance.control.assembly.core import Core, make_core
@@ -8,7 +9,7 @@ from appliance.control.assembly.endpoints import Endpoints, make_endpoints
 from appliance.control.assembly.foundation import INNER, RVMASTER, Foundation
 from appliance.control.assembly.listener_limits import value_limits
 from appliance.control.assembly.monitor_states import published_now
-from appliance.features.standby.replication import answered_when_stored
+from appliance.features.standby.replication import each_answered_when_stored
 from appliance.master import rosout
 from appliance.master.calls.call import Table, served
 from appliance.master.calls.call_execution import Execution
@@ -110,11 +111,7 @@ def assemble(base: Foundation) -> Parts:
         port,
     )
     node_table = served(NODE_CALLS.values(), node_calls)
-    ends.handler.set(
-        lambda incarnation: answered_when_stored(
-            base.replication, pipeline.handler(node_table, target=incarnation)
-        )
-    )
+    ends.handler.set(each_answered_when_stored(base.replication, partial(pipeline.handler, node_table)))
     return Parts(
         core=core,
         endpoints=ends,

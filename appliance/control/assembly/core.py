@@ -43,9 +43,7 @@ class Core:
 def make_core(base: Foundation) -> Core:
     """Make the core from the registry, the policy, and the parameters in the store."""
     settings, registry, monitors = base.settings, base.registry, Current[SpecificationManager]()
-
-    def policy() -> Policy:
-        return base.policies.current
+    policy = base.policies.policy
 
     watchlist = Watchlist()
     carried = RelayTraffic(base.trail, registry, settings.relays, watchlist.cut_off)

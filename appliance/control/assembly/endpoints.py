@@ -55,7 +55,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         policies.current.ports,
         keep=base.lifeline.keep,
         drop=base.lifeline.drop,
-        named_as=lambda host: core.policy().named_as(host),
+        named_as=policies.named_as,
         relays=settings.relays,
     )
     nodes = NodeApiClient(core.registry, timeout=settings.limits.node_call_seconds)
@@ -88,7 +88,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         core.registry,
         places,
         inner_port=base.port(INNER),
-        serve=lambda incarnation: handler()(incarnation),  # noqa: PLW0108 - it is set later
+        serve=handler,
         server=base.listener_limits.server,
     )
     entries = MasterRegistrations(rosmaster, core.registry, faces.inner_uri)

@@ -160,7 +160,7 @@ async def make_foundation(
     )
     policies.start(restarted=restarted or pair is not None)
     registry = Registry(settings.limits.nodes_per_host)
-    quota_class.set(HostQuotaClass(lambda: policies.current, registry.registrations_of))
+    quota_class.set(HostQuotaClass(policies.policy, registry.registrations_of))
     return Foundation(
         settings=settings,
         lifeline=lifeline,
@@ -178,7 +178,7 @@ async def make_foundation(
         policies=policies,
         registry=registry,
         quota_class=quota_class(),
-        listener_limits=ListenerLimits(settings, trail, lambda: policies.current, quota_class()),
+        listener_limits=ListenerLimits(settings, trail, policies.policy, quota_class()),
         sockets=_open_listeners(settings, lifeline),
         enforcement=enforcement,
         parameters_dirty=asyncio.Event(),

@@ -117,6 +117,13 @@ class Policies(Revisions[RevisionRow]):
             raise RuntimeError("no policy is loaded yet")
         return self._current
 
+    def policy(self) -> Policy:
+        """Return the policy in force to the parts that decide by it."""
+        return self.current
+
+    def named_as(self, host: Address) -> Network:
+        return self.current.named_as(host)
+
     @property
     def differs_from_file(self) -> bool:
         """Whether the policy in force differs from the file."""

@@ -31,6 +31,7 @@ from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
 from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_tunnels import StandbyTunnels
+from appliance.master.graph.registry import Incarnation
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import Database, StoreError
@@ -93,6 +94,15 @@ def answered_when_stored(replication: "Replication | None", handler: Handler) ->
         return answer
 
     return handle
+
+
+def each_answered_when_stored(
+    replication: "Replication | None", handler_of: Callable[[Incarnation], Handler]
+) -> Callable[[Incarnation], Handler]:
+    """Return a function that makes the handlers of `handler_of`, each answered when its changes are stored."""
+    if replication is None:
+        return handler_of
+    return lambda incarnation: answered_when_stored(replication, handler_of(incarnation))
 
 
 def state_of(

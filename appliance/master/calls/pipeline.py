@@ -44,7 +44,7 @@ class Pipeline:
     bulk: Turns[Address]
     processor: ProcessorTime
 
-    def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
+    def handler(self, table: Table, target: Incarnation | None = None, *, own: bool = False) -> Handler:
         """Return the handler of a listener with this table. `own`: the listener is for the appliance's own nodes."""
 
         async def handle(request: HttpRequest) -> bytes:

@@ -22,12 +22,12 @@ from roswire.xmlrpc import build_fault, build_response
 
 @dataclass(frozen=True, slots=True)
 class ProxyEndpoints:
-    """The open endpoints. `serve(incarnation)` makes the handler of an endpoint; `server` serves it on a socket."""
+    """The open endpoints. `serve()(incarnation)` makes the handler of an endpoint; `server` serves it on a socket."""
 
     registry: Registry
     places: NodePorts
     inner_port: int
-    serve: Callable[[Incarnation], Handler]
+    serve: Callable[[], Callable[[Incarnation], Handler]]
     server: Callable[[socket.socket, Handler], HttpServer]
     servers: dict[str, HttpServer] = field(default_factory=dict, init=False)
 
@@ -42,7 +42,7 @@ class ProxyEndpoints:
         except OSError as error:
             self.places.close(incarnation)
             raise NoPortError(f"no proxy endpoint for {incarnation.name}: {error.strerror}") from error
-        server = self.server(sock, self.serve(incarnation))
+        server = self.server(sock, self.serve()(incarnation))
         self.servers[incarnation.key] = server
         await server.start()
 
