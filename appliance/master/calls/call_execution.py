@@ -51,14 +51,8 @@ from roswire.xmlrpc import Value
 _log = structlog.get_logger()
 _REGISTERS = (CallVerb.REGISTER, CallVerb.UNREGISTER)
 _FAILURES = (
-    HostFullError,
-    NoPortError,
-    NodeElsewhereError,
-    LimitReachedError,
-    PeerError,
-    EncodingError,
-    CallFailedError,
-)
+    HostFullError, NoPortError, NodeElsewhereError, LimitReachedError, PeerError, EncodingError, CallFailedError,
+)  # fmt: skip
 
 
 class ServedRequest(NamedTuple):
