@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from rosmop.check import cursors, event_ages, members, order
+from rosmop.check import cursors, event_facts, members, order
 from rosmop.check.assignables import Value, path, root
 from rosmop.check.assignments import require_place, store
 from rosmop.check.conversion import condition, convert, number
@@ -62,8 +62,8 @@ def _named(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ..
 
 def _known(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, ...]) -> Value | None:
     """Compile a call of a predefined function; return None for any other name."""
-    if len(parts) == 1 and parts[0] in event_ages.FUNCTIONS:
-        return event_ages.age_or_seen(scope, node, parts[0])
+    if len(parts) == 1 and parts[0] in event_facts.FUNCTIONS:
+        return event_facts.fact(scope, node, parts[0])
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
@@ -95,7 +95,7 @@ def _unknown(scope: FunctionScope, node: tree.CallExpression, parts: tuple[str, 
     known = [
         *scope.names.functions,
         *LIBRARY,
-        *event_ages.FUNCTIONS,
+        *event_facts.FUNCTIONS,
         "printf",
         "ROS_INFO",
         "ROS_WARN",

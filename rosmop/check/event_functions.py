@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from rosmop.check.assignables import Variable
 from rosmop.check.conversion import condition, refusal
-from rosmop.check.event_ages import note_age
+from rosmop.check.event_facts import note_facts
 from rosmop.check.locate import type_of_path
 from rosmop.check.message_fields import PatternField, check_overlaps, read_fields, writes
 from rosmop.check.scope import CompilationContext, FunctionScope, SpecificationNames
@@ -42,10 +42,10 @@ def compile_event(
     check_topic(trigger.topic, trigger.position)
     kind = _message_type(shared, trigger)
     scope = FunctionScope(shared, names, "action")
-    scope.message_type = kind
+    scope.message_type, scope.event = kind, event.name
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    happens, is_aged = _assemble(scope, event, bound, *_body(scope, event, trigger))
+    happens, is_noted = _assemble(scope, event, bound, *_body(scope, event, trigger))
     whole = scope.function(function, ("m",), happens=happens)
     shared.define(whole)
     service = trigger.type if trigger.part is not None else None
@@ -60,7 +60,7 @@ def compile_event(
         binds=binds(names, event),
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
-        plain=not event.action.statements and trigger.when is None and not is_aged,
+        plain=not event.action.statements and trigger.when is None and not is_noted,
         acts=acts(whole, shared),
     )
 
@@ -281,7 +281,7 @@ def _assemble(
 ) -> tuple[int, bool]:
     """Write all statements of the function.
 
-    Return the number of statements before the action, and whether the event's age is used.
+    Return the number of statements before the action, and whether facts about the event are kept.
     """
     site = scope.lines.site = scope.site(event)
     read_fields(scope, bound)
@@ -296,6 +296,6 @@ def _assemble(
     before = len(scope.lines.found)
     scope.lines.found += action
     scope.add(nodes.WriteBack(site, fields, scope.temporary("w")))
-    is_aged = note_age(scope, event.name)
+    is_noted = note_facts(scope, event.name)
     scope.add(nodes.Leave(site, True))
-    return before, is_aged
+    return before, is_noted

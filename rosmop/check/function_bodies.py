@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import convert
-from rosmop.check.event_ages import NEVER, ages_of
+from rosmop.check.event_facts import first_facts
 from rosmop.check.library import ELEMENTARY, FREE
 from rosmop.check.loops import charge
 from rosmop.check.scope import CompilationContext, FunctionScope, HelperFunction, SpecificationNames
@@ -126,9 +126,9 @@ def _constants(
     for parameter in names.parameters.values():
         scope.written.add(parameter.code)
         scope.evaluate(nodes.Assign(parameter.type, parameter.code, nodes.Zero(parameter.type)))
-    for age in ages_of(names):
-        scope.written.add(age.code)
-        scope.evaluate(nodes.Assign(age.type, age.code, NEVER))
+    for assignment in first_facts(names):
+        scope.written.add(assignment.name)
+        scope.evaluate(assignment)
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)

@@ -183,6 +183,7 @@ class FunctionScope:
         self.result: Type = value_types.VOID
         self.references: tuple[Variable, ...] = ()
         self.message_type: str | None = None  # the type of `MESSAGE`
+        self.event: str | None = None  # the event whose action this is
         self.pending: str | None = None  # the code's name for the assigned fields, if `MESSAGE` was read
         self.drop_refused: str | None = None  # why `DROP;` is not allowed here
         self.below: set[str] = set()  # shared variables that are declared later

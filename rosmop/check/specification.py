@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from rosmop.check.enforcement import blocking_refused, enforcement, topics_of_remedy, with_remedy
-from rosmop.check.event_ages import declare_ages
+from rosmop.check.event_facts import declare_facts
 from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
 from rosmop.check.function_bodies import (
@@ -129,7 +129,7 @@ def _declare(shared: CompilationContext, specification: tree.Specification) -> S
     declare_givens(shared, names, specification)
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
-    declare_ages(shared, names, specification)
+    declare_facts(shared, names, specification)
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
     if MOST_BYTES < size <= MAX_BYTES:
         text = f"the variables take {size} bytes; a state of more than {MOST_BYTES >> 10} KiB is not kept, so"

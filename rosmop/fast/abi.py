@@ -44,6 +44,9 @@ def most_kept(kind: Type) -> int:
     return MOST_KEPT if isinstance(kind, value_types.StringType) else MOST_KEPT_ARRAY // kept_size(kind)
 
 
+SENDER = 16 + 2 * MOST_KEPT
+"""The size of the sender of messages: address and length of its host and caller, and then their bytes."""
+
 AREA = 512 << 10
 """The bytes of frames in one batch; one read takes the same number."""
 
@@ -129,6 +132,8 @@ class CompiledModule:
     lines: Sequence[OutputLine]
     said: int
     """Address of the lines of output. Each is stored by its index in `lines`."""
+    senders: Mapping[str, int]
+    """By context: the address of the sender of messages (`SENDER`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,4 +147,4 @@ class SetPart:
     def empty(cls) -> "SetPart":
         """Return the part without specifications."""
         nothing = Compiled((), (), {}, (), {}, MessageTypes(Definitions({})), ())
-        return cls(nothing, CompiledModule(b"", 0, 0, 0, {}, (), {}, (), 0))
+        return cls(nothing, CompiledModule(b"", 0, 0, 0, {}, (), {}, (), 0, {}))

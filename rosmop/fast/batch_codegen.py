@@ -206,6 +206,7 @@ def written(
         writer.throttles,
         writer.lines,
         writer.said,
+        writer.senders,
         writer.budgets,
         {raw: writer.constants[raw] for raw in writer.strings},
         writer.references,

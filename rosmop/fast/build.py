@@ -104,5 +104,5 @@ def _translated(module: WasmModule) -> CompiledModule:
     return CompiledModule(
         code=translated(module.code, module.memory), memory=module.memory, frames=module.frames,
         effects=module.effects, feeds=module.feeds, cells=module.cells, throttles=module.throttles,
-        lines=module.lines, said=module.said,
+        lines=module.lines, said=module.said, senders=module.senders,
     )  # fmt: skip

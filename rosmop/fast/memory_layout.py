@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from rosmop.fast.abi import FIRST, Cells, kept_size
+from rosmop.fast.abi import FIRST, SENDER, Cells, kept_size
 from rosmop.fast.deferred_output import OutputLine
 from rosmop.fast.wasm import F32, F64, I32, I64
 from rosmop.form import nodes
@@ -76,6 +76,8 @@ class MemoryLayout:
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
         """By specification and site: the address of the time when output was last due."""
+        self.senders: dict[str, int] = {}
+        """By specification: the address of the sender of messages."""
         self.constants: dict[bytes, int] = {}
         """Addresses of constant bytes."""
         self.strings: set[bytes] = set()
@@ -158,6 +160,12 @@ class MemoryLayout:
         if context not in self.budgets:
             self.budgets[context] = self.take(8)
         return self.budgets[context]
+
+    def sender(self, context: str) -> int:
+        """Return where the sender of messages is stored for a specification (`abi.SENDER`)."""
+        if context not in self.senders:
+            self.senders[context] = self.take(SENDER)
+        return self.senders[context]
 
     def throttle(self, context: str, site: int) -> int:
         """Return the address of the time when output at a site was last due."""

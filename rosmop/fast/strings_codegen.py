@@ -69,8 +69,8 @@ class StringCodegen(MessageAccess):
     """Writes code that reads and keeps strings."""
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
-            at = self._layout.variable(node.name, node.type)
+        at = self._address_of_span(node)
+        if at is not None:
             code = load(I32, at) + constant(I32, 0) + i64_load32_u(at + 4)
             return self._noted(code, most_kept(node.type))
         if isinstance(node, nodes.Literal | nodes.Zero) and kept_size(node.type):
@@ -84,6 +84,14 @@ class StringCodegen(MessageAccess):
         if isinstance(node, nodes.Conditional):
             return self._chosen(node)
         return super()._elements(node)
+
+    def _address_of_span(self, node: nodes.Expression) -> int | None:
+        """Return where address and length are stored: of a variable of the set, or of the sender of the message."""
+        if isinstance(node, nodes.Sender):
+            return self._layout.sender(self._context) + 8 * (node.part == "caller")
+        if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
+            return self._layout.variable(node.name, node.type)
+        return None
 
     def _constant_elements(self, node: nodes.Literal | nodes.Zero) -> tuple[bytes, bytes, bytes]:
         size = kept_size(node.type)

@@ -25,6 +25,7 @@ from rosmop.fast.abi import (
     BEYOND,
     LEFT,
     LOUD,
+    MOST_KEPT,
     POSITION,
     REST,
     SOONER,
@@ -68,6 +69,7 @@ _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
 _EFFECT = struct.Struct("<qq")
+_SPANS = struct.Struct("<QQ")
 _LOG = struct.Struct("<II8s")
 _PREPARED = struct.Struct("<4q")
 _TIME = struct.Struct("<q")
@@ -86,11 +88,14 @@ class ModuleState:
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
         *,
+        senders: Sequence[int] = (),
         due: NextDue,
         properties: Sequence[tuple[str, int]] = (),
         known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
     ) -> None:
         """`throttles` has specification, site, and the address of the time when output there was last due.
+
+        `senders` has the addresses of senders of messages (`abi.SENDER`).
 
         `properties` has the properties of `running` by monitor and number, `known` the variables by monitor and name.
         """
@@ -100,6 +105,7 @@ class ModuleState:
         self._contexts, self._values = interpreter.contexts, interpreter.variables
         self._running = running
         self._throttles = throttles
+        self._senders, self._turn = senders, interpreter.turn
         variables = dict(sorted(cells.variables.items(), key=lambda item: item[1][0]))
         self._names = [*variables]
         self._cells = struct.Struct(
@@ -132,6 +138,13 @@ class ModuleState:
         self.prepared = prepared
         self.machine.refuel(FUEL)
         self._memory[self._source : self._source + _PREPARED.size] = packed(prepared)
+        for address in self._senders:
+            names, room = self._turn.names(prepared.source), address + _SPANS.size
+            words = [
+                _entered(self._memory, name, room + place * MOST_KEPT, value_types.STRING)
+                for place, name in enumerate(names)
+            ]
+            _SPANS.pack_into(self._memory, address, *words)
 
     def _unprepare(self) -> None:
         """Forget the options: memory then differs from the `packed` form of all options."""
@@ -602,6 +615,7 @@ class WasmFastPath:
                 interpreter,
                 running,
                 throttles,
+                senders=[address for context, address in module.senders.items() if context in contexts],
                 due=due,
                 properties=[(monitors[number].name, index) for number, index in group.properties],
                 known={

@@ -20,7 +20,7 @@ from typing import Any
 
 import z3
 
-from rosmop.fast.abi import AREA, kept_size
+from rosmop.fast.abi import AREA, SENDER, kept_size
 from rosmop.fast.batch_codegen import WasmModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
@@ -120,6 +120,7 @@ class Validation:
         self._strings = [range(at, at + 8) for own in module.cells for at in own.kept]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += module.references
+        self._strings += [range(at, at + SENDER) for at in module.senders.values()]
 
     def finding(self, topic: str, event: str, function: str, place: int) -> ProofFinding:
         """Return the result for the event with this index on a topic."""

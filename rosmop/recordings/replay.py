@@ -116,14 +116,15 @@ def replay(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
     begun = False
-    selection = _ExplainOnce()
+    selection, caller = _ExplainOnce(), _Caller()
+    monitors.name_senders(caller)
     monitors.explain_when(selection, selection)
     for index, (connection, time_ns, data) in enumerate(messages_of(reader)):
         if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
             continue
         if not begun:
             started, begun = monitors.start(time_ns, expected), True
-        selection.now = time_ns
+        selection.now, caller.name = time_ns, _sender(connection).callerid or ""
         outcome = _outcome(
             monitors, connection, time_ns, data, refusals[connection.id], MessageSender(index + 1)
         )
@@ -147,6 +148,15 @@ def _steps(step: ReplayStep) -> Iterator[ReplayStep]:
     for number, judged in step.outcome.judged.items():
         message = step.outcome.published[number]
         yield from _steps(ReplayStep(judged, None, message.topic, message.monitor))
+
+
+class _Caller:
+    """The host and the caller id of the current message; a recording does not have the host."""
+
+    name = ""
+
+    def __call__(self, _source: int) -> tuple[str, str]:
+        return "", self.name
 
 
 class _ExplainOnce:

@@ -368,6 +368,16 @@ class MonitorSet:
         """Whether the last message, tick or deadline used up its time."""
         return self.interpreter.turn.late()
 
+    def name_senders(self, names: Callable[[int], tuple[str, str]]) -> None:
+        """Set how the host and the caller id of a source are found; both are empty for source 0."""
+
+        def encoded(source: int) -> tuple[bytes, bytes]:
+            host, caller = names(source) if source else ("", "")
+            return host.encode(), caller.encode()
+
+        for part in (self, *self.shadows):
+            part.interpreter.turn.names = encoded
+
     def explain_when(self, asked: Asked, shadowed: Asked) -> None:
         """Explain a verdict only if `asked` (in shadow mode: `shadowed`) returns true for the message's source."""
         self._execution.asked = asked

@@ -107,7 +107,7 @@ class MonitorExecution:
         """
         steps[0].monitor.move_to_python()
         steps[0].monitor.touch()
-        self._turn.now = outcome.time
+        self._turn.now, self._turn.source = outcome.time, sender.source
         if not published:
             self._turn.begin()
         self._sender = sender

@@ -848,6 +848,10 @@ class _Maker:
         turn = self._interpreter.turn
         return lambda _: turn.now
 
+    def _sender(self, node: nodes.Sender) -> _Value:
+        turn, place = self._interpreter.turn, ("host", "caller").index(node.part)
+        return lambda _: turn.names(turn.source)[place]
+
     def _whole(self, node: nodes.Whole) -> _Value:
         context, decode, site = self._context, self._values.decoder(node.type), node.site
         pending = self._whole_with[node.pending]
@@ -942,6 +946,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Value]] = Ma
         nodes.Log: _Maker._log,
         nodes.Throttle: _Maker._throttle,
         nodes.Now: _Maker._now,
+        nodes.Sender: _Maker._sender,
         nodes.Whole: _Maker._whole,
     }
 )

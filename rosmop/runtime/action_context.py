@@ -84,6 +84,9 @@ class Turn:
     """The state that all actions of one message or tick share: time, output, and values of evaluated conditions."""
 
     now: int = 0
+    source: int = 0
+    names: Callable[[int], tuple[bytes, bytes]] = lambda _: (b"", b"")
+    """Returns host and caller of a source (`MessageSender.source`)."""
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)

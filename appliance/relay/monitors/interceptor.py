@@ -156,6 +156,7 @@ class Interceptor:
         result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._shadow_observer.asks)
         result.give(self._given)
+        result.name_senders(self.senders.names)
         before, first = self.monitors, self._stated is None or bool(self.blocked)
         if before is None and first:
             self.offset += continued(message, self._keeper, self.now())
@@ -418,13 +419,13 @@ class Interceptor:
         observer = self.observer
 
         def prepare(lane: FastLane) -> BatchOptions:
-            prepared = self._prepared.get((point, way))
-            if prepared is None:
+            prepared, source = self._prepared.get((point, way)), self.senders.number(point)
+            if prepared is None or prepared.source != source:
                 prepared = self._prepared[point, way] = lane.prepare(
                     loud=lane.changes and observer.shows(point),
                     told=[True] * len(lane.events),
                     counted=[observer.hides_verdict(verdict, point) for verdict in lane.verdicts],
-                    source=self.senders.number(point),
+                    source=source,
                 )
             return prepared
 

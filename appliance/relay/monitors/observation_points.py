@@ -3,7 +3,8 @@
 import struct
 from collections import OrderedDict
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
+from weakref import WeakValueDictionary
 
 from appliance.relay.monitors.batch_progress import BatchProgress
 from rosmop.run.outcomes import SEQ, MessageSender
@@ -28,12 +29,19 @@ NOWHERE = ObservationPoint("", "")
 """The point of timed events, which concern no message."""
 
 
+class Holder(Protocol):
+    """An object that exists as long as its point is in use."""
+
+    point: ObservationPoint
+
+
 class Senders:
     """Numbers for observation points, which identify the senders of earlier messages; the last `_SENDERS` are known."""
 
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
         self._numbers: dict[ObservationPoint, int] = {}
+        self._holders: WeakValueDictionary[int, Holder] = WeakValueDictionary()
         self._last = 0
 
     def number(self, point: ObservationPoint) -> int:
@@ -46,6 +54,16 @@ class Senders:
                 del self._numbers[self._points.popitem(last=False)[1]]
         self._points.move_to_end(found)
         return found
+
+    def hold(self, number: int, holder: "Holder") -> None:
+        """Keep the point of this number known while `holder` exists."""
+        self._holders[number] = holder
+
+    def names(self, number: int) -> tuple[str, str]:
+        """Return the host and the caller id of the sender with this number; both are empty if it is not known."""
+        holder = self._holders.get(number)
+        point = self._points.get(number, NOWHERE) if holder is None else holder.point
+        return point.host, point.caller_id
 
     def point(self, number: int) -> ObservationPoint | None:
         return self._points.get(number)

@@ -38,18 +38,19 @@ class TopicPipeline:
 
     def __init__(self, interceptor: Interceptor, point: ObservationPoint) -> None:
         self._interceptor = interceptor
-        self._point = point
+        self.point = point
         self._preparation = _UNPREPARED
         self._until = 0
         self._prepared: tuple[FastLane, BatchOptions, FastPathCounts] | None = None
         self._defect: FastLane | None = None
         self._called: tuple[int, ModuleCall] | None = None
         self._source = interceptor.senders.number(point)
+        interceptor.senders.hold(self._source, self)
 
     def through(self, batch: Batch) -> Batch | None:
         """Pass a batch through the monitors, keep their state, and return the frames to pass on (None: no frames)."""
         judged = self._judged(batch)
-        self._interceptor.keep(self._point[1])
+        self._interceptor.keep(self.point[1])
         return judged
 
     def _judged(self, batch: Batch) -> Batch | None:
@@ -77,14 +78,14 @@ class TopicPipeline:
     def module_call(self) -> ModuleCall | None:
         """Return how the pump passes small frames through the monitors, until something changes; None if it cannot."""
         interceptor, monitors = self._interceptor, self._interceptor.monitors
-        lane = None if monitors is None or interceptor.blocked else monitors.lane(self._point[1])
+        lane = None if monitors is None or interceptor.blocked else monitors.lane(self.point[1])
         if monitors is None or lane is None or not self._usable(monitors, lane, interceptor.now()):
             return None
         options, counts = self._prepare(monitors, lane)
         if not counts.begun:
             interceptor.observer.collect_later(counts)
         if self._called is None or self._called[0] != self._preparation:
-            native, way = lane.native(), self._point[1]
+            native, way = lane.native(), self.point[1]
             place = interceptor.cells_place(way) if native is not None and native.cells else NOT_KEPT
             if native is None or place is None:
                 return None
@@ -103,7 +104,7 @@ class TopicPipeline:
 
     def _failed(self, error: Exception, lane: FastLane, now: int) -> None:
         """Report a defect of the fast path, and leave this topic to the engine from now on."""
-        self._interceptor.observer.defect(error, self._point, now)
+        self._interceptor.observer.defect(error, self.point, now)
         self._defect = lane
         self._preparation = _UNPREPARED
 
@@ -111,7 +112,7 @@ class TopicPipeline:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         if interceptor.blocked or monitors is None:
             return self._block(batch, progress)
-        lane = monitors.lane(self._point[1])
+        lane = monitors.lane(self.point[1])
         while progress.position < progress.end:
             if progress.position and interceptor.over():
                 progress.stop()
@@ -137,7 +138,7 @@ class TopicPipeline:
             alone = walked is not None and walked.paused and walked.position == progress.position
             if alone:
                 walked = lane.process_one(
-                    *given, interceptor.time_budget(self._point).fuel(progress.time, interceptor.budget)
+                    *given, interceptor.time_budget(self.point).fuel(progress.time, interceptor.budget)
                 )
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, lane, progress.time)
@@ -151,14 +152,14 @@ class TopicPipeline:
         self._account(walked, progress, counts)
         if alone:
             if walked.paused:  # the engine would take much longer
-                interceptor.time_budget(self._point).cut(progress.time)
+                interceptor.time_budget(self.point).cut(progress.time)
             return progress.position > begun
         return walked.paused or progress.position == progress.end
 
     def _report(self, walked: BatchResult, progress: BatchProgress) -> None:
         interceptor, monitors = self._interceptor, self._interceptor.monitors
         assert monitors is not None  # noqa: S101  they have put it out
-        head = HEAD if monitors.stamped(self._point[1]) else 0
+        head = HEAD if monitors.stamped(self.point[1]) else 0
         for position, line in walked.output:
             first = position + 4
             size = _unpack_length(progress.view, position)[0]
@@ -166,13 +167,13 @@ class TopicPipeline:
                 progress, position, bytes(progress.view[first : first + min(size, head)])
             )
             said = line.monitor, line.level, line.text
-            interceptor.observer.report_line(*said, point=self._point, time=progress.time, observed=observed)
+            interceptor.observer.report_line(*said, point=self.point, time=progress.time, observed=observed)
 
     def _prepare(self, monitors: MonitorSet, lane: FastLane) -> tuple[BatchOptions, FastPathCounts]:
         """Prepare the options and counts of all batches until something changes."""
         observer, point, number = (
             self._interceptor.observer,
-            self._point,
+            self.point,
             self._interceptor.preparation.number,
         )
         self._until = _NEVER if monitors.next_due is None else monitors.next_due
@@ -197,7 +198,7 @@ class TopicPipeline:
         """Pass up to `count` messages to the engine, or fewer if the quantum is used up."""
         interceptor, point, now, observer = (
             self._interceptor,
-            self._point,
+            self.point,
             progress.time,
             self._interceptor.observer,
         )
@@ -251,7 +252,7 @@ class TopicPipeline:
             body = progress.view[position + 4 : following]
             outcome = dropped(body, progress.time, self._interceptor.blocked)
             self._interceptor.observer.dropped(
-                outcome, self._point, body, ObservedMessage(progress, position, b"")
+                outcome, self.point, body, ObservedMessage(progress, position, b"")
             )
             position = following
         return None

@@ -1,4 +1,4 @@
-"""`age` and `seen`, compared with a naive account of the same messages."""
+"""`age`, `seen`, `host` and `caller`, compared with a naive account of the same messages."""
 
 from math import inf
 from random import Random
@@ -6,11 +6,13 @@ from random import Random
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.fast.abi import MOST_KEPT
 from rosmop.fast.build import require_loadable
 from rosmop.fast.serialization import encoded
 from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import MessageSender
 from rosmop.tests.acting import message
-from rosmop.tests.both_ways import BothWays, plain, state_of
+from rosmop.tests.both_ways import BothWays, plain, stamped, state_of
 from rosmop.tests.examples import examples
 from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import definitions
@@ -75,3 +77,55 @@ def test_equal_texts_with_ages_give_equal_sets() -> None:
     data = {encoded(compiled_from({"x.rv": TEXT}, definitions())) for _ in range(2)}
     [one] = data
     require_loadable(one)
+
+
+SENDERS = """s() { std::string mine; int n = 0;
+    event a(int c) /plain own/Plain '{count:c}' {
+        if (caller(a) == "/evil") { return; } mine = host(a); if (host(a) == "10.0.0.7") { n++; } }
+    event b() /stamped own/Stamped '{}' { ROS_INFO("%s %s", host(a).c_str(), caller(a).c_str()); } }"""
+
+
+@pytest.mark.parametrize("seed", range(examples(60)))
+def test_senders_are_those_of_a_naive_account(seed: int) -> None:
+    """`host` and `caller` are of this message in the action, and of the last message that was not dropped elsewhere."""
+    random = Random(seed)  # noqa: S311  draws examples, not keys
+    long = "/" + "x" * (MOST_KEPT + 1)
+    who = {1: ("10.0.0.7", "/a"), 2: ("10.0.0.8", "/evil"), 3: ("", long), 4: ("fe80::1", "/b")}
+    compiled = compiled_from({"x.rv": SENDERS}, definitions())
+    sets = on_module(compiled), MonitorSet.of(compiled)
+    for one in sets:
+        one.name_senders(lambda source: who[source])
+        one.start(0)
+    last, count = ("", ""), 0
+    for time in range(1, 60):
+        source = random.choice((0, 1, 2, 3, 4, 1))
+        topic, body = random.choice((("/plain", plain(7)), ("/stamped", stamped())))
+        host, caller = who.get(source, ("", ""))
+        for one, process in zip(sets, (sets[0].judge, sets[1].process), strict=True):
+            outcome = process(topic, bytearray(body), time, MessageSender(source))
+            if topic == "/stamped":
+                assert [line.text for line in outcome.log] == [" ".join(last)]
+                continue
+            assert (outcome.result == "dropped") == (caller == "/evil")
+            if caller != "/evil":
+                assert one.value("s", "mine") == host.encode()
+                assert one.value("s", "n") == count + (host == "10.0.0.7")
+        if topic == "/plain" and caller != "/evil":
+            last, count = (host, caller), count + (host == "10.0.0.7")
+
+
+def test_the_sender_is_read_in_the_module() -> None:
+    """A monitor that decides by the sender has no message that each goes to the engine."""
+    monitors = on_module(compiled_from({"x.rv": SENDERS}, definitions()))
+    assert monitors.lane("/plain")
+
+
+def test_a_published_message_has_no_sender() -> None:
+    """The monitor that publishes is not a node with an address."""
+    text = """a() { event e() /plain own/Plain '{}' { std_msgs::String s; PUBLISH(/told, std_msgs/String, s); } }
+        b() { event e() /told std_msgs/String '{}' { ROS_INFO("<%s>", caller(e).c_str()); } }"""
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
+    monitors.name_senders(lambda _: ("10.0.0.7", "/a"))
+    monitors.start(0)
+    [judged] = monitors.process("/plain", bytearray(plain()), 1, MessageSender(1)).judged.values()
+    assert [line.text for line in judged.log] == ["<>"]
