@@ -11,6 +11,7 @@ import datetime
 import os
 import socket
 import ssl
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from ipaddress import ip_network
@@ -41,10 +42,12 @@ _log = structlog.get_logger()
 _WITHOUT_CONTROL_SECONDS = 30.0
 _RENEW_SECONDS = 60.0
 _THREADS = 40
+_SWITCH_SECONDS = 0.0005  # a thread that judges a large text lets the loop run after this time
 
 
 def main(lifeline_fd: int, config: Path) -> None:
     """Serve REST until the supervisor ends it."""
+    sys.setswitchinterval(_SWITCH_SECONDS)
     uvloop.run(_Api(load_resolved(config), lifeline_fd).run())
 
 

@@ -71,6 +71,7 @@ class TokenAuthenticator:
         self._unknown = Buckets(failures_per_minute / 60, failures_per_minute)
         self._wrong = Buckets(failures_per_minute / 60, failures_per_minute)
         self._checking = asyncio.Lock()
+        self._of_token: dict[str, asyncio.Lock] = {}
         self._shown: OrderedDict[str, float] = OrderedDict()  # by peer: the time of its last valid token
 
     def quota_class(self, peer: str) -> QuotaClass:
@@ -87,6 +88,7 @@ class TokenAuthenticator:
         self._stated = True
         self._recognised.clear()
         self._reported.clear()
+        self._of_token = {}
 
     def still_good(self, bearer: Bearer) -> bool:
         """Whether a previously valid token may still be used."""
@@ -124,7 +126,10 @@ class TokenAuthenticator:
         if self._recognised.get(digest) == kept.id:
             return True
         _require_patience(self._wrong, host)
-        async with self._checking:
+        # One request of each token waits for the slow check, so that a token with many requests delays no other.
+        async with self._of_token.setdefault(kept.id, asyncio.Lock()), self._checking:
+            if self._recognised.get(digest) == kept.id:
+                return True
             _require_patience(self._wrong, host)  # others of this host may have failed while it waited
             if not await asyncio.to_thread(is_secret, secret, kept.salt, kept.hash):
                 return False

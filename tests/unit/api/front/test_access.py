@@ -1,5 +1,6 @@
 """Tests of `appliance.api.front.access`."""
 
+import asyncio
 from typing import Any
 
 import pytest
@@ -87,6 +88,32 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
     for _ in range(3):
         assert recognise(door, f"Bearer {text}").name == "a"
     assert len(checks) == 1
+
+
+def test_a_token_with_many_requests_delays_the_check_of_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sixty first requests of a viewer one is checked, and an administrator waits for one check at most."""
+    rows = [make_token(name, "viewer", now=clock.wall(), seconds=60) for name in ("eve", "adam")]
+    door = TokenAuthenticator(10, lambda _token: None)
+    door.state([kept(row) for row, _text in rows])
+    checked: list[bytes] = []
+
+    async def check(_function: object, _secret: str, salt: bytes, _kept: bytes) -> bool:
+        checked.append(salt)
+        await asyncio.sleep(0)  # the other requests come meanwhile
+        return True
+
+    monkeypatch.setattr(asyncio, "to_thread", check)
+    (eve, hers), (adam, his) = rows
+
+    async def all_at_once() -> list[str]:
+        asked = [*[hers] * 60, his]
+        return [
+            one.name
+            for one in await asyncio.gather(*(door.recognise(f"Bearer {text}", "") for text in asked))
+        ]
+
+    assert run(all_at_once()) == [*["eve"] * 60, "adam"]
+    assert checked == [eve.salt, adam.salt]
 
 
 def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
