@@ -290,7 +290,7 @@ WALL_CLOCK = {
         "features/recorder/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "api/routes/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py",
         "base/deadlines.py", "bundles/verified_bundles.py",
         "control/operators/token_orders.py", "features/standby/appliance_table.py",
         "hosts/certification.py", "hosts/enrolment_tokens.py",

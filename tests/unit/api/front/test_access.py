@@ -91,7 +91,7 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
 
 
 def test_a_token_with_many_requests_delays_the_check_of_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of sixty first requests of a viewer one is checked, and an administrator waits for one check at most."""
+    """Sixty first requests of a viewer cost one check, and an administrator waits for one check at most."""
     rows = [make_token(name, "viewer", now=clock.wall(), seconds=60) for name in ("eve", "adam")]
     door = TokenAuthenticator(10, lambda _token: None)
     door.state([kept(row) for row, _text in rows])
@@ -99,7 +99,7 @@ def test_a_token_with_many_requests_delays_the_check_of_no_other(monkeypatch: py
 
     async def check(_function: object, _secret: str, salt: bytes, _kept: bytes) -> bool:
         checked.append(salt)
-        await asyncio.sleep(0)  # the other requests come meanwhile
+        await asyncio.sleep(0)  # lets the other requests come
         return True
 
     monkeypatch.setattr(asyncio, "to_thread", check)
