@@ -266,7 +266,7 @@ end:
     :: atomic { EVENT(passive, me, 0) && shown[me] -> LOGGED; shown[me] = 0 }
     :: atomic { EVENT(activated, me, term[me]) && ANSWERS(me) && shown[me] != term[me] -> LOGGED; shown[me] = term[me] }
 #endif
-    /* It has heard neither for 0.8 of an expiry, or hands over in a switchover. */
+    /* It has heard neither for 0.8 of an expiry, or hands over: as ordered, or if only the other reaches the robot. */
     :: atomic {
         up[me] && leads[me] && (synced[me] || !IN_TIME(me)) && !SHOWN(me) ->
 #ifdef MUTANT_HANDS_OVER_ACTIVE

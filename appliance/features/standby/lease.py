@@ -15,7 +15,9 @@ This module reads no clock and no socket. Its owner passes the time with each me
    is none. A passive appliance believes it until the witness answers, unless the epoch is beyond `FARTHEST`.
 6. The active appliance answers without the standby only after the witness has removed the standby from the in-sync set.
    It waits for the standby again before it asks the witness to add it.
-7. The active appliance gives its lease up only if the other one could claim it at once: that one has all data and could
+7. The active appliance also gives up if the witness answers only the other one for an expiry: the robot needs that one,
+   whose promise would otherwise keep it from a claim for another expiry.
+8. The active appliance gives its lease up only if the other one could claim it at once: that one has all data and could
    serve, the witness answers it, and can save the grant. Each promise has what the other one knows of this.
 """
 
@@ -213,8 +215,12 @@ class ApplianceLease:
             return (self._to_witness("look", now),)
         if self._switching_until is not None:
             if now < self._switching_until:
-                return (self._take_over() if self._released else self._to_witness("release", now),)
+                expired = self._released or now - self._witnessed_at > EXPIRY
+                return (self._take_over() if expired else self._to_witness("release", now),)
             self._switching_until = None  # the other appliance did not claim
+        if self._is_cut_off(now):
+            self._give_up(now, released=True)  # the lease has expired at the witness
+            return (self._take_over(),)
         due: list[WitnessRequest | PeerMessage] = [self._to_witness("renew", now)]
         if self.is_active(now):
             due.append(self._ask(now))
@@ -306,11 +312,26 @@ class ApplianceLease:
         obstacle = self.handover_obstacle(now)
         if obstacle:
             raise LeaseError(obstacle)
-        self._valid_until = now
-        self._void_sequence, self._void_number = self._sequence, self._number
-        self._switching_until, self._released = now + 2 * EXPIRY, False
+        self._give_up(now, released=False)
         self._next_round = now
         return self.tick(now, waiting_since=None, caught_up=False)
+
+    def _give_up(self, now: float, *, released: bool) -> None:
+        """Become passive until the other appliance has claimed; `released`: the witness need not be asked first."""
+        self._valid_until = now
+        self._void_sequence, self._void_number = self._sequence, self._number
+        self._switching_until, self._released = now + 2 * EXPIRY, released
+
+    def _is_cut_off(self, now: float) -> bool:
+        """Whether only the other appliance reaches the robot. A witness that has ended answers neither."""
+        other = self._other_witnessed
+        return (
+            self.is_active(now)
+            and now - self._witnessed_at > EXPIRY
+            and other is not None
+            and other - self._witnessed_at > SILENCE
+            and not self.handover_obstacle(now)
+        )
 
     def _learn(self, epoch: int) -> None:
         if epoch > self.epoch:

@@ -106,14 +106,30 @@ def test_a_renewal_counts_from_the_time_when_it_was_sent() -> None:
 
 
 def test_a_promise_alone_keeps_it_active() -> None:
-    """R3: a dead witness changes nothing."""
+    """R3: a dead witness, which answers the other appliance no more than this one, changes nothing."""
     lease = active_lease()
-    for _ in range(20):
+    for number in range(20):
         asked = asked_by(lease.later(0.3))
-        lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+        promise = ClaimPromise(asked.epoch, asked.session, asked.number, unheard=0.3 * number)
+        lease.lease.received(lease.now, promise)
         assert lease.active()
     lease.lease.received(lease.later(0.5).now, ClaimPromise(asked.epoch, "other", asked.number))
     assert not lease.later(CONFIDENCE - 0.49).active()
+
+
+def test_a_holder_that_only_the_standby_could_replace_gives_up() -> None:
+    """The witness answers the standby alone: its promise ends at once, and not an expiry later."""
+    lease, due = active_lease(), list[object]()
+    while lease.active():
+        due = list(lease.later(0.3).tick())
+        for asked in due:
+            if isinstance(asked, PromiseRequest):
+                lease.lease.received(lease.now, ClaimPromise(asked.epoch, asked.session, asked.number))
+    (order,) = due
+    assert isinstance(order, TakeOver)
+    assert EXPIRY < lease.now - 50.0 - EXPIRY < 1.5 * EXPIRY
+    assert not lease.lease.may_be_renewed(lease.now)
+    assert isinstance(lease.later(0.3).tick()[0], TakeOver)  # the first may be lost
 
 
 def test_a_promise_makes_no_passive_appliance_active() -> None:
@@ -312,6 +328,14 @@ def test_a_switchover_ends_the_promises_to_the_old_holder() -> None:
     assert standby.later(0.1).operations() == ["look"]
     (claim,) = standby.lease.received(standby.now, order)
     assert isinstance(claim, WitnessRequest) and claim.operation == "claim"
+
+
+def test_a_smaller_epoch_of_the_witness_is_never_taken() -> None:
+    """Its disk was restored: however often it answers, the appliance claims nothing with such an epoch."""
+    lease = Lease(epoch=8).later(EXPIRY)
+    for _ in range(3):
+        lease.answered(lease.later(0.3).request("claim"), ok=False, holder="", epoch=6)
+    assert lease.lease.epoch == 8
 
 
 def test_a_late_order_does_not_end_a_later_promise() -> None:

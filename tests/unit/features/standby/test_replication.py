@@ -722,7 +722,7 @@ async def test_an_introduction_cannot_write_into_hosts_files(bad: dict[str, str 
 
 
 async def test_an_order_to_hand_over_is_refused_with_the_reason_or_ends_the_link(tmp_path: Path) -> None:
-    """The operator of the standby does not wait for a takeover that never comes, also after a cut of the link."""
+    """The operator of the standby need not wait for a takeover that does not come, also after the link was cut."""
     (tmp_path / "active").mkdir()
     (tmp_path / "standby").mkdir()
     store = StateStore(tmp_path / "active", failed=pytest.fail, kind=InlineDatabase)
