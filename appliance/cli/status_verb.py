@@ -30,7 +30,7 @@ from appliance.channel.status_summary import process_names
 from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
-from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
+from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import standby_troubles
 from appliance.features.standby.standby_view import answer_in_words, lag_in_words, standby_view
@@ -49,9 +49,7 @@ _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 def status(
     appliance: Appliance,
     *,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
-    ] = False,
+    watch: Watch = False,
     every: Annotated[
         float | None,
         typer.Option(

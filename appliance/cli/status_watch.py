@@ -6,8 +6,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import typer
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
@@ -18,6 +19,9 @@ from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningE
 from appliance.cli.output import say_json
 from rosmop.tool.terminal import printable
 
+Watch = Annotated[
+    bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
+]
 LEAST_SECONDS, LONGEST_SECONDS = 1.0, 3600.0
 _INTERRUPTED, _AWAY = 130, 2
 _MOST_DENIED = 3  # answers in a row: a restarted api knows no token for a moment

@@ -8,11 +8,15 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector as MetricSource
 
+from appliance.base import clock
 from rosrv_fleet.access import holder_of
 from rosrv_fleet.collector import Collector
 from rosrv_fleet.health import FleetHealth, health_of
-from rosrv_fleet.rollouts.metrics import RolloutMetrics
+from rosrv_fleet.rollouts.operator_routes import group_state
+from rosrv_fleet.rollouts.service import BundleService
 from rosrv_fleet.tokens import FleetRole
+
+_ROLLOUT_STATES = ("running", "stopped", "reverted", "done")
 
 
 def health_router(collector: Collector) -> APIRouter:
@@ -36,7 +40,7 @@ def health_router(collector: Collector) -> APIRouter:
         registry = CollectorRegistry()
         registry.register(_Source(health_of(collector)))
         if collector.bundles is not None:
-            registry.register(RolloutMetrics(collector.bundles))
+            registry.register(_RolloutMetrics(collector.bundles))
         return Response(generate_latest(registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     return router
@@ -83,3 +87,38 @@ class _Source(MetricSource):
         yield GaugeMetricFamily(
             "rosrv_fleet_disk_up", "1 while there is room for segments", health.disk is None
         )
+
+
+class _RolloutMetrics(MetricSource):
+    """The metrics of bundles and rollouts in one scrape: few labels, so that robots cannot fill Prometheus."""
+
+    def __init__(self, service: BundleService) -> None:
+        self._service = service
+
+    def collect(self) -> Iterator[Metric]:
+        service = self._service
+        robots = GaugeMetricFamily(
+            "rosrv_fleet_robots", "robots of a group by condition", labels=["site", "group", "condition"]
+        )
+        state = GaugeMetricFamily(
+            "rosrv_fleet_rollout",
+            "1 for the state of a group's last rollout",
+            labels=["site", "group", "state"],
+        )
+        for group in sorted({*service.rollouts, *service.robots}):
+            found = group_state(service, group)
+            for kind, count in found["conditions"].items():
+                robots.add_metric([*group, kind], count)
+            if found["rollout"] is not None:
+                for one in _ROLLOUT_STATES:
+                    state.add_metric([*group, one], found["rollout"]["state"] == one)
+        yield from (robots, state)
+        yield GaugeMetricFamily(
+            "rosrv_fleet_rollouts_up", "1 while bundles are published and rollouts advance",
+            service.advancing and not service.trouble,
+        )  # fmt: skip
+        if service.publication is not None:
+            left = service.publication.expires.timestamp() - clock.wall()
+            yield GaugeMetricFamily(
+                "rosrv_fleet_metadata_expiry_seconds", "until the signed metadata expire", left
+            )

@@ -16,14 +16,18 @@ from typing import Annotated, TextIO, TypeVar
 import msgspec
 import typer
 
-from appliance.audit.log.record_format import LogEntry, as_json, as_object
+from appliance.api.front.unrecorded import unrecorded
+from appliance.api.routes.named_hosts import has_name, with_networks
+from appliance.audit.log.record_format import LogEntry, as_json, as_object, printable
 from appliance.audit.log.signatures import read_public_key
 from appliance.audit.proof.chain_findings import Verification
 from appliance.audit.proof.copies import read_copies
 from appliance.audit.search.filter_options import FILTER
+from appliance.audit.search.query import Filter, FilterError
 from appliance.audit.search.search import LARGEST_PAGE
+from appliance.channel.admin import PolicyWanted
+from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.cli.audit.audit_errors import Errors, fail, note
-from appliance.cli.audit.filter import filter_of
 from appliance.cli.audit.record_argument import RecordArgument
 from appliance.cli.audit.record_table import (
     line,
@@ -32,6 +36,7 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
+from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.audit_file import FileLog
 from appliance.cli.connection.audit_over_rest import RestLog
 from appliance.cli.connection.target import Appliance, speaks_with
@@ -75,7 +80,7 @@ def search(
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
-    page = appliance.audit().search(filter_of(appliance), cursor, limit, newest_first=not oldest_first)
+    page = appliance.audit().search(_filter_of(appliance), cursor, limit, newest_first=not oldest_first)
     if appliance.as_json:
         _print_lines(page.entries, appliance)
     else:
@@ -98,7 +103,7 @@ def tail(
 
     Example: rosrv audit tail --deny
     """
-    for entries in appliance.audit().follow(filter_of(appliance), lines, on=follow):
+    for entries in appliance.audit().follow(_filter_of(appliance), lines, on=follow):
         _print_lines(entries, appliance)
 
 
@@ -257,7 +262,7 @@ def export(
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
-    wanted = filter_of(appliance)
+    wanted = _filter_of(appliance)
     source = appliance.audit()
     entries = source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as report:
@@ -268,6 +273,29 @@ def export(
                 count = _write_all(entries, report, file)
     if output is not None:
         note(f"{count} records in {output}")
+
+
+def _filter_of(appliance: Appliance) -> Filter:
+    """Return the filter that the options choose, with the networks of a host's name. Raises `FilterError`."""
+    wanted = FILTER.value(appliance.params)
+    for warning in unrecorded(wanted):
+        note(printable(warning))
+    if has_name(wanted) and appliance.place is None:  # over REST, the appliance looks the name up
+        return with_networks(wanted, _known(appliance, wanted))
+    return wanted
+
+
+def _known(appliance: Appliance, wanted: Filter) -> PolicyKnown:
+    """Return the policy in force, which has the names of hosts. Raises `FilterError` if no appliance answers."""
+    try:
+        answer = appliance.ask(PolicyWanted())
+    except NotRunningError:
+        raise FilterError(
+            f"--host {wanted.host}: only the running appliance knows the names of hosts; give an address or a glob"
+        ) from None
+    if not answer.ok:
+        raise FilterError(f"--host {wanted.host}: {answer.error}")
+    return answer.given()
 
 
 def _print_lines(entries: list[LogEntry], appliance: Appliance) -> None:

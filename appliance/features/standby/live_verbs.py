@@ -12,7 +12,7 @@ from appliance.channel.admin import StandbyPromote, StandbyWanted
 from appliance.cli.connection.admin_client import AccessDeniedError, NotRunningError
 from appliance.cli.connection.target import Appliance, speaks, speaks_with
 from appliance.cli.output import say_json, usage_error
-from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, watched
+from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
 from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_view import standby_view
 from rosmop.tool.terminal import printable, say
@@ -28,9 +28,7 @@ _SHOW_SECONDS = 2.0
 def status(
     appliance: Appliance,
     *,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Show it again and again, until Ctrl-C; in place on a terminal")
-    ] = False,
+    watch: Watch = False,
     every: Annotated[
         float | None,
         typer.Option(
