@@ -67,9 +67,15 @@ async def test_a_node_without_a_proxy_endpoint_is_not_registered() -> None:
     assert world.registry.all() == []
 
 
-@pytest.mark.parametrize("count", [2, 4, 8])
-async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) -> None:
+@pytest.mark.parametrize("count", [2, 8])
+@pytest.mark.parametrize(
+    ("limit", "reason"), [(500, "all ports are in use"), (_NODES, "has 4 nodes, the limit for one host")]
+)
+async def test_simultaneous_arrivals_do_not_take_each_others_room(
+    monkeypatch: pytest.MonkeyPatch, count: int, limit: int, reason: str
+) -> None:
     world = await world_with(SlowFaces())
+    monkeypatch.setattr(world.registry, "_most_of_host", limit)
 
     async def come(number: int) -> Any:
         uri = f"http://10.0.0.5:{4000 + number}/"
@@ -80,7 +86,7 @@ async def test_simultaneous_arrivals_do_not_take_each_others_room(count: int) ->
     async with asyncio.timeout(10):
         answers = await asyncio.gather(*(come(number) for number in range(10, 10 + count)))
     assert [answer[0] for answer in answers] == [1] + [0] * (count - 1)
-    assert "all ports are in use" in answers[1][1]
+    assert reason in answers[1][1]
     assert [node.name for node in world.registry.all()] == ["/n0", "/n1", "/n2", "/n10"]
     assert not any(node.calls for node in world.registry.all())
 
