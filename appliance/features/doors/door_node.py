@@ -34,7 +34,14 @@ from appliance.features.doors.requests import (
 )
 from appliance.features.doors.values import MessageCodec
 from roswire.errors import DefinitionError, LimitExceededError, PeerError, ProtocolError, RosError
-from roswire.node import MessageType, NodePublication, RosNode, ServiceFailedError, ServiceType
+from roswire.node import (
+    MasterDenialError,
+    MessageType,
+    NodePublication,
+    RosNode,
+    ServiceFailedError,
+    ServiceType,
+)
 from roswire.node.network import OwnedTasks
 from roswire.node.tcpros_streams import ANY
 
@@ -172,10 +179,15 @@ class DoorNode:
             known.clients.add(client)
 
     async def _type_of(self, topic: str) -> str:
-        types = await self.node.master("getTopicTypes")
+        try:
+            types = await self.node.master("getTopicTypes")
+        except MasterDenialError as denial:
+            raise ProtocolError(
+                f"advertise {topic} with its type; the door cannot look it up: {denial}"
+            ) from None
         for row in types if isinstance(types, list) else []:
             match row:
-                case [str(name), str(kind)] if name == topic and kind != "*":
+                case [str(name), str(kind)] if name == topic and kind != ANY:
                     return kind
         raise ProtocolError(f"the type of {topic} is not known; advertise it with its type first")
 
@@ -303,7 +315,7 @@ class DoorNode:
         if offer is None or future is None or future.done():
             raise ProtocolError(f"no call of {request.service} waits for this answer")
         try:
-            # As in rosbridge, values that fit are the answer even if `result` is false: clients return that for success.
+            # As in rosbridge, values that fit are the answer, whatever `result` is: some clients send false.
             future.set_result(offer.response.writer.from_json(request.values, present_time()))
         except PeerError as error:
             reason = str(error) if request.ok else bytes(request.values)[:1000].decode("utf-8", "replace")
