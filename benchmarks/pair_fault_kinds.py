@@ -22,14 +22,14 @@ _ROLES = ("control", "relay", "rosmaster", "signer", "lease", "api", "recorder",
 _STANDBY_ROLES = ("control", "lease", "signer", "relay", "supervisor")
 _PROMOTE_SECONDS = 30.0
 Said = list[str]
-"""What orders of operators were answered during a fault."""
+"""The answers to orders of operators during a fault."""
 
 
 @dataclass(frozen=True)
 class Fault:
     """A fault of a site with `active` and `passive`, which `make(site, active, passive, said)` holds for its block.
 
-    It lasts `least` to `most` seconds. `cut_off`: meanwhile no appliance could serve, so times count from its end.
+    It lasts `least` to `most` seconds. `cut_off`: no appliance could serve during it, so times count from its end.
     `goes_on`: the active appliance goes on without the standby, so a call waits once for up to 0.8 s.
     `interrupts`: the network loses packets, and TCP repeats them at intervals that grow with the interruption.
     """

@@ -6,7 +6,7 @@ The list of faults follows from the seed alone (`benchmarks.pair_fault_kinds`). 
 to the file, and a further run with the same file continues after the last one.
 
 Columns: the longest time in seconds without an answer of the Master API, a message, and an answer of a service (from
-the end of the fault if no appliance could serve meanwhile); subscriptions that were not back 20 s after the fault; the
+the end of the fault if no appliance could serve before); subscriptions that were not back 20 s after the fault; the
 holder of the lease before and after; how `standby status` judged the pair on either appliance near the end of the
 fault, and the seconds of the answer. An outsider, which the robot does not fence, asks both appliances all the time:
 `two` counts the changes of the answering appliance that no grant of the witness explains.
@@ -74,7 +74,7 @@ class Noticed:
 
 
 class Statuses:
-    """What both appliances answer about the pair; a thread asks each."""
+    """The answers of both appliances about the pair; a thread asks each."""
 
     def __init__(self, site: StandbySite) -> None:
         self.said: dict[str, str] = {}

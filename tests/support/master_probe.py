@@ -2,7 +2,7 @@
 
     master_probe.py NAME=URI...
 
-Each is asked 20 times a second; event `answered` with its name for each answer. Refused and late calls are no event.
+Each is asked 20 times a second; event `answered` with its name for each answer. Refused and late calls are left out.
 """
 
 import http.client

@@ -141,8 +141,8 @@ def test_a_cut_between_the_appliances(site: StandbySite, robot: StandbyRobot) ->
 def test_a_lapse_of_the_lease(site: StandbySite, robot: StandbyRobot) -> None:
     """Nothing serves until the lease is renewed; then all goes on in the same epoch, with the same processes.
 
-    Without the standby no other appliance can claim, however long the process of the lease is paused. Meanwhile
-    operators learn the reason within seconds, over the socket, REST and the health check of a container.
+    Without the standby no other appliance can claim, however long the process of the lease is paused. During
+    the pause, operators learn the reason within seconds, over the socket, REST and the health check of a container.
     """
     active, passive = site.pair()
     rest = rest_of(site.appliances[active], site.appliances["a"].token)
