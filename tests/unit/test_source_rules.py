@@ -284,7 +284,8 @@ WALL_CLOCK = {
         "features/doors/door_node.py", "features/syslog/log_forwarder.py",
         "forwarding/segment_pusher.py",
         "hosts/checked_ports.py", "hosts/host_table.py", "features/standby/shared_authority.py",
-        "features/recorder/recorder.py", "features/recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
+        "features/recorder/recorder.py", "features/recorder/ring.py", "relay/topic_taps.py",
+        "relay/monitors/interceptor.py",
         "features/recorder/recorder_ring.py",
         "specifications/specification_manager.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "features/recorder/rings.py", "supervisor/supervisor.py",
@@ -307,7 +308,8 @@ WALL_CLOCK = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/front/moments.py", "audit/search/filter_options.py", "cli/evidence_verbs.py",
-        "cli/monitor/offline.py", "features/recorder/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py",
+        "cli/monitor/offline.py", "features/recorder/recorder_input.py", "cli/policy/learn_verb.py",
+        "cli/protect_verb.py",
         "features/recorder/record_verbs.py", "cli/status_verb.py", "cli/topic_verbs.py",
     ],
 }  # fmt: skip

@@ -4,6 +4,7 @@ import time
 from pathlib import Path
 
 from appliance.evidence.bundle import RecordingSelection, export
+from appliance.evidence.page import Names
 from tests.system.fleet.fleet_site import FleetRobot
 from tests.unit.evidence.conftest import Control
 
@@ -18,5 +19,5 @@ def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:
     if not bag:
         return control.exported(place)
     recording: RecordingSelection = control.record(robot.folder, bag)
-    place.write_bytes(b"".join(export(robot.log_file, recording, control.ask)))
+    place.write_bytes(b"".join(export(robot.log_file, recording, control.ask, Names("", str))))
     return place

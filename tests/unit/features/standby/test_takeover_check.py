@@ -1,4 +1,4 @@
-"""Tests of `appliance.features.standby.takeover_check`: obstacles to a takeover are found before it, and their ends noticed."""
+"""Obstacles to a takeover are found before it, and their ends noticed."""
 
 import asyncio
 import contextlib
