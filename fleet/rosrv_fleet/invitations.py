@@ -83,7 +83,7 @@ class Invitations:
         for file in self._folder.glob("*.json"):
             pending = _read(file)
             its = pending is not None and pending.name == name and appliance in (None, pending.appliance)
-            if pending is None or its or pending.expires <= clock.wall():
+            if its or (file.is_file() if pending is None else pending.expires <= clock.wall()):
                 file.unlink()
 
     @contextmanager
@@ -96,7 +96,10 @@ class Invitations:
         digest = hashlib.sha256(request).hexdigest()
         with changing(self._folder):
             pending = _read(self._file(token)) if _TOKEN.fullmatch(token) else None
-            if pending is None or pending.expires <= clock.wall() or pending.request not in ("", digest):
+            if pending is not None and pending.expires <= clock.wall():
+                self._file(token).unlink()  # a clock that is set back later does not make it valid again
+                raise InvalidInvitationError
+            if pending is None or pending.request not in ("", digest):
                 raise InvalidInvitationError
             if pending.request:
                 yield pending
@@ -116,7 +119,8 @@ class Invitations:
 
 
 def _read(file: Path) -> PendingRobot | None:
+    """Return an invitation; None if the file is missing, damaged or unreadable, which affects no other invitation."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=PendingRobot)
-    except (FileNotFoundError, ValueError):
+    except (OSError, ValueError):
         return None

@@ -114,6 +114,21 @@ def test_a_changed_robot_has_no_invitation(act: str, used: bool, data: Path, tmp
     ]  # fmt: skip
 
 
+def test_an_invitation_that_ended_stays_ended(tmp_path: Path) -> None:
+    """A clock that is set back does not make it valid again; a folder among the files affects no other."""
+    invitations, machine = Invitations(tmp_path / "invitations"), VirtualClock()
+    with using(machine):
+        _pending, token = invitations.add("arm7", "", 60.0)
+        (tmp_path / "invitations" / "strange.json").mkdir()
+        for seconds in (61, -3600):
+            machine.set_wall(machine.wall_ns() / 1e9 + seconds)
+            with pytest.raises(InvalidInvitationError), invitations.using(token, b"request"):
+                pass
+        _pending, token = invitations.add("arm7", "", 60.0)
+        with invitations.using(token, b"request") as used:
+            assert used.name == "arm7"
+
+
 @pytest.mark.parametrize("error", [OSError("the disk is full"), SystemExit()], ids=["failure", "end"])
 def test_an_interrupted_request_can_only_be_repeated(error: BaseException, tmp_path: Path) -> None:
     """If the collector fails while it enrols the robot, the same request is valid again, and no other is."""
