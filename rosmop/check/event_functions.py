@@ -283,8 +283,8 @@ def _assemble(
 
     Return the number of statements before the action, and whether facts about the event are kept.
     """
+    read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)
-    read_fields(scope, bound)
     written = [field for field in bound if field.variable is not None and field.variable.assigned]
     check_overlaps(bound, written)
     fields = writes(scope, written)
