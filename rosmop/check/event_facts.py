@@ -111,7 +111,7 @@ def _event(scope: FunctionScope, node: tree.CallExpression, function: str) -> st
 def _asked(specification: tree.Specification) -> Iterator[tuple[str, str]]:
     """Yield the facts that must be kept, with their events. In the action of its event, a sender need not be kept."""
     own = {function.name for function in specification.functions}
-    for within in (getattr(specification, field) for field in specification.__dataclass_fields__):
+    for within in tree.fields_of(specification):
         for part in within if isinstance(within, tuple) else ():
             for node in tree.walk(part):
                 match node:

@@ -45,7 +45,7 @@ def compile_event(
     scope.message_type, scope.event = kind, event.name
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    happens, is_noted = _assemble(scope, event, bound, *_body(scope, event, trigger))
+    happens, is_noted = _assemble(scope, event, bound, _body(scope, event, trigger))
     whole = scope.function(function, ("m",), happens=happens)
     shared.define(whole)
     service = trigger.type if trigger.part is not None else None
@@ -254,8 +254,8 @@ def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | flo
 
 def _body(
     scope: FunctionScope, event: tree.EventDefinition, trigger: tree.MessageTrigger
-) -> tuple[list[nodes.Statement], list[nodes.Statement]]:
-    """Compile the `when` and the action. This comes first because they determine which fields are needed."""
+) -> tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]]:
+    """Compile the `when`, the action and what follows it: first, because they determine which fields are needed."""
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
@@ -269,20 +269,23 @@ def _body(
                 raise SpecificationError.at(when.position, "`when` only tests; assign in the action")
     with scope.nested() as action:
         write(scope, event.action)
-    return conditions, action
+    with scope.nested() as after:
+        for statement in event.after:
+            write(scope, statement)
+    return conditions, action, after
 
 
 def _assemble(
     scope: FunctionScope,
     event: tree.EventDefinition,
     bound: list[PatternField],
-    conditions: list[nodes.Statement],
-    action: list[nodes.Statement],
+    body: tuple[list[nodes.Statement], list[nodes.Statement], list[nodes.Statement]],
 ) -> tuple[int, bool]:
     """Write all statements of the function.
 
     Return the number of statements before the action, and whether facts about the event are kept.
     """
+    conditions, action, after = body
     read_fields(scope, bound)  # at a site without parameters, because they have no values yet
     site = scope.lines.site = scope.site(event)
     written = [field for field in bound if field.variable is not None and field.variable.assigned]
@@ -296,6 +299,7 @@ def _assemble(
     before = len(scope.lines.found)
     scope.lines.found += action
     scope.add(nodes.WriteBack(site, fields, scope.temporary("w")))
-    is_noted = note_facts(scope, event.name)
+    is_noted = note_facts(scope, event.name) or bool(after)
+    scope.lines.found += after
     scope.add(nodes.Leave(site, True))
     return before, is_noted

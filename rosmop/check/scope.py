@@ -266,7 +266,7 @@ class FunctionScope:
         if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())
         known = [local for block in self._blocks for local in block]
-        known += [*filter(str.isidentifier, self.names.variables), *self.names.functions]
+        known += filter(str.isidentifier, [*self.names.variables, *self.names.functions])
         advice = instead(name.split("::"))
         hint = f"; {advice}" if advice else nearest(name, known)
         return SpecificationError.at(position, f"unknown {what} {shown(name)}{hint}")

@@ -29,6 +29,7 @@ from rosmop.check.givens import (
     with_given,
     with_topics,
 )
+from rosmop.check.pattern_references import with_references, without_references
 from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
 from rosmop.check.safe_messages import declare_safes
@@ -101,7 +102,7 @@ def _compile_all(
     topics: Topics,
 ) -> list[SpecificationCode]:
     given = [topics.get(specification.name, {}) for _, specification in originals]
-    pairs = [(file, with_topics(one, own)) for (file, one), own in zip(originals, given, strict=True)]
+    pairs = [(file, _rewritten(shared, with_topics(one, own))) for (file, one), own in zip(originals, given, strict=True)]
     names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
     compiled = []
@@ -119,6 +120,12 @@ def _compile_all(
     shared.findings += rival_changes([specification for _, specification in pairs])
     shared.findings += _same_names(shared.specifications)
     return compiled
+
+
+def _rewritten(shared: CompilationContext, specification: tree.Specification) -> tree.Specification:
+    """Return the specification without references in patterns; if one is not valid, without these patterns."""
+    rewritten = _noted(shared, partial(with_references, specification))
+    return without_references(specification) if rewritten is None else rewritten
 
 
 def _declare(shared: CompilationContext, specification: tree.Specification) -> SpecificationNames:

@@ -16,6 +16,9 @@ _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
 _AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
 """The `@` of an operator of `ptcaret`, which does not begin a handler."""
 
+_CONDITION = r"\{[^{}@]*@[A-Za-z_]\w*\.[^{}]*\}"
+"""A condition of a pattern that refers to an earlier message, such as `{x < @A.x}`."""
+
 _GRAMMAR = r"""
 file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
@@ -208,7 +211,7 @@ MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<
     | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,{]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
 QUOTE: /['\u2018\u2019\u00b4`]/
-FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|<AT>|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
+FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|<AT>|<CONDITION>|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
 AT: "@"
 NUMBER: /(0[xX][0-9A-Fa-f]+|(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)[uUlLfF]*/
 STRING: /"(\\.|[^"\\\n])*"|“(\\.|[^”\\\n])*”/
@@ -235,5 +238,9 @@ _NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+
 """The end of a formula without handlers: another property, or an event."""
 
 GRAMMAR = (
-    _GRAMMAR.replace("<NEXT>", _NEXT).replace("<AT>", _AT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)
+    _GRAMMAR.replace("<CONDITION>", _CONDITION)
+    .replace("<NEXT>", _NEXT)
+    .replace("<AT>", _AT)
+    .replace("<GAP>", _GAP)
+    .replace("<WORD>", _WORD)
 )

@@ -396,13 +396,14 @@ class TimerTrigger(SyntaxNode):
 
 @dataclass(frozen=True)
 class EventDefinition(SyntaxNode):
-    """An event and its action."""
+    """An event and its action. `after` is what follows an action that does not drop the message."""
 
     modifiers: tuple[Name, ...]
     name: str
     parameters: tuple[ParameterDeclaration, ...]
     trigger: MessageTrigger | TimerTrigger
     action: Block
+    after: tuple[Statement, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ NOWHERE = ObservationPoint("", "")
 """The point of timed events, which concern no message."""
 
 
-class Holder(Protocol):
+class PointHolder(Protocol):
     """An object that exists as long as its point is in use."""
 
     point: ObservationPoint
@@ -41,7 +41,7 @@ class Senders:
     def __init__(self) -> None:
         self._points: OrderedDict[int, ObservationPoint] = OrderedDict()
         self._numbers: dict[ObservationPoint, int] = {}
-        self._holders: WeakValueDictionary[int, Holder] = WeakValueDictionary()
+        self._holders: WeakValueDictionary[int, PointHolder] = WeakValueDictionary()
         self._last = 0
 
     def number(self, point: ObservationPoint) -> int:
@@ -55,7 +55,7 @@ class Senders:
         self._points.move_to_end(found)
         return found
 
-    def hold(self, number: int, holder: "Holder") -> None:
+    def hold(self, number: int, holder: PointHolder) -> None:
         """Keep the point of this number known while `holder` exists."""
         self._holders[number] = holder
 
