@@ -53,7 +53,9 @@ def note_facts(scope: FunctionScope, event: str) -> bool:
     found = _variables(scope.names, event)
     for variable in found:
         scope.written.add(variable.code)
-        value = _NOW if variable.type == value_types.LONG else nodes.Sender(variable.name.partition("(")[0])
+        value = (
+            _NOW if variable.type == value_types.LONG else nodes.SenderName(variable.name.partition("(")[0])
+        )
         scope.evaluate(nodes.Assign(variable.type, variable.code, value))
     return bool(found)
 
@@ -82,7 +84,7 @@ def fact(scope: FunctionScope, node: tree.CallExpression, function: str) -> Valu
 
 def _sender(scope: FunctionScope, node: tree.CallExpression, function: str, event: str) -> Value:
     if event == scope.event:
-        return Value(nodes.Sender(function), node.position)
+        return Value(nodes.SenderName(function), node.position)
     if scope.role == "function":
         text = f"a function may run before the action of `{event}` ends; give it `{function}({event})` as a parameter"
         raise SpecificationError.at(node.position, text)

@@ -874,7 +874,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_FunctionCodegen, Any], byt
             nodes.Log: _FunctionCodegen._log,
             nodes.Throttle: _FunctionCodegen._throttle,
             nodes.Now: _FunctionCodegen._now,
-            nodes.Sender: nodes.Left("compares the sender of a message with a number"),
+            nodes.SenderName: nodes.Left("compares the sender of a message with a number"),
             nodes.Whole: nodes.Left("uses MESSAGE"),
         }
     )

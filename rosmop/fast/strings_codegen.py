@@ -87,7 +87,7 @@ class StringCodegen(MessageAccess):
 
     def _address_of_span(self, node: nodes.Expression) -> int | None:
         """Return where address and length are stored: of a variable of the set, or of the sender of the message."""
-        if isinstance(node, nodes.Sender):
+        if isinstance(node, nodes.SenderName):
             return self._layout.sender(self._context) + 8 * (node.part == "caller")
         if isinstance(node, nodes.Read) and node.name in self._layout.shared and kept_size(node.type):
             return self._layout.variable(node.name, node.type)

@@ -305,7 +305,7 @@ class Now(FormNode, frozen=True):
     type: Type = value_types.TIME
 
 
-class Sender(FormNode, frozen=True):
+class SenderName(FormNode, frozen=True):
     """The `host` or the `caller` of the message: the address of its sender's host, or the name of its node."""
 
     part: str
@@ -323,7 +323,7 @@ class Whole(FormNode, frozen=True):
 Expression = (
     Literal | Read | Assign | Convert | Arithmetic | Unary | Moment | MomentOf | Compare | CompareTexts | Logical | Not
     | Conditional | Sequence | Discard | Item | Vector | Zero | Copy | Recast | OfType | Call | Accumulate | Invoke
-    | Format | Join | Log | Throttle | Now | Sender | Whole
+    | Format | Join | Log | Throttle | Now | SenderName | Whole
 )  # fmt: skip
 
 

@@ -864,7 +864,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[FormTerms, Any, State], Any
             nodes.Log: FormTerms._log,
             nodes.Throttle: FormTerms._throttle,
             nodes.Now: FormTerms._now,
-            nodes.Sender: nodes.Left("the sender of the message"),
+            nodes.SenderName: nodes.Left("the sender of the message"),
             nodes.Whole: nodes.Left("MESSAGE"),
         }
     )

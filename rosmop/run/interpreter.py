@@ -848,7 +848,7 @@ class _Maker:
         turn = self._interpreter.turn
         return lambda _: turn.now
 
-    def _sender(self, node: nodes.Sender) -> _Value:
+    def _sender(self, node: nodes.SenderName) -> _Value:
         turn, place = self._interpreter.turn, ("host", "caller").index(node.part)
         return lambda _: turn.names(turn.source)[place]
 
@@ -946,7 +946,7 @@ EXPRESSIONS: Mapping[type[nodes.FormNode], Callable[[_Maker, Any], _Value]] = Ma
         nodes.Log: _Maker._log,
         nodes.Throttle: _Maker._throttle,
         nodes.Now: _Maker._now,
-        nodes.Sender: _Maker._sender,
+        nodes.SenderName: _Maker._sender,
         nodes.Whole: _Maker._whole,
     }
 )
