@@ -80,7 +80,7 @@ def contents(
         types,
         {name: definitions.full_text(name) for name in types.values()},
         tuple(map(frozenset, monitors.compiled.groups(monitors.names))),
-        {name: monitors.published_by(name) for name in files},
+        {one.code.file: monitors.published_by(one.code.file) for one in monitors.monitors},
         certificates,
         _bounded(data),
         _places(monitors),

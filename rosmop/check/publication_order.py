@@ -29,7 +29,7 @@ def bypassing(
             name, topic = publication.specification, publication.topic
             text = (
                 f"{name} publishes {topic}, but {earlier.name}, which drops or changes messages there, comes before"
-                f" {name} and does not see them: move {name} into a file whose name comes before {earlier.file}"
+                f" {name} and does not see them: write `order {name} < {earlier.name};`"
             )
             yield Diagnostic(publication.position, "warning", text)
 

@@ -4,7 +4,7 @@ Specifications of one set see each other's variables. One pass finds all errors 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import TypeVar
@@ -30,6 +30,7 @@ from rosmop.check.givens import (
     with_topics,
 )
 from rosmop.check.pattern_references import with_references, without_references
+from rosmop.check.phases import Phases, ordered, phases_of, unknown_phases
 from rosmop.check.publication_order import bypassing
 from rosmop.check.reachable_types import identity, reached
 from rosmop.check.safe_messages import declare_safes
@@ -69,7 +70,15 @@ def compile_files(
     """
     shared = CompilationContext(MessageTypes(definitions), value_of, margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
-    compiled = _compile_all(shared, pairs, topics)
+    orders = [order for file in files for order in file.orders]
+    compiled: Sequence[SpecificationCode] = ()
+    phases = _noted(shared, partial(phases_of, orders))
+    if phases is not None:
+        names = [specification.name for _, specification in pairs]
+        shared.findings += unknown_phases(orders, names)
+        pairs = [pairs[place] for place in ordered(names, phases)]
+        named = frozenset(name.parts[0] for order in orders for name in order.names)
+        compiled = _compile_all(shared, pairs, topics, phases, named)
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
@@ -92,7 +101,7 @@ def findings_of(files: Sequence[tree.SpecificationFile], definitions: Definition
     shared = CompilationContext(MessageTypes(definitions), value_of)
     shared.partial = True
     pairs = [(file, specification) for file in files for specification in file.specifications]
-    _compile_all(shared, pairs, {})
+    _compile_all(shared, pairs, {}, frozenset(), frozenset())
     return list(dict.fromkeys(shared.findings))
 
 
@@ -100,9 +109,12 @@ def _compile_all(
     shared: CompilationContext,
     originals: Sequence[tuple[tree.SpecificationFile, tree.Specification]],
     topics: Topics,
+    phases: Phases,
+    named: Collection[str],
 ) -> list[SpecificationCode]:
     given = [topics.get(specification.name, {}) for _, specification in originals]
-    pairs = [(file, _rewritten(shared, with_topics(one, own))) for (file, one), own in zip(originals, given, strict=True)]
+    renamed = [(file, with_topics(one, own)) for (file, one), own in zip(originals, given, strict=True)]
+    pairs = [(file, _rewritten(shared, specification)) for file, specification in renamed]
     names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
     compiled = []
@@ -110,14 +122,17 @@ def _compile_all(
         code = _compile(shared, own, file, specification)
         if code is not None:
             compiled.append(code)
+    written = {one.name: one for _, one in originals}
     for place, code in enumerate(compiled):
-        original = next(one for _, one in originals if one.name == code.name)
+        original = written[code.name]
         replaced = given_topics(shared, original, topics.get(code.name, {}))
         whole = with_given(identity(original), replaced)
-        compiled[place] = dataclasses.replace(code, identity=whole, given_topics=replaced)
+        compiled[place] = dataclasses.replace(
+            code, identity=whole, given_topics=replaced, ordered=code.name in named
+        )
     _check_types(shared, compiled)
     shared.findings += bypassing(compiled, shared.publications, shared.functions)
-    shared.findings += rival_changes([specification for _, specification in pairs])
+    shared.findings += rival_changes([specification for _, specification in pairs], phases)
     shared.findings += _same_names(shared.specifications)
     return compiled
 

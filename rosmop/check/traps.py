@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+from rosmop.check.phases import Phases
 from rosmop.form.findings import Diagnostic
 from rosmop.text import tree
 from rosmop.types.messages import shown
@@ -154,8 +155,11 @@ def _assigned_in(statement: tree.Statement) -> set[str]:
     return {_assigned(node) for node in tree.walk(statement) if isinstance(node, tree.ExpressionStatement)}
 
 
-def rival_changes(specifications: Sequence[tree.Specification]) -> Iterator[Diagnostic]:
-    """Yield warnings about two specifications that change the same field of a topic: the later one decides."""
+def rival_changes(specifications: Sequence[tree.Specification], phases: Phases) -> Iterator[Diagnostic]:
+    """Yield warnings about two specifications that change the same field of a topic: the later one decides.
+
+    Those that `order` statements put in order (`phases`) are not reported.
+    """
     changed = [
         (specification, topic, field, binding)
         for specification in specifications
@@ -165,10 +169,13 @@ def rival_changes(specifications: Sequence[tree.Specification]) -> Iterator[Diag
     for (first, topic, one, _), (second, there, other, binding) in combinations(changed, 2):
         same = one == other or one.startswith(f"{other}.") or other.startswith(f"{one}.")
         key = first.name, second.name, topic
+        if (first.name, second.name) in phases:
+            continue
         if first is not second and topic == there and same and key not in seen:
             seen.add(key)
             text = f"{first.name} also changes {other} of {topic}; the order of the files decides: {second.name} has"
-            yield Diagnostic(binding.position, "warning", f"{text} the last word")
+            text = f"{text} the last word; write `order {first.name} < {second.name};`, or the reverse"
+            yield Diagnostic(binding.position, "warning", text)
 
 
 def _changes(specification: tree.Specification) -> Iterator[tuple[str, str, tree.Binding]]:

@@ -171,6 +171,8 @@ class SpecificationCode:
     safes: tuple[nodes.SafeMessage, ...] = ()
     givens: tuple[Given, ...] = ()
     given_topics: tuple[GivenTopic, ...] = ()
+    ordered: bool = False
+    """Whether an `order` statement names it."""
 
 
 @dataclass(eq=False)

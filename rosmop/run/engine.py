@@ -18,7 +18,7 @@ Theory of operation:
 
 import sys
 import weakref
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -202,7 +202,7 @@ class MonitorSet:
         self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
         self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
-        self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
+        self._agenda = Agenda(self._monitors, self._execution, patience, deadlines, self._follow_up)
         self.began: tuple[str, ...] = ()
         self._broken = False
         self._index()
@@ -733,8 +733,6 @@ class MonitorSet:
     def advance(self, time_ns: int) -> list[Outcome]:
         """Process the ticks up to this time and the deadlines before it, in the order of their times."""
         outcomes = self._agenda.advance(time_ns)
-        for outcome in outcomes:
-            self._follow_up(outcome)
         self._agenda.schedule()
         return outcomes
 
@@ -747,14 +745,15 @@ class MonitorSet:
     def _judge_published(self, outcome: Outcome) -> None:
         """Give published messages to the monitors behind their publisher, whose own go to those behind them.
 
-        As each message goes only to monitors further behind, there is no loop.
+        What a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. Then there is no loop:
+        each other message goes only further back, and a deadline that a message sets is later than the message.
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):
-            places = self._places.get(message.topic, ())
-            behind = self.steps.get(message.topic, ())[
-                bisect_right(places, self._place_of[message.monitor]) :
-            ]
+            places, own = self._places.get(message.topic, ()), self._place_of[message.monitor]
+            due = (outcome.timer or "").endswith(".deadline") and self.monitor(message.monitor).code.ordered
+            first = (bisect_left if due else bisect_right)(places, own)
+            behind = self.steps.get(message.topic, ())[first:]
             if behind:
                 judged[number] = one = Outcome(bytearray(message.data), outcome.time)
                 self._execution.message(behind, one.buffer, one, NOBODY, published=True)

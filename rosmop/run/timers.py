@@ -28,11 +28,17 @@ class Agenda:
     """The timers and deadlines of monitors."""
 
     def __init__(
-        self, monitors: Sequence[MonitorInstance], execution: MonitorExecution, patience: Patience, most: int
+        self,
+        monitors: Sequence[MonitorInstance],
+        execution: MonitorExecution,
+        patience: Patience,
+        most: int,
+        follow_up: Callable[[Outcome], None],
     ) -> None:
         """`patience()` is called when something is due; it returns a function that returns whether the work takes too
-        long.
+        long. `follow_up(outcome)` is called before the next tick or deadline, which its publications may change.
         """
+        self._follow_up = follow_up
         self.due: int | None = None
         """Time of the next tick or deadline; None if there is none."""
         self._monitors = monitors
@@ -88,6 +94,9 @@ class Agenda:
         left = self._most
         over = self._patience()
         self.schedule()  # lanes may have moved deadlines
+        for outcome in outcomes:
+            self._follow_up(outcome)
+        followed = len(outcomes)
         while self.has_come(time_ns):
             timer = self._next_timer()
             deadline = self._next_deadline(slices=left > 0)
@@ -102,11 +111,16 @@ class Agenda:
                 outcomes += self._execution.expire(monitor, running, explains=explains)
             else:
                 break
+            for outcome in outcomes[followed:]:
+                self._follow_up(outcome)
+            followed = len(outcomes)
             self.schedule()
             if self.has_come(time_ns) and over():
                 outcomes.append(self._leave_out(time_ns))
                 self.schedule()
                 break
+        for outcome in outcomes[followed:]:
+            self._follow_up(outcome)
         return outcomes
 
     def send_safe(self, time_ns: int) -> list[Outcome]:

@@ -85,8 +85,12 @@ def test_the_module_and_the_interpreter_agree_for_all_values() -> None:
 
 def test_a_topic_renames_events_safe_messages_and_publications() -> None:
     """A state belongs to the text and to its topics, so another topic begins anew; unknown names are ignored."""
-    command = {"command": "/base/cmd"}
-    given: tuple[dict[str, str], ...] = {}, command, {"command": "/cmd_vel", "vMax": "/x"}, {"other": "/p"}
+    given: tuple[dict[str, str], ...] = (
+        {},
+        {"command": "/base/cmd"},
+        {"command": "/cmd_vel", "vMax": "/x"},
+        {"other": "/p"},
+    )
     all_topics = ({"cap": topics, "lid": {"command": "/x"}} for topics in given)
     sets = [compiled_from({"x.rv": CAP}, definitions(), topics=topics) for topics in all_topics]
     codes = [one.specifications[0] for one in sets]

@@ -94,7 +94,13 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
 
     def file(self, _: Meta, *children: Any) -> tree.SpecificationFile:
         found = tuple(child for child in children if isinstance(child, tree.Specification))
-        return tree.SpecificationFile(self._file, self._text, found)
+        orders = tuple(child for child in children if isinstance(child, tree.OrderStatement))
+        return tree.SpecificationFile(self._file, self._text, found, orders)
+
+    def order(self, meta: Meta, _word: Any, *names: Any) -> tree.OrderStatement:
+        return tree.OrderStatement(
+            self.at(meta), tuple(tree.Name(self.at(name), (str(name),)) for name in names)
+        )
 
     using = _unsaid
 

@@ -74,6 +74,7 @@ _FORMS = tuple(
             "a pattern is `'{field:x, list[0]:y, field:5}'`; a condition follows it: `when (x > 3)`",
         ),
         (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
+        (r"(?:\A|[};])\s*order\s[^{};]*\Z", "an order is `order first < second;`"),
         (
             r"\bgiven\s*\{[^{}]*\Z",
             "a given is `double name = 0.22 m/s in 0..2;`, `bool name = true;` or `topic name = /topic;`",
@@ -130,6 +131,7 @@ _WORDS = {
     "SERVICE": "`service`",
     "EVERY": "`every`",
     "ON": "`on`",
+    "ORDER": "`order`",
     "GIVEN": "`given`",
     "GIVEN_VALUE": "a value such as `0.22 m/s in 0..2`",
     "TOPIC_WORD": "`topic`",

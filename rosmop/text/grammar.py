@@ -20,8 +20,9 @@ _CONDITION = r"\{[^{}@]*@[A-Za-z_]\w*\.[^{}]*\}"
 """A condition of a pattern that refers to an earlier message, such as `{x < @A.x}`."""
 
 _GRAMMAR = r"""
-file: (specification | using | ";")*
+file: (specification | using | order | ";")*
 using: "using" "namespace" NAME ";"
+order: ORDER NAME ("<" NAME)* ";"
 
 specification: NAME+ ["(" [parameters] ")" [given]] "{" item* "}"
 given: GIVEN "{" (given_value | given_topic)* "}"
@@ -198,6 +199,7 @@ DROP: "DROP"
 STOP.5: /STOP(?=<GAP>*;)/
 RESET: "__RESET"
 PUBLISH: "PUBLISH"
+ORDER.5: /order(?=<GAP>+[A-Za-z_]\w*<GAP>*[<;])/
 GIVEN.5: /given(?!\w)/
 TOPIC_WORD.5: /topic(?!\w)/
 GIVEN_VALUE.9: /[^;={}]+/

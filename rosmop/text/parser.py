@@ -58,7 +58,7 @@ def parse(text: str, file: str) -> tree.SpecificationFile:
     builder = TreeBuilder(file, text)
     result: tree.SpecificationFile = builder.transform(parsed)
     check(builder)
-    if not result.specifications:
+    if not result.specifications and not result.orders:
         raise SpecificationError.at(
             start, "there is no specification in this file; write `name() { event … }`"
         )

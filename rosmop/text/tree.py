@@ -488,9 +488,17 @@ class Specification(SyntaxNode):
 
 
 @dataclass(frozen=True)
+class OrderStatement(SyntaxNode):
+    """`order first < second;`: specifications in the order in which they get messages."""
+
+    names: tuple[Name, ...]
+
+
+@dataclass(frozen=True)
 class SpecificationFile:
-    """The specifications of one file, in order, and its `text`."""
+    """The specifications of one file, in order, its `text`, and its `order` statements."""
 
     name: str
     text: str
     specifications: tuple[Specification, ...]
+    orders: tuple[OrderStatement, ...] = ()

@@ -48,6 +48,15 @@ def test_common_topics_join_specifications(other: str) -> None:
     assert together(a=a, b=other, c=spec("c", "/c", "/b")) == [{"a", "b", "c"}]
 
 
+def test_a_file_with_nothing_but_an_order_needs_no_relay() -> None:
+    """It changes the order of the monitors, also of those on other relays."""
+    code = checked(a=spec("a", "/a"), b=spec("b", "/b"), order="order b < a;")
+    assert ([*code.monitors], [{*group.files} for group in groups_of(code)]) == (
+        ["b", "a"],
+        [{"a.rv"}, {"b.rv"}],
+    )
+
+
 def test_a_service_joins_but_a_topic_of_the_same_name_does_not() -> None:
     service = "NAME() { event e() service /x std_srvs/SetBool request '{}' { } }"
     topic = spec("t", "/x")
