@@ -12,7 +12,7 @@ from roswire.tcpros import HeaderParser, encode_header
 ANY = "*"
 """The md5sum, or the name, of any type."""
 
-READ_BYTES = 1 << 18
+READ_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)

@@ -118,6 +118,7 @@ class NodeSubscription:
             while True:
                 for body in frames.feed(data):
                     self._received(body, header)
+                await asyncio.sleep(0)  # a fast publisher must not keep other tasks waiting
                 data = await reader.read(READ_BYTES)
                 if not data:
                     raise ConnectionResetError(f"{uri} ended the connection")

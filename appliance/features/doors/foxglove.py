@@ -53,7 +53,6 @@ class FoxgloveLimits:
     subscriptions: int = 1000
     channels: int = 200  # of the client
     calls: int = 100
-    depth: int = 10  # messages of a subscription that wait for a slow client
 
 
 class _Operation(Struct, tag_field="op"):
@@ -203,7 +202,7 @@ class Foxglove:
             else:
                 self._subscriptions[one.id] = seen.topic
                 self._by_topic.setdefault(seen.topic, set()).add(one.id)
-                self.queue.configure(one.id, depth=self._limits.depth, interval=0.0, queued=False)
+                self.queue.configure(one.id, depth=None, interval=0.0)
                 requests.append(SubscribeTopic(seen.topic, seen.type))
         return requests
 

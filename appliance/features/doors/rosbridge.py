@@ -71,7 +71,6 @@ class RosbridgeLimits:
     services: int = 100
     calls: int = 100  # without an answer, in each direction
     fragment_bytes: int = 8 << 20  # of all frames that are not complete
-    depth: int = 10  # messages that wait for a slow client, if it sets no queue_length
     call_seconds: float = 60.0
 
 
@@ -189,8 +188,7 @@ class Rosbridge:
         """Use the least of the rates and lengths of all subscriptions to a topic, as rosbridge does."""
         seconds = min(one[0] for one in subscription.clients.values())
         length = min(one[1] for one in subscription.clients.values())
-        depth = length or self._limits.depth
-        self.queue.configure(spelling, depth=depth, interval=seconds, queued=length > 0)
+        self.queue.configure(spelling, depth=length or None, interval=seconds)
 
     def _unsubscribe(self, operation: UnsubscribeOp) -> list[DoorRequest]:
         subscription = self._subscriptions.get(operation.topic)

@@ -36,6 +36,7 @@ from roswire.errors import RosError
 from roswire.node.network import ByteWriter
 
 _READ_BYTES = 1 << 16
+_BATCH_BYTES = 1 << 15
 _CLOSING_SECONDS = 2.0
 _WATCH_SECONDS = 2.0  # between two looks at the surroundings
 _WINDOW_BITS = 12  # with this and the level, a connection takes about 40 KB for compression
@@ -243,12 +244,7 @@ class DoorSession:
         loop = asyncio.get_running_loop()
         next_ping = loop.time() + self._options.ping_seconds
         while self._socket.state is State.OPEN:
-            frame = self._protocol.next_frame(loop.time())
-            if frame is not None:
-                if isinstance(frame, str):
-                    self._socket.send_text(frame.encode())
-                else:
-                    self._socket.send_binary(frame)
+            if self._take_frames(loop.time()):
                 await self._flush()
                 continue
             if loop.time() >= next_ping:
@@ -262,8 +258,22 @@ class DoorSession:
             self._wake.clear()
         await asyncio.sleep(_CLOSING_SECONDS)  # for the client's answer to the closing frame
 
+    def _take_frames(self, now: float) -> int:
+        """Give frames that may be sent now to the WebSocket; return their number of bytes, about `_BATCH_BYTES`."""
+        size = 0
+        while size < _BATCH_BYTES and (frame := self._protocol.next_frame(now)) is not None:
+            if isinstance(frame, str):
+                self._socket.send_text(frame.encode())
+            else:
+                self._socket.send_binary(frame)
+            size += len(frame)
+        return size
+
     async def _flush(self) -> None:
-        for data in self._socket.data_to_send():
+        pieces = self._socket.data_to_send()
+        if sum(map(len, pieces)) <= 2 * _BATCH_BYTES:
+            pieces = [b"".join(pieces)]
+        for data in pieces:
             if data:
                 self._writer.write(data)
         await self._writer.drain()

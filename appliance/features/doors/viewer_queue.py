@@ -14,6 +14,10 @@ from typing import Any, Generic, TypeVar
 
 from appliance.features.doors.requests import Frame
 
+_BURST = 1000
+_BURST_BYTES = 256 << 10
+"""Messages and bytes of a topic that may come at once, in one packet, before the first is sent."""
+
 Key = TypeVar("Key", bound=Hashable)
 
 
@@ -24,6 +28,7 @@ class ViewerStalledError(Exception):
 @dataclass(slots=True)
 class _Waiting:
     depth: int
+    most_bytes: int
     interval: float
     items: deque[tuple[Any, int]] = field(default_factory=deque)
     bytes: int = 0
@@ -53,14 +58,21 @@ class ViewerQueue(Generic[Key]):
             )
         self._replies.append(frame)
 
-    def configure(self, key: Key, *, depth: int, interval: float, queued: bool) -> None:
+    def configure(self, key: Key, *, depth: int | None, interval: float) -> None:
         """Set the number of messages that wait, and the seconds between two of them.
 
-        A message that comes earlier waits if `queued`, and is dropped otherwise.
+        Without a depth, only as many wait as a client that reads needs, and a large one only until the next comes.
+        Then a message that comes too early is dropped; with a depth, it waits.
         """
-        topic = self._topics.setdefault(key, _Waiting(depth, interval))
+        most, most_bytes = (_BURST, _BURST_BYTES) if depth is None else (depth, self._most_message_bytes)
+        topic = self._topics.setdefault(key, _Waiting(most, most_bytes, interval))
         topic.next_time += interval - topic.interval
-        topic.depth, topic.interval, topic.queued = max(depth, 1), interval, queued
+        topic.depth, topic.most_bytes, topic.interval, topic.queued = (
+            most,
+            most_bytes,
+            interval,
+            depth is not None,
+        )
         self._trim(topic)
 
     def remove(self, key: Key) -> None:
@@ -122,7 +134,7 @@ class ViewerQueue(Generic[Key]):
         return min((topic.next_time if topic.queued else 0.0 for topic in waiting), default=None)
 
     def _trim(self, topic: _Waiting) -> None:
-        while len(topic.items) > topic.depth:
+        while len(topic.items) > topic.depth or (topic.bytes > topic.most_bytes and len(topic.items) > 1):
             self._drop(topic)
 
     def _drop(self, topic: _Waiting) -> None:

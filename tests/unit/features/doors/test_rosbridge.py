@@ -199,6 +199,19 @@ def test_a_client_that_does_not_read_loses_old_messages_and_no_memory(client: Cl
     assert client.queue.dropped == 46
 
 
+def test_a_burst_of_small_messages_is_kept_and_of_large_ones_the_newest(client: Client) -> None:
+    """Many messages may come in one packet, and a client that reads gets them all."""
+    for topic in ("/chatter", "/image"):
+        client.sends({"op": "subscribe", "topic": topic})
+    for number in range(500):
+        client.hears(str(number))
+    for number in range(5):
+        client.hears(f"{number}" * 30_000, "/image")
+    received = [(frame["topic"], frame["msg"]["data"][:3]) for frame in client.gets()]
+    assert [text for topic, text in received if topic == "/chatter"] == [*map(str, range(500))]
+    assert ("/image", "444") in received
+
+
 def test_a_client_that_asks_and_does_not_read_is_given_up(client: Client) -> None:
     with pytest.raises(ViewerStalledError, match="more than 100000 bytes of replies"):
         for _ in range(10_000):
