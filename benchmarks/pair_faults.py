@@ -30,9 +30,9 @@ from rich.console import Console
 from rich.table import Table
 
 from appliance.channel import admin
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 from appliance.features.standby.membership import load_membership, path_of, save_membership
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import standby_troubles
 from benchmarks.pair_fault_kinds import Fault, drawn
 from benchmarks.standby import Successes, Watch, busy

@@ -38,13 +38,13 @@ from appliance.channel.answers import (
     measures,
     monitor_answers,
     policy_answers,
+    standby_answers,
     status,
     token_answers,
 )
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
 from appliance.features.recorder import recording_answers
-from appliance.features.standby import standby_answers
 
 A = TypeVar("A")
 

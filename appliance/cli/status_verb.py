@@ -17,6 +17,7 @@ from appliance.base.actors import DISK
 from appliance.channel.admin import A, AdminAnswer, StandbyWanted, StatusWanted
 from appliance.channel.alarms import Alarm, activity, open_alarms
 from appliance.channel.answers.host_answers import PortsSeen
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     BundlesState,
     ClockState,
@@ -31,7 +32,6 @@ from appliance.cli.connection.admin_client import NotRunningError
 from appliance.cli.connection.target import Appliance, speaks_with
 from appliance.cli.output import loaded_by, moment, say_json, usage_error
 from appliance.cli.status_watch import LEAST_SECONDS, LONGEST_SECONDS, StatusView, Watch, watched
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import standby_troubles
 from appliance.features.standby.standby_view import answer_in_words, lag_in_words, standby_view
 from rosmop.tool.tables import table_of

@@ -27,8 +27,8 @@ import msgspec
 import structlog
 
 from appliance.base.engine_thread import Drive, EngineThread
-from appliance.features.standby.change_feed import ChangeFeed
 from appliance.store.ahead import Encoded, WriteAhead
+from appliance.store.change_feed import ChangeFeed
 from appliance.store.changes import Change, ChangeError, Condition, Delete, Put, Tables, Value, joined
 
 _GROUP = 2_000

@@ -22,9 +22,9 @@ from appliance.base import clock
 from appliance.channel.admin import MetricsWanted, StandbyWanted
 from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import BundlesState, ForwardingState, ProcessInfo
 from appliance.channel.status_summary import no_relay, probe_failed, process_names
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_summary import both_active
 from appliance.telemetry.metrics import METRICS, Metric
 

@@ -6,7 +6,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import Moment, doc
 from appliance.channel.answers.host_answers import PortsSeen
-from appliance.features.standby.standby_answers import StandbyState
+from appliance.channel.answers.standby_answers import StandbyState
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):

@@ -19,6 +19,7 @@ from appliance.channel.answers.graph_answers import (
 from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import (
     AuditState,
     BlocksState,
@@ -37,7 +38,6 @@ from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.links.supervisor_link import Surroundings
 from appliance.control.operators.measurements import measures_of
 from appliance.control.operators.overview import graph_of
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live_rights import LiveRight

@@ -20,6 +20,7 @@ import structlog
 from appliance.base import clock
 from appliance.base.background import run_always
 from appliance.channel import messages
+from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import Settings
 from appliance.control.robot_admission import RobotAdmission
@@ -29,7 +30,6 @@ from appliance.features.standby.membership import Membership
 from appliance.features.standby.replication_frames import Introduction, ReplicationError
 from appliance.features.standby.replication_sender import ReplicationSender
 from appliance.features.standby.replication_transport import ReplicationListener
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_tunnels import StandbyTunnels
 from appliance.master.graph.registry import Incarnation
 from appliance.rpc.server import Handler, HttpRequest

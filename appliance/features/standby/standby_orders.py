@@ -9,6 +9,7 @@ import structlog
 
 from appliance.channel import admin
 from appliance.channel.admin import A
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Foundation
 from appliance.control.errors import UnknownThingError
@@ -17,7 +18,6 @@ from appliance.features.standby.fleet_of_pair import compare_fleets
 from appliance.features.standby.inheritance import StateCopies, inherited_state, keep_state, leave_state
 from appliance.features.standby.lease_client import HandOverError
 from appliance.features.standby.replication import Pair, Replication
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.takeover_record import TakeoverRecorder
 from appliance.telemetry.audit_trail import AuditTrail
 

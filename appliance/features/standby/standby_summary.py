@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
+from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 
 PATIENCE_SECONDS = 60.0
 """How long the standby may be away or behind before this is an alarm: an update of its machine takes longer."""

@@ -7,9 +7,9 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.api.front.moments import in_full
+from appliance.channel.answers.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.cli.output import moment
 from appliance.cli.status_watch import StatusView
-from appliance.features.standby.standby_answers import OtherAppliance, StandbyState, WitnessSeen
 from appliance.features.standby.standby_summary import is_silent, lag_of, lasting, standby_troubles
 
 _RED = "bold red"

@@ -1,7 +1,7 @@
 """The latest changes, for a consumer."""
 
-from appliance.features.standby.change_feed import ChangeFeed
 from appliance.store.ahead import Encoded
+from appliance.store.change_feed import ChangeFeed
 
 
 def change(number: int, size: int = 10) -> Encoded:

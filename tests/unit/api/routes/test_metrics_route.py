@@ -11,8 +11,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from appliance.api.routes.metrics_route import rendered, rendered_standby
 from appliance.base import clock
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.answers.status import RecorderState
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
 

@@ -18,9 +18,9 @@ from appliance.api.front.request_gate import RequestGate
 from appliance.api.front.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.channel.messages.api import TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import on_standby
 from appliance.store.access_tokens import make_token
 from tests.support.answers import example

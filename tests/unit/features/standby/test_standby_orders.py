@@ -5,9 +5,9 @@ from typing import Any, cast
 import pytest
 
 from appliance.channel import admin
+from appliance.channel.answers.standby_answers import StandbyState
 from appliance.control.errors import UnknownThingError
 from appliance.features.standby.lease_client import HandOverError
-from appliance.features.standby.standby_answers import StandbyState
 from appliance.features.standby.standby_orders import SingleAppliance, StandbyAdministration, StandbyOrders
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example

@@ -1,4 +1,4 @@
-"""The latest changes of the state, kept in memory for one consumer that sends them to another appliance."""
+"""The latest changes of the state, kept in memory for one consumer."""
 
 import threading
 from collections import deque
