@@ -4,14 +4,10 @@ Importing all modules takes a second of processor time, so `rosrv status` must n
 completion take the verbs' names from the table of verbs, and the first sentences of help from the source files.
 """
 
-import functools
 import importlib
 import inspect
-import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any
 
 import typer
@@ -19,45 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
-
-
-@dataclass(frozen=True, slots=True)
-class Verb:
-    """A verb's function in this folder (`module:function`); in the help, `first` precedes its docstring."""
-
-    place: str
-    first: str = ""
-    hidden: bool = False
-
-    @property
-    def help(self) -> str:
-        """Return the first sentence of the help, read without importing the module."""
-        module, _colon, function = self.place.partition(":")
-        file = _FOLDER.joinpath(*module.split(".")).with_suffix(".py")
-        return self.first or _first_sentence(file, function)
-
-
-Verbs = Mapping[str, "Verb | Group"]
-_FOLDER = Path(__file__).parent
-
-
-@functools.cache
-def _text(file: Path) -> str:
-    return file.read_text(encoding="utf-8")
-
-
-def _first_sentence(file: Path, function: str) -> str:
-    found = re.search(rf'(?ms)^def {function}\(.*?"""(.+?)(?:"""|\n\n)', _text(file))
-    assert found is not None, function  # noqa: S101  every verb has a docstring
-    return " ".join(found[1].split())
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """A command with its own verbs, such as `rosrv audit`."""
-
-    help: str
-    verbs: "Verbs"
+from appliance.base.verbs import Group, Verb, Verbs
 
 
 def application(verbs: Verbs, *, callback: Callable[..., None] | None = None, **settings: Any) -> typer.Typer:
@@ -96,7 +54,7 @@ def _group_of(verbs: Verbs) -> type[TyperGroup]:
     return _Lazy
 
 
-def _command_of(verb: "Verb | Group", name: str) -> Any:
+def _command_of(verb: Verb | Group, name: str) -> Any:
     match verb:
         case Group(help, inner):
             return _named(typer.main.get_group(application(inner, help=help)), name)
@@ -132,8 +90,7 @@ class _Deferred(TyperCommand):
 
 def loaded(verb: Verb, name: str) -> Any:
     """Import a verb and return its command."""
-    module, _colon, attribute = verb.place.partition(":")
-    found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
+    found = getattr(importlib.import_module(verb.module), verb.function)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function, kind = (
         (found.function, found.command) if isinstance(found, GroupedVerb) else (found, TyperCommand)

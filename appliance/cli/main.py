@@ -10,7 +10,9 @@ import typer
 
 from appliance import __version__
 from appliance.base.user_errors import UserError
-from appliance.cli.lazy import Group, Verb, application
+from appliance.base.verbs import Group, Verb
+from appliance.cli.lazy import application
+from appliance.features.table import FEATURE_VERBS
 from rosmop.tool.options import SUMMARIES
 
 _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
@@ -147,16 +149,7 @@ VERBS: dict[str, Verb | Group] = {
             "unblock": Verb("host.block_verbs:unblock"),
         },
     ),
-    "standby": Group(
-        "Run two appliances, of which one stands by to take over.",
-        {
-            "join": Verb("standby.membership_verbs:join"),
-            "leave": Verb("standby.membership_verbs:leave"),
-            "repair": Verb("standby.membership_verbs:repair"),
-            "status": Verb("standby.live_verbs:status"),
-            "promote": Verb("standby.live_verbs:promote"),
-        },
-    ),
+    **FEATURE_VERBS,
     "fleet": Group(
         "Push the audit log to a collector of many robots.",
         {"join": Verb("fleet_verbs:join"), "leave": Verb("fleet_verbs:leave")},

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from appliance.base.verbs import Verbs
 from appliance.configuration.sections import FeatureSection, Sections
 from appliance.supervisor.role import Role
 
@@ -43,9 +44,10 @@ class FeaturePart:
 
 @dataclass(frozen=True)
 class Feature:
-    """All that a feature adds: a section of `appliance.yaml`, processes, and a part of control."""
+    """All that a feature adds: a section of `appliance.yaml`, processes, verbs of `rosrv`, and a part of control."""
 
     name: str
     settings: type[FeatureSection] | None = None
     roles: tuple[Role, ...] = ()
+    verbs: Verbs = field(default_factory=dict)
     make: Callable[[FeatureContext], FeaturePart] | None = None

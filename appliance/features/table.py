@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from appliance.configuration.sections import Sections
 from appliance.features.feature import Feature, FeatureContext
+from appliance.features.standby.feature import STANDBY
 from appliance.features.syslog.feature import SYSLOG
 
 if TYPE_CHECKING:
@@ -14,7 +15,8 @@ if TYPE_CHECKING:
     from appliance.channel.link import Link
     from appliance.telemetry.audit_trail import AuditTrail
 
-FEATURES: tuple[Feature, ...] = (SYSLOG,)
+FEATURES: tuple[Feature, ...] = (SYSLOG, STANDBY)
+FEATURE_VERBS = {name: verb for feature in FEATURES for name, verb in feature.verbs.items()}
 
 
 class FeatureParts:

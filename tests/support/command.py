@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from appliance.base.verbs import Group, Verb, Verbs
 from appliance.cli import main
-from appliance.cli.lazy import Group, Verb, Verbs, loaded
+from appliance.cli.lazy import loaded
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output

@@ -148,7 +148,7 @@ def test_options_that_pages_name_alone_exist() -> None:
                 one for each in command.get_params(context) for one in (*each.opts, *each.secondary_opts)
             }
     named = {name for page in WITH_LINKS[:-1] for name in re.findall(r"`(--[a-z][a-z-]*)", page.read_text())}
-    folders = ("appliance/standby", "benchmarks", "tests/support", "tests/world")
+    folders = ("appliance/features/standby", "benchmarks", "tests/support", "tests/world")
     scripts = "".join(file.read_text() for one in folders for file in (ROOT / one).rglob("*.py"))
     missing = {name for name in named - options if f'"{name}"' not in scripts}
     assert missing == OTHERS.keys()

@@ -1,0 +1,22 @@
+"""The feature standby: two appliances, of which one stands by to take over (docs/standby.md)."""
+
+from appliance.base.verbs import Group, Verb
+from appliance.features.feature import Feature
+
+_PLACE = "appliance.features.standby."
+
+STANDBY = Feature(
+    "standby",
+    verbs={
+        "standby": Group(
+            "Run two appliances, of which one stands by to take over.",
+            {
+                "join": Verb(f"{_PLACE}membership_verbs:join"),
+                "leave": Verb(f"{_PLACE}membership_verbs:leave"),
+                "repair": Verb(f"{_PLACE}membership_verbs:repair"),
+                "status": Verb(f"{_PLACE}live_verbs:status"),
+                "promote": Verb(f"{_PLACE}live_verbs:promote"),
+            },
+        ),
+    },
+)
