@@ -31,8 +31,8 @@ from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child_process import Child
-from appliance.features.standby.sealed_authority import open_authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
+from appliance.ipsec.brought_authority import open_authority
 from appliance.ipsec.certificate_authority import CertificateAuthority
 from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.proof_of_possession import RequestRefusedError

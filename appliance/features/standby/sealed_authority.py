@@ -1,7 +1,7 @@
-"""Bring the encrypted key of an authority to the other one of two appliances, and use it there.
+"""Bring the encrypted key of an authority to the other one of two appliances.
 
-Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority, and uses it
-instead once it has the same passphrase. Until then, or with a wrong passphrase, it starts without it.
+Only a key that the passphrase encrypts is brought. The other appliance keeps it beside its own authority, and its
+signer uses it (`ipsec/brought_authority.py`).
 """
 
 import contextlib
@@ -11,11 +11,9 @@ from pathlib import Path
 import msgspec
 
 from appliance.base.atomic_files import write_whole
-from appliance.ipsec.authority_key import Kind, is_encrypted
-from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE, CertificateAuthority
-from appliance.ipsec.key_files import SignerKeyError, require_private
-
-FOLDER = "joined"  # of the signer's directory
+from appliance.ipsec.authority_key import is_encrypted
+from appliance.ipsec.brought_authority import FOLDER
+from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE
 
 
 class SealedAuthority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,27 +48,3 @@ def keep_sealed(signer: Path, sealed: SealedAuthority, owner: tuple[int, int] | 
                 os.chown(made, *owner)
     write_whole(folder / CERTIFICATE_FILE, sealed.certificate.encode(), 0o644, owner)
     write_whole(folder / KEY_FILE, sealed.key.encode(), 0o600, owner)
-
-
-def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
-    """Return the joined authority if its key can be used, else the appliance's own, with the reason (empty: none).
-
-    Raises `SignerKeyError` and `OSError` if the appliance's own authority cannot be used.
-    """
-    own, folder = CertificateAuthority(directory, kind, passphrase), directory / FOLDER
-    if not (folder / KEY_FILE).exists():
-        return own, ""
-    try:
-        require_encrypted(folder / KEY_FILE)
-        return CertificateAuthority(folder, kind, passphrase), ""
-    except (SignerKeyError, OSError) as error:
-        return own, str(error)
-
-
-def require_encrypted(path: Path) -> None:
-    """Raise `SignerKeyError` for a key that is not encrypted, or that others may read."""
-    require_private(path)
-    if not is_encrypted(path.read_bytes()):
-        raise SignerKeyError(
-            f"{path}: the key is not encrypted, so it is not used: run `rosrv standby join` again"
-        )

@@ -5,12 +5,11 @@ from pathlib import Path
 import pytest
 
 from appliance.features.standby.sealed_authority import (
-    FOLDER,
     SealedAuthority,
     keep_sealed,
-    open_authority,
     sealed_authority,
 )
+from appliance.ipsec.brought_authority import FOLDER, open_authority
 from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
 
 SECRET = b"correct horse"

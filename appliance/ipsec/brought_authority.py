@@ -1,0 +1,37 @@
+"""Use an authority that was brought from another machine, with a key that a passphrase encrypts.
+
+It is beside the signer's own authority, and is used instead once the signer has the passphrase. Until then, or with a
+wrong passphrase, the signer uses its own.
+"""
+
+from pathlib import Path
+
+from appliance.ipsec.authority_key import Kind, is_encrypted
+from appliance.ipsec.certificate_authority import KEY_FILE, CertificateAuthority
+from appliance.ipsec.key_files import SignerKeyError, require_private
+
+FOLDER = "joined"  # of the signer's directory
+
+
+def open_authority(directory: Path, kind: Kind, passphrase: bytes | None) -> tuple[CertificateAuthority, str]:
+    """Return the joined authority if its key can be used, else the appliance's own, with the reason (empty: none).
+
+    Raises `SignerKeyError` and `OSError` if the appliance's own authority cannot be used.
+    """
+    own, folder = CertificateAuthority(directory, kind, passphrase), directory / FOLDER
+    if not (folder / KEY_FILE).exists():
+        return own, ""
+    try:
+        require_encrypted(folder / KEY_FILE)
+        return CertificateAuthority(folder, kind, passphrase), ""
+    except (SignerKeyError, OSError) as error:
+        return own, str(error)
+
+
+def require_encrypted(path: Path) -> None:
+    """Raise `SignerKeyError` for a key that is not encrypted, or that others may read."""
+    require_private(path)
+    if not is_encrypted(path.read_bytes()):
+        raise SignerKeyError(
+            f"{path}: the key is not encrypted, so it is not used: run `rosrv standby join` again"
+        )
