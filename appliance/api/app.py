@@ -9,7 +9,6 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 import appliance
-from appliance.api import evidence_routes
 from appliance.api.console import console
 from appliance.api.front import health
 from appliance.api.front.control import ControlAwayError
@@ -29,6 +28,7 @@ from appliance.api.routes import (
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import meant, refusal
+from appliance.features.evidence import evidence_routes
 from appliance.features.recorder import recording_routes
 
 _MOST_SHOWN = 5

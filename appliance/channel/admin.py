@@ -30,7 +30,6 @@ import msgspec
 from appliance.channel import alarms
 from appliance.channel import rest_bodies as bodies
 from appliance.channel.answers import (
-    evidence_answers,
     graph_answers,
     host_answers,
     inventory_answers,
@@ -44,6 +43,7 @@ from appliance.channel.answers import (
 )
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
+from appliance.features.evidence import evidence_answers
 from appliance.features.recorder import recording_answers
 
 A = TypeVar("A")

@@ -8,7 +8,6 @@ from appliance.control.assembly.assembly import Parts
 from appliance.control.assembly.foundation import Current, Foundation
 from appliance.control.bundle_gate import BundleGate
 from appliance.control.bundle_health import RobotHealth
-from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.links.forwarder_link import ForwarderLink
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders, HandledAlarms
@@ -22,6 +21,7 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
+from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.standby.standby_orders import StandbyOrders, StandbySource
 from appliance.features.table import FeatureParts
 from appliance.hosts.certification import Certification

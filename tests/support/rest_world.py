@@ -31,7 +31,6 @@ from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
-from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
@@ -40,6 +39,7 @@ from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
+from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification

@@ -13,10 +13,10 @@ from appliance.channel.admin import A
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.control.evidence_orders import NotSealedError
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import RequestMethod
 from appliance.control.operators.token_orders import TokenRefusedError
+from appliance.features.evidence.evidence_orders import NotSealedError
 from appliance.features.recorder.recording_orders import RecorderAwayError
 from appliance.features.standby.lease_client import HandOverError
 from appliance.hosts.host_table import (

@@ -7,12 +7,12 @@ from typing import Any, Generic
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.control.assembly.policies import Policies
-from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.token_orders import TokenOrders
+from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import load_pem_public_key
 
 from appliance.audit.log.signatures import signature_is_valid
-from appliance.evidence.bundle_verifier import Verifier, printable
+from appliance.formats.bundle_verifier import Verifier, printable
 from rosrv_fleet.config import FleetConfig
 from rosrv_fleet.enrolment import Robot
 from rosrv_fleet.evidence.store import EvidenceContent

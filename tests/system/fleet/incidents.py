@@ -3,10 +3,10 @@
 import time
 from pathlib import Path
 
-from appliance.evidence.bundle import RecordingSelection, export
-from appliance.evidence.page import Names
+from appliance.features.evidence.bundle import RecordingSelection, export
+from appliance.features.evidence.page import Names
 from tests.system.fleet.fleet_site import FleetRobot
-from tests.unit.evidence.conftest import Control
+from tests.unit.features.evidence.conftest import Control
 
 
 def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:

@@ -13,13 +13,13 @@ import httpx
 import pytest
 from rosrv_fleet.access import COOKIE
 
-from appliance.evidence import bundle_verifier
+from appliance.formats import bundle_verifier
 from tests.support.small_disk import small_disk
 from tests.support.waiting import eventually
 from tests.system.fleet.fleet_site import FleetRobot, FleetSite, running
 from tests.system.fleet.incidents import incident
 from tests.system.fleet.test_bundles import Operator
-from tests.unit.evidence.test_bundle import Members, members_of, written
+from tests.unit.features.evidence.test_bundle import Members, members_of, written
 
 MakeRobot = Callable[..., FleetRobot]
 

@@ -14,8 +14,8 @@ from rosrv_fleet.evidence.store import EvidenceContent
 from rosrv_fleet.workers import Workers
 
 from tests.unit.audit.conftest import key, make_log, notary, path
-from tests.unit.evidence.conftest import Control, control
-from tests.unit.evidence.test_bundle import members_of, written
+from tests.unit.features.evidence.conftest import Control, control
+from tests.unit.features.evidence.test_bundle import members_of, written
 
 pytestmark = pytest.mark.nightly
 

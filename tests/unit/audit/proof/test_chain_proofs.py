@@ -15,8 +15,8 @@ from appliance.audit.log.signatures import read_public_key, write_public_key
 from appliance.audit.proof.chain_proofs import evidence, evidence_line
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
-from appliance.evidence.bundle import stored_line
-from appliance.evidence.bundle_verifier import Verifier
+from appliance.features.evidence.bundle import stored_line
+from appliance.formats.bundle_verifier import Verifier
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import first_sequence, make_old, retain

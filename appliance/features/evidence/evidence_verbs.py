@@ -22,9 +22,9 @@ from appliance.cli.connection.rest_orders import RestWay
 from appliance.cli.connection.rest_session import RestProblemError
 from appliance.cli.connection.target import Appliance, speaks
 from appliance.cli.output import Json, say_json, usage_error
-from appliance.evidence import bundle_verifier as verifier_module
-from appliance.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export
-from appliance.evidence.page import Names
+from appliance.features.evidence.bundle import VERIFIER, BundleError, RecordingSelection, TimeSpan, export
+from appliance.features.evidence.page import Names
+from appliance.formats import bundle_verifier as verifier_module
 from appliance.signing.fingerprints import fingerprint
 from rosmop.tool.terminal import say
 

@@ -28,10 +28,10 @@ from appliance.audit.search.query import Filter
 from appliance.audit.search.search import search
 from appliance.base import clock
 from appliance.base.clock import wall_ns
-from appliance.evidence import bundle as bundles
-from appliance.evidence import bundle_verifier
-from appliance.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
+from appliance.features.evidence import bundle as bundles
+from appliance.features.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
 from appliance.features.recorder.recording_answers import RecordedTopic, Trigger
+from appliance.formats import bundle_verifier
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
@@ -40,7 +40,7 @@ from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import make_old, retain
-from tests.unit.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control
+from tests.unit.features.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control
 
 Members = dict[str, bytes]
 
@@ -678,7 +678,7 @@ def test_empty_and_too_large_time_spans_are_rejected(
 
 def test_an_export_needs_the_signer(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Without an answer the export ends after a timeout and names the signer."""
-    monkeypatch.setattr("appliance.control.evidence_orders.SEAL_SECONDS", 0.2)
+    monkeypatch.setattr("appliance.features.evidence.evidence_orders.SEAL_SECONDS", 0.2)
     log = open_log(path, signer=lambda _number, _text: None)
     running = Control(log)
     running.work()

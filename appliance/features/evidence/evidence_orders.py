@@ -4,7 +4,7 @@ import asyncio
 
 from appliance.audit.log.log import AuditLog
 from appliance.channel import admin
-from appliance.channel.answers.evidence_answers import Sealed
+from appliance.features.evidence.evidence_answers import Sealed
 from appliance.telemetry.audit_trail import AuditTrail
 
 SEAL_SECONDS = 10.0

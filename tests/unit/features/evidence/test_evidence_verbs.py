@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from appliance.cli import evidence_verbs
-from appliance.evidence.bundle import BundleError
+from appliance.features.evidence import evidence_verbs
+from appliance.features.evidence.bundle import BundleError
 from tests.support.command import rosrv
 
 

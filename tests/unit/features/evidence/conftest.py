@@ -14,9 +14,9 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
-from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.evidence.bundle import RecordingSelection, TimeSpan, export
-from appliance.evidence.page import Names
+from appliance.features.evidence.bundle import RecordingSelection, TimeSpan, export
+from appliance.features.evidence.evidence_orders import EvidenceOrders, NotSealedError
+from appliance.features.evidence.page import Names
 from appliance.features.recorder.recording_answers import Recording
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.telemetry.audit_trail import AuditTrail

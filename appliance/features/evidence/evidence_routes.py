@@ -16,8 +16,8 @@ from appliance.api.front.streams import StreamResponse, in_thread, peer_of
 from appliance.api.routes.named_hosts import host_in_words
 from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
-from appliance.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
-from appliance.evidence.page import Names
+from appliance.features.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
+from appliance.features.evidence.page import Names
 from appliance.features.recorder.recording_routes import OneId
 
 _ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {

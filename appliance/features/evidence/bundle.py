@@ -40,13 +40,14 @@ from appliance.channel.admin import (
     RecordingFetch,
     Trouble,
 )
-from appliance.evidence.page import Names, Page
+from appliance.features.evidence.page import Names, Page
 from appliance.features.recorder.recording_answers import Recording
+from appliance.formats import bundle_verifier
 from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
 MOST_RECORDS = 1_000_000
-VERIFIER = Path(__file__).with_name("bundle_verifier.py")
+VERIFIER = Path(bundle_verifier.__file__)
 Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500

@@ -1,0 +1,1 @@
+"""Formats that the appliance writes and the collector reads, and the other way round."""
