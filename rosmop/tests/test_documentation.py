@@ -19,24 +19,25 @@ from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
-CODE = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
+EXAMPLE, GIVEN, _ORDER, SAFE, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
+    r"```cpp\n(.*?)```", PAGE, re.DOTALL
+)
 
 
 def test_the_example_loads() -> None:
     """Each example file of the page is valid."""
-    assert [monitor.name for monitor in load(CODE[0]).monitors] == ["safeTrigger"]
+    assert [monitor.name for monitor in load(EXAMPLE).monitors] == ["safeTrigger"]
 
 
 def test_the_example_of_a_property_loads() -> None:
     """Each example property of the page is valid."""
     events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
-    text = CODE[3]
-    assert load(f"s() {{ {events} {text} }}").monitors[0].properties
+    assert load(f"s() {{ {events} {PROPERTY} }}").monitors[0].properties
 
 
 def test_the_code_of_library_functions_is_on_the_page() -> None:
     """The page has each function that it describes by code, exactly as it runs, without the comments."""
-    code = re.sub(r" +// .*", "", CODE[2]).strip().split("\n")
+    code = re.sub(r" +// .*", "", FUNCTIONS).strip().split("\n")
     text = "\n".join(code)
     named = set(re.findall(r"^\w+ (\w+)\(", text, re.MULTILINE))
     assert named == set(functions()) - FREE - {"isfinite_all"}
@@ -57,10 +58,12 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
 @pytest.mark.parametrize(
     "text",
     [
-        CODE[0],
-        f"s() {{ {CODE[1]} }}",
-        in_specification(CODE[3]),
-        CODE[4],
+        EXAMPLE,
+        f"s() {{ {VARIABLES} }}",
+        in_specification(PROPERTY),
+        SLICED,
+        SAFE,
+        GIVEN,
         in_specification(HELPER, "v = half(v);"),
     ],
 )
