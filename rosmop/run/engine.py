@@ -202,7 +202,7 @@ class MonitorSet:
         self._silent: dict[str, BatchOptions] = {}
         """The options for `judge`, by topic and source."""
         self._execution = MonitorExecution(self.interpreter, on_fault, self._guards.judging)
-        self._agenda = Agenda(self._monitors, self._execution, patience, deadlines, self._follow_up)
+        self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._broken = False
         self._index()
@@ -732,7 +732,7 @@ class MonitorSet:
 
     def advance(self, time_ns: int) -> list[Outcome]:
         """Process the ticks up to this time and the deadlines before it, in the order of their times."""
-        outcomes = self._agenda.advance(time_ns)
+        outcomes = self._agenda.advance(time_ns, self._follow_up)
         self._agenda.schedule()
         return outcomes
 

@@ -33,12 +33,10 @@ class Agenda:
         execution: MonitorExecution,
         patience: Patience,
         most: int,
-        follow_up: Callable[[Outcome], None],
     ) -> None:
         """`patience()` is called when something is due; it returns a function that returns whether the work takes too
-        long. `follow_up(outcome)` is called before the next tick or deadline, which its publications may change.
+        long.
         """
-        self._follow_up = follow_up
         self.due: int | None = None
         """Time of the next tick or deadline; None if there is none."""
         self._monitors = monitors
@@ -87,15 +85,18 @@ class Agenda:
             self.schedule()
         return self.due
 
-    def advance(self, time_ns: int) -> list[Outcome]:
-        """Process the ticks up to this time and the deadlines before it, in the order of their times."""
+    def advance(self, time_ns: int, follow_up: Callable[[Outcome], None]) -> list[Outcome]:
+        """Process the ticks up to this time and the deadlines before it, in the order of their times.
+
+        `follow_up(outcome)` is called before the next tick or deadline, which its publications may change.
+        """
         outcomes = self.send_safe(time_ns)
         ticks: dict[int, int] = {}
         left = self._most
         over = self._patience()
         self.schedule()  # lanes may have moved deadlines
         for outcome in outcomes:
-            self._follow_up(outcome)
+            follow_up(outcome)
         followed = len(outcomes)
         while self.has_come(time_ns):
             timer = self._next_timer()
@@ -112,7 +113,7 @@ class Agenda:
             else:
                 break
             for outcome in outcomes[followed:]:
-                self._follow_up(outcome)
+                follow_up(outcome)
             followed = len(outcomes)
             self.schedule()
             if self.has_come(time_ns) and over():
@@ -120,7 +121,7 @@ class Agenda:
                 self.schedule()
                 break
         for outcome in outcomes[followed:]:
-            self._follow_up(outcome)
+            follow_up(outcome)
         return outcomes
 
     def send_safe(self, time_ns: int) -> list[Outcome]:

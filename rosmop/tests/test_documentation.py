@@ -19,7 +19,7 @@ from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
-EXAMPLE, GIVEN, _ORDER, SAFE, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
+EXAMPLE, GIVEN, ORDER, SAFE, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
     r"```cpp\n(.*?)```", PAGE, re.DOTALL
 )
 
@@ -62,7 +62,7 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
         f"s() {{ {VARIABLES} }}",
         in_specification(PROPERTY),
         SLICED,
-        SAFE,
+        SAFE + ORDER,
         GIVEN,
         in_specification(HELPER, "v = half(v);"),
     ],

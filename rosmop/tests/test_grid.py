@@ -44,6 +44,7 @@ def test_each_kind_of_node_is_in_the_grid() -> None:
         "Advance",
         "Event",
         "Component",
+        "SafeMessage",
     }
     kinds: UnionType = nodes.Expression | nodes.Statement
     assert _names(nodes.FormNode.__subclasses__()) == _names(get_args(kinds)) | parts
@@ -61,6 +62,10 @@ SLOW = {
     "a branch": (
         f"{EVENT} {{ if (x > 3) {{\n PUBLISH(/told, geometry_msgs/Twist, twist); }} }}",
         [("/t", "event s.e", 2, "publishes a message")],
+    ),
+    "a stop": (
+        f"safe std_msgs/Int32 {{}} on /t every 1s; {EVENT} {{ if (x > 3) {{\n STOP; }} }}",
+        [("/t", "event s.e", 2, "sends the safe message")],
     ),
     "a helper function": (
         f"int f(int x) {{ if (x > 3) {{\n return sin(x); }} return x; }} {EVENT} {{ n = f(x); }}",
