@@ -14,6 +14,7 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from http import HTTPStatus
 from typing import Any, Protocol
 
 from msgspec import Raw
@@ -24,11 +25,12 @@ from websockets.frames import Frame as WebSocketFrame
 from websockets.http11 import Request
 from websockets.protocol import State
 from websockets.server import ServerProtocol
-from websockets.typing import Origin, Subprotocol
+from websockets.typing import Subprotocol
 
 from appliance.features.doors.door_node import DoorNode
 from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
+from appliance.features.doors.origins import rejection
 from appliance.features.doors.requests import DoorRequest, Frame
 from appliance.features.doors.surroundings import Surroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
@@ -121,7 +123,6 @@ class DoorSession:
         self._is_text = False
         self._wake = asyncio.Event()
         self._socket = ServerProtocol(
-            origins=[None, *map(Origin, options.origins)],
             extensions=[
                 ServerPerMessageDeflateFactory(
                     server_max_window_bits=_WINDOW_BITS,
@@ -159,11 +160,17 @@ class DoorSession:
                 self._socket.receive_data(data)
                 if self._socket.handshake_exc is not None:
                     break
+            rejected = ""
             if events and isinstance(events[0], Request):
-                self._socket.send_response(self._socket.accept(events[0]))
+                rejected = rejection(events[0].headers, self._options.origins)
+                self._socket.send_response(
+                    self._socket.reject(HTTPStatus.FORBIDDEN, f"{rejected}\n")
+                    if rejected
+                    else self._socket.accept(events[0])
+                )
             await self._flush()
         if self._socket.state is not State.OPEN:
-            self.end = f"no WebSocket handshake: {self._socket.handshake_exc}"
+            self.end = rejected or f"no WebSocket handshake: {self._socket.handshake_exc}"
             return False
         self._protocol = self._protocols(self._socket.subprotocol)
         return True

@@ -5,7 +5,9 @@ import struct
 from typing import Any
 
 import pytest
+from websockets.datastructures import Headers
 
+from appliance.features.doors.origins import rejection
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
 from roswire.standard import standard_definitions
 from tests.support.door_world import DOOR, WebSocketClient, door_world
@@ -220,13 +222,38 @@ async def test_a_client_that_asks_without_reading_is_disconnected() -> None:
 
 
 @pytest.mark.parametrize(
-    ("origin", "status"),
-    [(None, 101), ("https://robot.example", 101), ("https://evil.example", 403), ("null", 403)],
+    ("origin", "status"), [(None, 101), ("https://robot.example", 101), ("https://evil.example", 403)]
 )
 async def test_only_listed_pages_may_connect(origin: str | None, status: int) -> None:
     async with door_world() as world:
         client = await world.client(origin=origin)
         assert client.response is not None and client.response.status_code == status
+        assert status == 101 or b"'https://evil.example' may not connect" in (client.response.body or b"")
+
+
+@pytest.mark.parametrize(
+    ("origins", "host", "accepted"),
+    [
+        ([], "evil.example:9090", True),  # not a browser
+        (["http://10.0.0.2:9090"], "10.0.0.2:9090", True),
+        (["https://[fd00::2]:9090"], "[fd00::2]:9090", True),
+        (["http://localhost:9090"], "localhost:9090", True),
+        (["http://evil.example:9090"], "evil.example:9090", False),  # whose name has the door's address
+        (["http://10.0.0.2:8080"], "10.0.0.2:9090", False),
+        (["http://localhost.evil.example:9090"], "localhost.evil.example:9090", False),
+        (["http://10.0.0.2.evil.example"], "10.0.0.2.evil.example", False),
+        (["http://evil.example@10.0.0.2"], "10.0.0.2", False),
+        (["null"], "10.0.0.2:9090", False),
+        ([""], "", False),
+        (["https://robot.example", "https://evil.example"], "10.0.0.2:9090", False),
+        (["https://robot.example."], "10.0.0.2:9090", False),
+    ],
+)
+def test_an_origin_that_equals_the_host_is_accepted_only_for_addresses(
+    origins: list[str], host: str, accepted: bool
+) -> None:
+    headers = Headers([("Host", host), *(("Origin", origin) for origin in origins)])
+    assert (rejection(headers, ("https://robot.example",)) == "") is accepted
 
 
 @pytest.mark.parametrize(
