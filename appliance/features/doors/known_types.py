@@ -17,7 +17,8 @@ from appliance.features.doors.values import MessageCodec, ValueLimits
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 
-_MOST_CODECS = 512
+_MOST_CHARACTERS = 500_000
+"""The size of all kept definitions together. A codec takes up to 140 bytes for each character of its definition."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,13 @@ class DoorMessage:
 
 
 class KnownTypes:
-    """The types of one door. The least recently used of many codecs are made again when they are needed."""
+    """The types of one door. If they are many, those that were not used for the longest time are forgotten."""
 
     def __init__(self, defined: Definitions, limits: ValueLimits) -> None:
         self._defined = defined
         self._limits = limits
         self._codecs: OrderedDict[tuple[str, str], tuple[MessageCodec, Definitions]] = OrderedDict()
+        self._sizes: dict[tuple[str, str], int] = {}
         self._latest: dict[str, str] = {}  # the md5sum of each type that a header defined
 
     def learn(self, header: Mapping[str, str]) -> MessageCodec:
@@ -80,6 +82,7 @@ class KnownTypes:
                 )
             self._keep(name, self._defined.md5sum(name), self._defined)
             known = self._codecs[name, self._latest[name]]
+        self._codecs.move_to_end((name, self._latest[name]))
         return known
 
     def service(self, name: str) -> tuple[MessageCodec, MessageCodec, Definitions]:
@@ -98,9 +101,11 @@ class KnownTypes:
     def _keep(self, name: str, md5sum: str, definitions: Definitions) -> MessageCodec:
         codec = MessageCodec(definitions, name, self._limits)
         self._codecs[name, md5sum] = codec, definitions
+        self._sizes[name, md5sum] = len(definitions.full_text(name))
         self._latest[name] = md5sum
-        if len(self._codecs) > _MOST_CODECS:
+        while sum(self._sizes.values()) > _MOST_CHARACTERS and len(self._codecs) > 1:
             (oldest, oldest_md5sum), _ = self._codecs.popitem(last=False)
+            del self._sizes[oldest, oldest_md5sum]
             if self._latest.get(oldest) == oldest_md5sum:
                 del self._latest[oldest]
         return codec

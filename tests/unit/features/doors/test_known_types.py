@@ -1,0 +1,65 @@
+"""The types of a door: known from ROS's own packages or from publishers, within a limit of memory."""
+
+import pytest
+
+from appliance.features.doors.known_types import KnownTypes
+from appliance.features.doors.values import ValueLimits
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.standard import standard_definitions
+
+
+def header(name: str, text: str) -> dict[str, str]:
+    md5sum = Definitions.from_full_text(name, text).md5sum(name)
+    return {"type": name, "md5sum": md5sum, "message_definition": text}
+
+
+@pytest.fixture
+def types() -> KnownTypes:
+    return KnownTypes(standard_definitions(), ValueLimits())
+
+
+def test_a_type_is_known_once_a_publisher_sent_its_definition(types: KnownTypes) -> None:
+    """The newest definition is used for publishing; a message is read by that of its own publisher."""
+    with pytest.raises(DefinitionError, match="no publisher of it has been heard"):
+        types.message("own/Load")
+    first = types.learn(header("own/Load", "int8 x"))
+    second = types.learn(header("own/Load", "int16 x"))
+    assert types.learn(header("own/Load", "int8 x")) is first
+    assert types.message("own/Load")[0] is second
+    assert types.message("std_msgs/String")[0].name == "std_msgs/String"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"md5sum": "0" * 32}, "does not have its md5sum 00000"),
+        ({"message_definition": "own/Other y"}, "own/Other, which is not defined"),
+        ({"message_definition": "own/Load y"}, "own/Load contains own/Load"),
+        ({"type": "", "message_definition": ""}, "not a message type"),
+    ],
+)
+def test_a_definition_that_cannot_be_used_is_an_error(
+    types: KnownTypes, change: dict[str, str], words: str
+) -> None:
+    with pytest.raises(DefinitionError, match=words):
+        types.learn(header("own/Load", "int8 x") | change)
+
+
+def test_a_type_with_too_large_messages_is_an_error(types: KnownTypes) -> None:
+    with pytest.raises(DefinitionError, match="more than 4294967296 bytes"):
+        types.learn(header("own/Load", "float64[4000000000] x"))
+
+
+def test_many_large_definitions_are_forgotten_in_order(types: KnownTypes) -> None:
+    """Publishers that define more and more types take bounded memory, and their types can be learned again."""
+    types.message("std_msgs/String")
+    large = "\n".join(f"int8 f{number}" for number in range(4000))
+    for number in range(15):
+        types.learn(header(f"own/Large{number}", large))
+        types.message("std_msgs/String")  # in use
+    assert types.message("own/Large14")
+    assert types.message("std_msgs/String")
+    with pytest.raises(DefinitionError):
+        types.message("own/Large0")
+    assert types.learn(header("own/Large0", large)) is types.message("own/Large0")[0]
