@@ -26,7 +26,7 @@ from appliance.features.doors.requests import (
     UnsubscribeTopic,
     WriteParameter,
 )
-from appliance.features.doors.surroundings import SeenService, SeenTopic, Surroundings
+from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted
 from roswire.names import resolve
@@ -151,7 +151,7 @@ class Foxglove:
         self._calls: dict[int, tuple[int, int]] = {}  # service and call of the client
         self._number = 0
         self._graph: dict[str, dict[str, Sequence[str]]] | None = None  # the last one that the client got
-        self._seen: Surroundings | None = None
+        self._seen: DoorSurroundings | None = None
         self._carry_out: dict[type[Any], Callable[[Any], list[DoorRequest]]] = {
             _Subscribe: self._subscribe,
             _Unsubscribe: self._unsubscribe,
@@ -345,7 +345,7 @@ class Foxglove:
 
     # --- what the door sees ---
 
-    def surroundings(self, seen: Surroundings) -> None:
+    def surroundings(self, seen: DoorSurroundings) -> None:
         """Announce what is new, and withdraw what is gone. Raises `ViewerStalledError`."""
         if seen.denial and (self._seen is None or self._seen.denial != seen.denial):
             self._refuse(seen.denial)
@@ -368,7 +368,7 @@ class Foxglove:
     def _id(self, seen: SeenTopic | SeenService) -> int:
         return self._ids.setdefault(seen, len(self._ids) + 1)
 
-    def _send_graph(self, seen: Surroundings) -> None:
+    def _send_graph(self, seen: DoorSurroundings) -> None:
         now: dict[str, dict[str, Sequence[str]]] = {
             "publishedTopics": dict(seen.graph.publishers),
             "subscribedTopics": dict(seen.graph.subscribers),

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Sequence
 
 from appliance.features.doors.known_types import KnownTypes
 from appliance.features.doors.rosapi import Sight
-from appliance.features.doors.surroundings import SeenService, SeenTopic, Surroundings, VisibleGraph
+from appliance.features.doors.surroundings import DoorSurroundings, SeenService, SeenTopic, VisibleGraph
 from roswire.errors import DefinitionError, RosError
 
 _FRESH_SECONDS = 1.0
@@ -31,9 +31,9 @@ class Lookout:
         self._asked: dict[str, tuple[str, ...]] = {}  # publishers or providers, when it was asked about
         self._service_types: dict[str, str] = {}
         self._lock = asyncio.Lock()
-        self._last: tuple[float, Surroundings] | None = None
+        self._last: tuple[float, DoorSurroundings] | None = None
 
-    async def look(self) -> Surroundings:
+    async def look(self) -> DoorSurroundings:
         """Return the present surroundings; those of the last second are good enough."""
         async with self._lock:
             now = asyncio.get_running_loop().time()
@@ -41,11 +41,11 @@ class Lookout:
                 self._last = now, await self._look()
             return self._last[1]
 
-    async def _look(self) -> Surroundings:
+    async def _look(self) -> DoorSurroundings:
         try:
             graph = await self._sight.graph()
         except RosError as error:
-            return Surroundings(VisibleGraph({}, {}, {}, {}), (), (), str(error))
+            return DoorSurroundings(VisibleGraph({}, {}, {}, {}), (), (), str(error))
         await self._ask(graph)
         topics = [
             SeenTopic(topic, kind, text)
@@ -55,7 +55,7 @@ class Lookout:
         services = [
             seen for service in sorted(graph.services) if (seen := self._service(service)) is not None
         ]
-        return Surroundings(graph, topics, services)
+        return DoorSurroundings(graph, topics, services)
 
     async def _ask(self, graph: VisibleGraph) -> None:
         """Ask about topics without a known definition, and about services without a known type."""

@@ -53,7 +53,7 @@ from appliance.features.doors.rosbridge_frames import (
     json_frame,
     publish_frame,
 )
-from appliance.features.doors.surroundings import Surroundings
+from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.errors import PeerError, quoted
 from roswire.names import resolve
@@ -306,7 +306,7 @@ class Rosbridge:
     def parameters(self, _values: Mapping[str, Any], _reply_to: str | None) -> None:
         """Do nothing: this protocol has parameters as services of rosapi."""
 
-    def surroundings(self, _seen: Surroundings) -> None:
+    def surroundings(self, _seen: DoorSurroundings) -> None:
         """Do nothing: clients of this protocol call rosapi."""
 
     def ask(self, service: str, values: Raw) -> str:

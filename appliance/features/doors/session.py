@@ -32,7 +32,7 @@ from appliance.features.doors.known_types import DoorMessage
 from appliance.features.doors.lookout import Lookout
 from appliance.features.doors.origins import rejection
 from appliance.features.doors.requests import DoorRequest, Frame
-from appliance.features.doors.surroundings import Surroundings
+from appliance.features.doors.surroundings import DoorSurroundings
 from appliance.features.doors.viewer_queue import ViewerStalledError
 from roswire.errors import RosError
 from roswire.node.network import ByteWriter
@@ -74,7 +74,7 @@ class ClientProtocol(Protocol):
     def parameters(self, values: Mapping[str, Any], reply_to: str | None) -> None:
         """Send the values of parameters."""
 
-    def surroundings(self, seen: Surroundings) -> None:
+    def surroundings(self, seen: DoorSurroundings) -> None:
         """Announce what the door sees; only if `wants_surroundings`."""
 
     def ask(self, service: str, values: Raw) -> str:

@@ -39,7 +39,7 @@ class SeenService:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class DoorSurroundings:
     """The result of a look; `denial` has the reason if the policy allows none."""
 
     graph: VisibleGraph

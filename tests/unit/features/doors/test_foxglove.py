@@ -9,7 +9,7 @@ import pytest
 
 from appliance.features.doors.foxglove import SUBPROTOCOLS, Foxglove, FoxgloveLimits
 from appliance.features.doors.requests import PublishMessage, SubscribeTopic
-from appliance.features.doors.surroundings import SeenTopic, Surroundings, VisibleGraph
+from appliance.features.doors.surroundings import DoorSurroundings, SeenTopic, VisibleGraph
 from appliance.features.doors.viewer_queue import ViewerQueue
 from roswire.definitions import Definitions
 from roswire.node import MessageType, RosNode, ServiceFailedError, ServiceType
@@ -165,7 +165,7 @@ def viewer(**limits: int) -> tuple[Foxglove, ViewerQueue[int]]:
     queue: ViewerQueue[int] = ViewerQueue()
     foxglove = Foxglove("/door_alice", FoxgloveLimits(**limits), queue)
     graph = VisibleGraph({"/t": ["/n"]}, {}, {}, {"/t": "a/B"})
-    foxglove.surroundings(Surroundings(graph, [SeenTopic("/t", "a/B", "int8 x")], []))
+    foxglove.surroundings(DoorSurroundings(graph, [SeenTopic("/t", "a/B", "int8 x")], []))
     while foxglove.next_frame(0.0) is not None:
         pass
     return foxglove, queue

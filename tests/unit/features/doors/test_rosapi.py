@@ -155,7 +155,7 @@ async def test_parameters_are_set_as_json_or_as_a_string(rosapi: Rosapi) -> None
         ("/rosapi/service_request_details", '{"type":"own/Type"}', "does not know this service type"),
     ],
 )
-async def test_what_cannot_be_answered_fails_in_words(
+async def test_a_call_without_an_answer_fails_in_words(
     rosapi: Rosapi, service: str, values: str, words: str
 ) -> None:
     with pytest.raises((PeerError, MasterDenialError)) as caught:
