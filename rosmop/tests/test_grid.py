@@ -58,7 +58,7 @@ HEAD = "s() { int n = 0; geometry_msgs::Twist twist; "
 EVENT = "event e(int x) /t std_msgs/Int32 '{data:x}'"
 SLOW = {
     "nothing": (f"{EVENT} {{ if (x > 3) {{ return; }} n = x; }}", []),
-    "a whole topic": (f"{EVENT} {{\n n = sin(x); }}", [("/t", "", 2, "calls sin")]),
+    "a whole topic": (f"{EVENT} {{\n n = exp(x); }}", [("/t", "", 2, "calls exp")]),
     "a branch": (
         f"{EVENT} {{ if (x > 3) {{\n PUBLISH(/told, geometry_msgs/Twist, twist); }} }}",
         [("/t", "event s.e", 2, "publishes a message")],
@@ -68,12 +68,12 @@ SLOW = {
         [("/t", "event s.e", 2, "sends the safe message")],
     ),
     "a helper function": (
-        f"int f(int x) {{ if (x > 3) {{\n return sin(x); }} return x; }} {EVENT} {{ n = f(x); }}",
-        [("/t", "event s.e", 2, "calls sin")],
+        f"int f(int x) {{ if (x > 3) {{\n return exp(x); }} return x; }} {EVENT} {{ n = f(x); }}",
+        [("/t", "event s.e", 2, "calls exp")],
     ),
     "a handler": (
-        f"{EVENT} {{ }} fsm : idle [ e -> idle ] @idle {{\n n = sin(n); }}",
-        [("/t", "handler @idle of s", 2, "calls sin")],
+        f"{EVENT} {{ }} fsm : idle [ e -> idle ] @idle {{\n n = exp(n); }}",
+        [("/t", "handler @idle of s", 2, "calls exp")],
     ),
     "time bounds": (
         f"{EVENT} {{ }}\n pattern: globally: no e within 1ms @violation {{ n = 1; }}",
