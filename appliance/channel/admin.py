@@ -436,7 +436,7 @@ class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="mo
     "operator", "PATCH", "/v1/monitors/{name}/given", name="set_monitor", body=bodies.GivenValues, of=MONITORS,
     problems=_NO_MONITOR,
 )  # fmt: skip
-class MonitorSet(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="monitor set"):
+class MonitorGive(AdminRequest[monitor_answers.GivenSet], frozen=True, tag="monitor set"):
     """Set constants that are given to a monitor, within their ranges; its state and its text stay."""
 
     name: OneMonitor

@@ -581,7 +581,7 @@ class SpecificationManager(Revisions[MonitorRevisionRow]):
             await self.rollout.carried_out()
             return self._switched(held)
 
-    async def give(self, request: admin.MonitorSet, who: str) -> answers.GivenSet:
+    async def give(self, request: admin.MonitorGive, who: str) -> answers.GivenSet:
         """Set constants that are given to a monitor; return everything that is given to it.
 
         Raises `UnknownMonitorError`. Raises `SpecificationsRefusedError` for a value outside of its range.

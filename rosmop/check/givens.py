@@ -78,7 +78,7 @@ def _number(kind: value_types.Type, text: str, position: Position) -> int | floa
 
 def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> tree.Specification:
     """Return a specification with topics in the place of their given names."""
-    topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.GivenTopic)}
+    topics = {one.name: one.topic for one in specification.givens if isinstance(one, tree.TopicDeclaration)}
     topics |= {name: topic for name, topic in given.items() if name in topics}
     renamed: tree.Specification = _renamed(specification, topics) if topics else specification
     return renamed
@@ -87,11 +87,10 @@ def with_topics(specification: tree.Specification, given: Mapping[str, str]) -> 
 def _renamed(node: Any, topics: Mapping[str, str]) -> Any:
     if isinstance(node, tuple):
         return tuple(_renamed(part, topics) for part in node)
-    if not isinstance(node, tree.SyntaxNode) or isinstance(node, tree.GivenTopic):
+    if not isinstance(node, tree.SyntaxNode) or isinstance(node, tree.TopicDeclaration):
         return node
     changed: dict[str, Any] = {}
-    for field in fields(node):
-        part = getattr(node, field.name)
+    for field, part in zip(fields(node), tree.fields_of(node), strict=True):
         if field.name == "topic":
             changed[field.name] = topics.get(part, part)
         elif isinstance(part, tuple | tree.SyntaxNode):
@@ -105,7 +104,7 @@ def given_topics(
     """Return the topics of a specification that a load may replace, and report invalid ones."""
     found: dict[str, GivenTopic] = {}
     for node in specification.givens:
-        if isinstance(node, tree.GivenTopic):
+        if isinstance(node, tree.TopicDeclaration):
             topic = given.get(node.name, node.topic)
             try:
                 check_topic(topic, node.position)

@@ -652,7 +652,7 @@ class MonitorSet:
     def give(self, values: GivenValues) -> None:
         """Set given constants, by specification and name; the others get their defaults.
 
-        The state stays. Unknown names, and values outside of their ranges, are ignored: whoever sets them checks them.
+        The state stays. Unknown names, and values outside of their ranges, are ignored: the caller has checked them.
         """
         for part in (self, *self.shadows):
             for monitor in part._monitors:
@@ -745,8 +745,8 @@ class MonitorSet:
     def _judge_published(self, outcome: Outcome) -> None:
         """Give published messages to the monitors behind their publisher, whose own go to those behind them.
 
-        What a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. Then there is no loop:
-        each other message goes only further back, and a deadline that a message sets is later than the message.
+        A message that a remedy publishes at a deadline also goes to its own monitor if that is `ordered`. There is
+        still no loop: each other message goes only further back, and its deadlines are later than a message.
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):

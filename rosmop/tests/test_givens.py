@@ -45,7 +45,7 @@ def test_a_value_is_set_between_two_messages_and_the_state_stays(module: bool) -
     assert monitors.value("cap", "seen") == 8 + 6 * 3
 
 
-def test_values_are_no_part_of_the_state() -> None:
+def test_values_are_outside_of_the_state() -> None:
     """A kept state, another text of another monitor, and the check for an initial state ignore them."""
     monitors = on_module(compiled_from({"x.rv": CAP}, definitions()), "drop")
     monitors.start(0)
@@ -84,7 +84,7 @@ def test_the_module_and_the_interpreter_agree_for_all_values() -> None:
 
 
 def test_a_topic_renames_events_safe_messages_and_publications() -> None:
-    """A state belongs to the text and to its topics, so another topic begins anew; unknown names are ignored."""
+    """A state belongs to the text and to its topics, so another topic starts again; unknown names are ignored."""
     given: tuple[dict[str, str], ...] = (
         {},
         {"command": "/base/cmd"},
@@ -126,7 +126,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("given", "why"), REFUSED)
-def test_what_cannot_be_given_is_refused(given: str, why: str) -> None:
+def test_invalid_givens_are_refused(given: str, why: str) -> None:
     """The error says what to write."""
     body = given if "} {" in given else f"{given} }} {{"
     errors = refused(f"s() given {{ {body} event e() /t std_msgs/Empty '{{}}' {{ }} }}")

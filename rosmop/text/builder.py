@@ -155,8 +155,8 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
             self.at(meta), kind, str(name), found["value"], (found["unit"] or "").strip(), bounds
         )
 
-    def given_topic(self, meta: Meta, _word: Any, name: Any, topic: Any) -> tree.GivenTopic:
-        return tree.GivenTopic(self.at(meta), str(name), str(topic))
+    def given_topic(self, meta: Meta, _word: Any, name: Any, topic: Any) -> tree.TopicDeclaration:
+        return tree.TopicDeclaration(self.at(meta), str(name), str(topic))
 
     prototype = _unsaid
 

@@ -453,7 +453,7 @@ class GivenValue(SyntaxNode):
 
 
 @dataclass(frozen=True)
-class GivenTopic(SyntaxNode):
+class TopicDeclaration(SyntaxNode):
     """`topic name = /default;`, a name for a topic that a load may replace."""
 
     name: str
@@ -484,7 +484,7 @@ class Specification(SyntaxNode):
     events: tuple[EventDefinition, ...]
     properties: tuple[Property, ...]
     safes: tuple[SafeDeclaration, ...] = ()
-    givens: tuple[GivenValue | GivenTopic, ...] = ()
+    givens: tuple[GivenValue | TopicDeclaration, ...] = ()
 
 
 @dataclass(frozen=True)

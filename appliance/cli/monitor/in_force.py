@@ -244,7 +244,7 @@ def set_given(
     """
     if values:
         wanted: dict[str, GivenValue] = dict(_assigned(value, "NAME=VALUE") for value in values)
-        answer = appliance.answer_or_exit(admin.MonitorSet(name, wanted))
+        answer = appliance.answer_or_exit(admin.MonitorGive(name, wanted))
         given = answer.given
     else:
         rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors

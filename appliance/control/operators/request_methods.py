@@ -81,7 +81,7 @@ def request_methods(
         RequestMethod(admin.MonitorConfirm, monitors.confirm, who=True),
         RequestMethod(admin.MonitorSwitch, monitors.switch, who=True),
         RequestMethod(admin.MonitorShadow, monitors.shadow, who=True),
-        RequestMethod(admin.MonitorSet, monitors.give, who=True),
+        RequestMethod(admin.MonitorGive, monitors.give, who=True),
         RequestMethod(admin.MonitorResume, monitors.resume, who=True),
         RequestMethod(admin.HostList, hosts.listed),
         RequestMethod(admin.HostEndpoint, hosts.endpoint),

@@ -45,7 +45,7 @@ async def test_a_value_is_set_recorded_and_kept(desk: Desk) -> None:
         monitors.tag,
         [one["sha256"] for event, one in desk.trail.heard if event == "specifications loaded"],
     )
-    answer = await monitors.give(admin.MonitorSet("cap", {"vMax": "0.3 m/s", "on": False, "n": 3}), "eve")
+    answer = await monitors.give(admin.MonitorGive("cap", {"vMax": "0.3 m/s", "on": False, "n": 3}), "eve")
     assert (answer.changed, monitors.revision, monitors.tag != before) == (["vMax", "on"], 2, True)
     assert desk.sent[-1] == messages.MonitorGiven("cap", {"vMax": 0.3, "on": False, "n": 3})
     [record] = [fields for event, fields in desk.trail.heard if event == "monitor set"]
@@ -58,7 +58,7 @@ async def test_a_value_is_set_recorded_and_kept(desk: Desk) -> None:
         assert stated(again) == {"vMax": 0.3, "on": False, "n": 3}
         assert values(again) == {"vMax": 0.3, "n": 3, "on": False, "command": "/cmd"}
     count = len(desk.sent)
-    assert (await again.give(admin.MonitorSet("cap", {"vMax": 0.3}), "eve")).changed == []
+    assert (await again.give(admin.MonitorGive("cap", {"vMax": 0.3}), "eve")).changed == []
     assert len(desk.sent) == count
 
 
@@ -79,7 +79,7 @@ async def test_a_value_is_set_recorded_and_kept(desk: Desk) -> None:
 async def test_a_wrong_value_changes_nothing(desk: Desk, name: str, value: Any, why: str) -> None:
     monitors = await loaded(desk)
     with pytest.raises(SpecificationsRefusedError) as caught:
-        await monitors.give(admin.MonitorSet("cap", {"vMax": 1, name: value}), "eve")
+        await monitors.give(admin.MonitorGive("cap", {"vMax": 1, name: value}), "eve")
     assert why in caught.value.findings[-1]
     assert (values(monitors)["vMax"], stated(monitors)) == (0.22, {})
 
@@ -137,4 +137,4 @@ async def test_with_site_keys_a_load_cannot_replace_a_signed_topic(desk: Desk) -
     with pytest.raises(SpecificationsRefusedError, match="the site signs the topics"):
         await monitors.load(order, "eve")
     await monitors.load(admin.MonitorLoad({"cap.rv": TEXT}, signatures={"cap.rv": signed(TEXT)}), "eve")
-    assert (await monitors.give(admin.MonitorSet("cap", {"vMax": 1}), "eve")).changed == ["vMax"]
+    assert (await monitors.give(admin.MonitorGive("cap", {"vMax": 1}), "eve")).changed == ["vMax"]
