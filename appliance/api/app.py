@@ -1,6 +1,7 @@
 """Build the REST application: its routes, the answers to errors, and the contract (OpenAPI)."""
 
 import asyncio
+import pkgutil
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -28,8 +29,8 @@ from appliance.api.routes import (
 from appliance.api.routes.contract import contract_of
 from appliance.api.routes.contract_page import PATH, page_of
 from appliance.base.validation_messages import meant, refusal
-from appliance.features.evidence import evidence_routes
 from appliance.features.recorder import recording_routes
+from appliance.features.table import FEATURES
 
 _MOST_SHOWN = 5
 _DESCRIPTION = """\
@@ -68,10 +69,12 @@ def build_app(services: Services) -> FastAPI:
         recording_routes,
         audit_summary,  # before /v1/audit/{record_id}
         audit,
-        evidence_routes,
-        metrics_route,
-        live,
     ):
+        app.include_router(part.routes(services))
+    for feature in FEATURES:
+        if feature.routes is not None:
+            app.include_router(pkgutil.resolve_name(feature.routes)(services))
+    for part in (metrics_route, live):
         app.include_router(part.routes(services))
     app.include_router(console.routes(services.settings))
     app.openapi = lambda: contract_of(app)  # type: ignore[method-assign]  # FastAPI's own way to change the contract

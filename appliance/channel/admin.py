@@ -1,10 +1,10 @@
 """The requests of operators' tools to the running appliance. Each request names the struct of its answer.
 
 The admin socket carries one JSON document per line in each direction, and one request per connection at a time. It is
-in the state directory; only its owner and root may use it. It accepts `AnyRequest`: all requests except
-`ChallengeWanted`.
+in the state directory; only its owner and root may use it. It accepts all requests except `ChallengeWanted`.
 
-Over REST, the api process passes on `RestRequest`: all requests with `@rest`. It gets the same JSON document back.
+Over REST, the api process passes on all requests with `@rest`. It gets the same JSON document back.
+`channel/operations.py` has both unions, with the requests of features.
 
 `@rest` defines a request's row in the table of operations (`channel/rest_operation.py`): method, path, role, ETag. The
 docstring of a request is its description in the REST contract, unless the row has `words`.
@@ -14,13 +14,11 @@ docstring of a request is its description in the REST contract, unless the row h
 
 import functools
 from typing import (
-    TYPE_CHECKING,
     Annotated,
     Any,
     Generic,
     Literal,
     TypeVar,
-    Union,
     cast,
     get_args,
 )
@@ -43,7 +41,6 @@ from appliance.channel.answers import (
 )
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.rest_operation import Operation, Versioned, parameter, rest, rows
-from appliance.features.evidence import evidence_answers
 from appliance.features.recorder import recording_answers
 
 A = TypeVar("A")
@@ -724,46 +721,13 @@ class AuthorityWanted(AdminRequest[host_answers.AuthorityCertificate], frozen=Tr
     """The authority's certificate, in PEM."""
 
 
-@rest("viewer")
-class LogSealed(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="audit seal"):
-    """Have all that was recorded sealed by a signed checkpoint, now."""
-
-
-@rest("viewer")
-class EvidenceExported(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="evidence exported"):
-    """Record that a bundle was made whose manifest has this hash, and seal the record.
-
-    The bundle has this number of `records`, from `since` until before `until` (nanoseconds since the epoch), and the
-    `recording` of this id.
-    """
-
-    manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-    since: int
-    until: int
-    records: int
-    recording: str = ""
-
-
 @rest("viewer", "GET", "/v1/challenge", name="challenge", tag="status")
 class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="challenge"):
     """A challenge: an order that changes something is signed under one, and each is good once."""
 
 
-OPERATIONS = tuple(operation for operations in rows().values() for operation in operations)
-CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
-"""Requests that change something in the name of a token. Control requires the client's HTTP request for each."""
-
-ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-"""All requests that change something over REST, in the name of a token or of a host."""
-
-if TYPE_CHECKING:
-    RestRequest = AdminRequest[Any]
-    AnyRequest = AdminRequest[Any]
-else:
-    RestRequest = Union[tuple(rows())]  # noqa: UP007  there are as many as there are
-    AnyRequest = Union[
-        (TokenAdd, TokenRotate, *(request for request in rows() if request is not ChallengeWanted))
-    ]
+CORE_REQUESTS: tuple[type[AdminRequest[Any]], ...] = (TokenAdd, TokenRotate, *rows())
+"""The requests of this module. `channel/operations.py` adds those of features."""
 
 
 def operation_of(request: AdminRequest[Any]) -> Operation | None:

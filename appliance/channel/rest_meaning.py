@@ -16,8 +16,9 @@ from urllib.parse import parse_qs, quote, unquote, urlencode
 import msgspec
 
 from appliance.base.timestamps import parse_date
-from appliance.channel.admin import OPERATIONS, AdminRequest, operation_of
+from appliance.channel.admin import AdminRequest, operation_of
 from appliance.channel.messages.api import ClientRequest
+from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_operation import Operation, plain
 
 _TAG = re.compile(r'"([\x21\x23-\x7e]{1,90})"')

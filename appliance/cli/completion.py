@@ -5,6 +5,7 @@ Completion never prints errors: without access to a running appliance, it offers
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -34,5 +35,13 @@ def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Comple
 monitors = _names(admin.MonitorsWanted(), lambda body: [row.name for row in body.monitors])
 hosts = _names(admin.HostList(), lambda body: [row.name for row in body.hosts])
 tokens = _names(admin.TokenList(), lambda body: [row.name for row in body.tokens])
-recordings = _names(admin.RecordingsWanted(), lambda body: [row.id for row in body.recordings])
 topics = _names(admin.GraphWanted(), lambda body: [row.name for row in body.topics])
+
+
+def recordings(context: typer.Context, incomplete: str) -> list[str]:
+    """Complete the ids of recordings, if the appliance has a recorder."""
+    from appliance.channel.operations import request_named  # noqa: PLC0415  only completion needs all features
+
+    wanted: Any = request_named("recordings")
+    ids = _names(wanted(), lambda body: [row.id for row in body.recordings]) if wanted is not None else None
+    return [] if ids is None else ids(context, incomplete)

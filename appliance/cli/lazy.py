@@ -4,8 +4,9 @@ Importing all modules takes a second of processor time, so `rosrv status` must n
 completion take the verbs' names from the table of verbs, and the first sentences of help from the source files.
 """
 
-import importlib
+import functools
 import inspect
+import pkgutil
 from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
@@ -15,13 +16,22 @@ from typer.core import TyperCommand, TyperGroup
 
 from appliance.base.option_group import GroupedVerb
 from appliance.base.validation_messages import refusal
-from appliance.base.verbs import Group, Verb, Verbs
+from appliance.cli.verb_table import Group, Verb, Verbs, joined
 
 
-def application(verbs: Verbs, *, callback: Callable[..., None] | None = None, **settings: Any) -> typer.Typer:
-    """Return a typer application with these verbs; `callback` takes the options before the verb."""
+def application(
+    verbs: Verbs,
+    *,
+    further: Callable[[], Verbs] = dict,
+    callback: Callable[..., None] | None = None,
+    **settings: Any,
+) -> typer.Typer:
+    """Return a typer application with these verbs; `callback` takes the options before the verb.
+
+    `further` returns more verbs. It is called for the help, for completion and for a name that `verbs` lacks.
+    """
     app = typer.Typer(
-        cls=_group_of(verbs),
+        cls=_group_of(verbs, further),
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -35,17 +45,33 @@ def _nothing() -> None:
     pass
 
 
-def _group_of(verbs: Verbs) -> type[TyperGroup]:
+def _group_of(verbs: Verbs, further: Callable[[], Verbs]) -> type[TyperGroup]:
     class _Lazy(TyperGroup):
         """A group whose commands are imported when they are run."""
 
-        def __init__(self, **settings: Any) -> None:
-            super().__init__(**settings)
-            self.commands = {name: _command_of(verb, name) for name, verb in verbs.items()}
+        # click sets it
+        commands = property(lambda self: self.all_commands, lambda _self, _given: None)
+
+        @functools.cached_property
+        def own_commands(self) -> dict[str, Any]:
+            """The commands of `verbs`."""
+            return {name: _command_of(verb, name) for name, verb in verbs.items()}
+
+        @functools.cached_property
+        def all_commands(self) -> dict[str, Any]:
+            """The commands of `verbs` and `further`, in the order of the help."""
+            own, table = self.own_commands, joined(verbs, further())
+            return {name: own.get(name) or _command_of(verb, name) for name, verb in table.items()}
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            """Return a command; import features only for a command that the core lacks."""
+            return self.own_commands.get(cmd_name) or super().get_command(ctx, cmd_name)
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Return the verb. For an unknown name without a close match, list all verbs."""
             name = args[0]
+            if name in self.own_commands:
+                return super().resolve_command(ctx, args)
             if name not in self.commands and name[:1] != "-" and not get_close_matches(name, self.commands):
                 shown = [verb for verb, command in self.commands.items() if not command.hidden]
                 ctx.fail(f"No such command {name!r}; use one of: {', '.join(shown)}.")
@@ -90,7 +116,7 @@ class _Deferred(TyperCommand):
 
 def loaded(verb: Verb, name: str) -> Any:
     """Import a verb and return its command."""
-    found = getattr(importlib.import_module(verb.module), verb.function)
+    found = pkgutil.resolve_name(verb.path)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     function, kind = (
         (found.function, found.command) if isinstance(found, GroupedVerb) else (found, TyperCommand)

@@ -1,4 +1,4 @@
-"""Define the `rosrv` command: the table of its verbs, and the handling of errors that the verbs do not catch."""
+"""Define the `rosrv` command: the table of the core's verbs, and the handling of errors that the verbs do not catch."""
 
 import errno
 import os
@@ -10,14 +10,13 @@ import typer
 
 from appliance import __version__
 from appliance.base.user_errors import UserError
-from appliance.base.verbs import Group, Verb
 from appliance.cli.lazy import application
-from appliance.features.table import FEATURE_VERBS
+from appliance.cli.verb_table import Group, Verb, Verbs, joined
 from rosmop.tool.options import SUMMARIES
 
 _CONFIRM = "Keep a change loaded with --confirm-within. Exit status 1 if there is nothing to confirm."
 
-VERBS: dict[str, Verb | Group] = {
+VERBS: Verbs = {
     "up": Verb("up:up"),
     "status": Verb("status_verb:status"),
     "limits": Verb("limits_verb:limits"),
@@ -43,14 +42,6 @@ VERBS: dict[str, Verb | Group] = {
             "verify": Verb("audit.audit_verbs:verify"),
             "checkpoints": Verb("audit.audit_verbs:checkpoints"),
             "export": Verb("audit.audit_verbs:export"),
-        },
-    ),
-    "evidence": Group(
-        "Export and verify signed evidence of an incident.",
-        {
-            "export": Verb("evidence_verbs:export_evidence"),
-            "verify": Verb("evidence_verbs:verify"),
-            "verifier": Verb("evidence_verbs:verifier"),
         },
     ),
     "policy": Group(
@@ -149,7 +140,6 @@ VERBS: dict[str, Verb | Group] = {
             "unblock": Verb("host.block_verbs:unblock"),
         },
     ),
-    **FEATURE_VERBS,
     "fleet": Group(
         "Push the audit log to a collector of many robots.",
         {"join": Verb("fleet_verbs:join"), "leave": Verb("fleet_verbs:leave")},
@@ -170,6 +160,18 @@ VERBS: dict[str, Verb | Group] = {
 }
 
 
+def feature_verbs() -> Verbs:
+    """Return the verbs of all features."""
+    from appliance.features.table import FEATURES  # noqa: PLC0415  most verbs of the core do not need it
+
+    return {name: group for feature in FEATURES for name, group in feature.verbs.items()}
+
+
+def all_verbs() -> Verbs:
+    """Return the verbs of the core and of all features, in the order of the help."""
+    return joined(VERBS, feature_verbs())
+
+
 def _show_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"rosrv {__version__}")
@@ -186,7 +188,11 @@ def _global_options(
 
 
 app = application(
-    VERBS, callback=_global_options, name="rosrv", help="A network-security appliance for ROS 1 robots."
+    VERBS,
+    further=feature_verbs,
+    callback=_global_options,
+    name="rosrv",
+    help="A network-security appliance for ROS 1 robots.",
 )
 
 

@@ -7,3 +7,7 @@ class UnknownThingError(Exception):
 
 class SenselessError(Exception):
     """The request makes no sense."""
+
+
+class UnavailableError(Exception):
+    """The appliance cannot do it now; the message gives the reason."""

@@ -21,7 +21,7 @@ from appliance.control.operators.switched_off import SwitchedOffWatch
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.control.rest.rest_certificate import RestCertificate
-from appliance.features.evidence.evidence_orders import EvidenceOrders
+from appliance.features.feature import FeatureContext
 from appliance.features.standby.standby_orders import StandbyOrders, StandbySource
 from appliance.features.table import FeatureParts
 from appliance.hosts.certification import Certification
@@ -75,7 +75,7 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     rest = Current[RestLink]()
     tokens = TokenOrders(base.store, trail, ends_of_tokens, lambda: rest().state_tokens())
     clock = ClockCheck(trail, lambda: base.audit.ids.ahead)
-    features = FeatureParts(settings.sections, trail)
+    features = FeatureParts(FeatureContext(settings.sections, trail, base.audit, settings.name))
     pushed_to = settings.fleet.collector if settings.fleet.receipt_key is not None else None
     collected = ForwarderLink(pushed_to, "all", trail, base.receipts.received)
     switched_off = SwitchedOffWatch(
@@ -126,7 +126,8 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
     orders = StandbyOrders(standby, trail)
     administration = Administration(
         looks,
-        request_methods(
+        features.methods()
+        + request_methods(
             queries=looks,
             policies=base.policies,
             monitors=parts.monitors,
@@ -135,7 +136,6 @@ def make_operators(base: Foundation, parts: Parts, standby: StandbySource) -> Op
             tokens=tokens,
             recordings=ends.recordings,
             blocks=blocks,
-            evidence=EvidenceOrders(base.audit, trail, base.settings.name),
             standby=orders,
             alarms=AlarmOrders(handled, trail, looks.present),
             limits=LimitQueries(parts, settings, base.listener_limits, ends.recordings.state),

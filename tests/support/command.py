@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from appliance.base.verbs import Group, Verb, Verbs
 from appliance.cli import main
 from appliance.cli.lazy import loaded
+from appliance.cli.verb_table import Group, Verb, Verbs
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output
@@ -49,9 +49,9 @@ def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
     return subprocess.CompletedProcess(command, status, said, wrong)
 
 
-def table(verbs: Verbs = main.VERBS) -> Iterator[tuple[str, Verb]]:
+def table(verbs: Verbs | None = None) -> Iterator[tuple[str, Verb]]:
     """Yield every entry of the command table."""
-    for name, one in verbs.items():
+    for name, one in (main.all_verbs() if verbs is None else verbs).items():
         if isinstance(one, Group):
             yield from ((f"{name} {inner}", verb) for inner, verb in table(one.verbs))
         else:

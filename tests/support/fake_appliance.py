@@ -21,7 +21,8 @@ from typing import Any, get_args
 
 import msgspec
 
-from appliance.channel.admin import AdminAnswer, AdminRequest, AnyRequest, Trouble, answer_to, encode
+from appliance.channel.admin import AdminAnswer, AdminRequest, Trouble, answer_to, encode
+from appliance.channel.operations import AnyRequest
 from appliance.signing.request_signing import is_signed, keys_of, parse_proof, reading_key, statement
 from tests.support.answers import example
 

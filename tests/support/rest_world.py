@@ -22,13 +22,14 @@ from appliance.api.front.request_gate import RequestGate
 from appliance.api.front.services import Services
 from appliance.base.clock import using
 from appliance.channel import admin
-from appliance.channel.admin import CHANGES, AdminRequest, answer_to
+from appliance.channel.admin import AdminRequest, answer_to
 from appliance.channel.answers.graph_answers import Registrations
 from appliance.channel.answers.host_answers import Endpoint, KitParts
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestMade, TokenKept
+from appliance.channel.operations import CHANGES
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.administration import Administration
@@ -39,7 +40,6 @@ from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
-from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
@@ -50,6 +50,7 @@ from appliance.specifications.specification_manager import SpecificationManager
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.asgi import sent
+from tests.support.feature_parts import idle_parts
 from tests.support.idle import idle
 from tests.support.inline_loop import InlineLoop
 from tests.support.memory_channel import memory_link
@@ -143,7 +144,7 @@ class RestWorld:
         object.__setattr__(queries, "policies", SimpleNamespace(revision=7))
         object.__setattr__(queries, "parts", SimpleNamespace(monitors=SimpleNamespace(revision=3)))
         hosts.itself, hosts.ports = idle(HostSelfService), idle(PortChecks)
-        methods = request_methods(
+        methods = idle_parts().methods() + request_methods(
             queries=queries,
             policies=idle(Policies),
             monitors=idle(SpecificationManager),
@@ -152,7 +153,6 @@ class RestWorld:
             tokens=idle(TokenOrders),
             recordings=idle(RecordingOrders),
             blocks=idle(BlockOrders),
-            evidence=idle(EvidenceOrders),
             standby=idle(StandbyOrders),
             limits=idle(LimitQueries),
             alarms=idle(AlarmOrders),

@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 import pytest
 from rosrv_fleet.cli import app as fleet_app
 
-from appliance.channel.admin import OPERATIONS
+from appliance.channel.operations import OPERATIONS
 from appliance.configuration.settings import Settings
 from distribution import command_line_page, settings_page
 from rosmop.tool.command import app as rosmop_app

@@ -19,7 +19,7 @@ import structlog
 
 from appliance.api.front.access import Bearer
 from appliance.base import clock
-from appliance.channel.admin import CHANGES, ORDERS, A, AdminAnswer, AdminRequest, decode, operation_of
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode, operation_of
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
@@ -32,6 +32,7 @@ from appliance.channel.messages.api import (
     TokensStated,
     TokenUsed,
 )
+from appliance.channel.operations import CHANGES, ORDERS
 from appliance.channel.rest_operation import ANSWER_SECONDS
 
 _log = structlog.get_logger()

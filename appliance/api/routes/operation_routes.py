@@ -21,9 +21,10 @@ from appliance.api.front.route_roles import answered, problem_of, requires
 from appliance.api.front.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
 from appliance.api.front.services import Services
 from appliance.api.routes.monitor_judgement import refusal
-from appliance.channel.admin import MONITORS, OPERATIONS, A, AdminAnswer, AdminRequest, answer_to
+from appliance.channel.admin import MONITORS, A, AdminAnswer, AdminRequest, answer_to
 from appliance.channel.answers.token_answers import may
 from appliance.channel.messages.api import ClientRequest
+from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_meaning import BadTagError, NoOrderError, meant
 from appliance.channel.rest_operation import Operation, parameter_of, plain
 

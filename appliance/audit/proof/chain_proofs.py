@@ -2,7 +2,7 @@
 
 Each exported record contains the previous hash and its own hash. `then` lists the content hashes of the following
 records that the filter omits. It ends at the next exported record, or at the signed checkpoint that seals the record
-(`checkpoint`). `appliance/evidence` verifies this with the public key alone.
+(`checkpoint`). `appliance/formats/bundle_verifier.py` verifies this with the public key alone.
 """
 
 import json
@@ -13,7 +13,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.log.chain import content_hash, genesis, link
+from appliance.audit.log.chain import StoredColumns, content_hash, genesis, link
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.record_format import LogEntry, as_json
 from appliance.audit.proof.copies import SignedCheckpoint
@@ -56,6 +56,12 @@ def evidence_line(entry: LogEntry, chain: ChainProof, robot: str = "") -> str:
     """Return one line of NDJSON without the newline: the record, the name of the `robot` if it has one, and `chain`."""
     name = f'"robot":{json.dumps(robot)},' if robot else ""
     return f'{as_json(entry)[:-1]},{name}"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
+
+
+def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
+    """Return a record as it is stored, with its position in the chain, as a line of NDJSON."""
+    stored = columns._asdict() | {"detail": columns.detail.decode("utf-8", "surrogateescape")}
+    return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
 
 
 def _placed(path: Path, entries: list[LogEntry], *, whole: bool) -> Iterator[tuple[LogEntry, ChainProof]]:

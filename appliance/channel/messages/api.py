@@ -8,8 +8,8 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.admin import RestRequest
 from appliance.channel.messages.message import Message
+from appliance.channel.operations import RestRequest
 
 
 class ClientRequest(msgspec.Struct, frozen=True):

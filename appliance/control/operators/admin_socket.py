@@ -12,6 +12,7 @@ import structlog
 from appliance.base.withdrawal import awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
+from appliance.channel.operations import AnyRequest
 
 _log = structlog.get_logger()
 _LINE_LIMIT = 16 << 20
@@ -30,7 +31,7 @@ class AdminServer:
 
     def __init__(self, administration: RequestHandler) -> None:
         self._administration = administration
-        self._decoder = msgspec.json.Decoder(admin.AnyRequest)
+        self._decoder = msgspec.json.Decoder(AnyRequest)
 
     async def start(self, sock: socket.socket) -> asyncio.Server:
         """Serve the listening socket. The caller must keep a reference to the returned server."""

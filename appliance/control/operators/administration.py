@@ -2,6 +2,7 @@
 
 Each request is a class in `appliance.channel.admin`. To add a request, define its class with a row in the table of
 operations, write the method that answers it, and add the method to the table in `control/operators/request_methods.py`.
+A request of a feature is in the feature's `operations`, and its method in `FeaturePart.methods`.
 """
 
 from collections.abc import Awaitable, Callable, Iterable
@@ -10,13 +11,13 @@ from typing import Any
 from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
+from appliance.channel.operations import CHANGES
 from appliance.control.assembly.policies import RevisionChangedError
 from appliance.control.assembly.policy_gate import PolicyRefusedError
-from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.errors import SenselessError, UnavailableError, UnknownThingError
 from appliance.control.operators.queries import Queries
-from appliance.control.operators.request_methods import RequestMethod
+from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenRefusedError
-from appliance.features.evidence.evidence_orders import NotSealedError
 from appliance.features.recorder.recording_orders import RecorderAwayError
 from appliance.features.standby.lease_client import HandOverError
 from appliance.hosts.host_table import (
@@ -49,26 +50,23 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     HostRefusedError: "refused",
     TokenRefusedError: "refused",
     RecorderAwayError: "failed",
-    NotSealedError: "failed",
+    UnavailableError: "failed",
     HandOverError: "failed",
     StoreError: "failed",
 }
-# Requests that are rejected if the store cannot be written. A block or revocation is not in the list: it takes effect
-# at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a reason
-# to switch over.
-KEPT = (
-    admin.CHANGES
-    | {admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}
-) - {
-    admin.HostBlock, admin.HostRevoke, admin.TokenRevoke,
-    admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove, admin.StandbyPromote,
+# Requests that are rejected if the store cannot be written, except rows with `full_disk`: a block or revocation takes
+# effect at once, and its answer reports if it was not stored. The recorder checks its own disk space. A full disk is a
+# reason to switch over.
+KEPT = CHANGES | {
+    admin.TokenAdd, admin.TokenRotate, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed,
 }  # fmt: skip
 
 
 class Administration:
     """Carry out requests. `durable()` waits until all audit records are on disk, or cannot be written.
 
-    `require_room()` raises `StoreError` if the store cannot be written. Requests in `KEPT` are then rejected.
+    `require_room()` raises `StoreError` if the store cannot be written. Requests in `KEPT` without `full_disk` are then
+    rejected.
     """
 
     def __init__(
@@ -99,7 +97,7 @@ class Administration:
         method = self._methods[type(request)]
         try:
             require_awaited()
-            if type(request) in KEPT:
+            if method.request in KEPT and not method.full_disk:
                 self._require_room()
             return admin.AdminAnswer(True, await method.answer(request, *([who] if method.who else [])))
         except (PolicyRefusedError, SpecificationsRefusedError) as error:

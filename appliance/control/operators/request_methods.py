@@ -1,36 +1,20 @@
-"""The table of methods: the method of control that answers each request of operators' tools."""
+"""The table of methods: the method of control that answers each request of the core."""
 
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any
 
 from appliance.channel import admin
-from appliance.channel.admin import A, AdminRequest
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
 from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
+from appliance.control.operators.request_method import RequestMethod
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.specifications.specification_manager import SpecificationManager
-
-
-@dataclass(frozen=True, slots=True)
-class RequestMethod(Generic[A]):
-    """The method that answers a request. `who`: it also takes the client's name.
-
-    `order`: the answer waits until the records of the request are in the audit log.
-    """
-
-    request: type[AdminRequest[A]]
-    answer: Callable[..., Awaitable[A]]
-    who: bool = False
-    order: bool = True
 
 
 def request_methods(
@@ -43,12 +27,11 @@ def request_methods(
     tokens: TokenOrders,
     recordings: RecordingOrders,
     blocks: BlockOrders,
-    evidence: EvidenceOrders,
     standby: StandbyOrders,
     limits: LimitQueries,
     alarms: AlarmOrders,
 ) -> tuple[RequestMethod[Any], ...]:
-    """Return the methods of these parts: one for each request."""
+    """Return the methods of these parts: one for each request of the core."""
     return (
         RequestMethod(admin.StatusWanted, queries.status, order=False),
         RequestMethod(admin.InventoryWanted, queries.inventory, order=False),
@@ -62,7 +45,7 @@ def request_methods(
         RequestMethod(admin.MetricsWanted, queries.metrics, order=False),
         RequestMethod(admin.RegistrationsWanted, queries.registrations, order=False),
         RequestMethod(admin.StandbyWanted, standby.state, order=False),
-        RequestMethod(admin.StandbyPromote, standby.promote, who=True, order=False),
+        RequestMethod(admin.StandbyPromote, standby.promote, who=True, order=False, full_disk=True),
         RequestMethod(admin.PolicyReload, policies.reload, who=True),
         RequestMethod(admin.PolicyLoad, policies.load, who=True),
         RequestMethod(admin.PolicyRollback, policies.roll_back, who=True),
@@ -89,9 +72,9 @@ def request_methods(
         RequestMethod(admin.HostAdd, hosts.add, who=True),
         RequestMethod(admin.HostRenew, hosts.renew, who=True),
         RequestMethod(admin.HostToken, hosts.token, who=True),
-        RequestMethod(admin.HostRevoke, hosts.revoke, who=True),
+        RequestMethod(admin.HostRevoke, hosts.revoke, who=True, full_disk=True),
         RequestMethod(admin.HostsReload, hosts.reload, who=True),
-        RequestMethod(admin.HostBlock, blocks.block, who=True),
+        RequestMethod(admin.HostBlock, blocks.block, who=True, full_disk=True),
         RequestMethod(admin.HostUnblock, blocks.unblock, who=True),
         RequestMethod(admin.HostBlocks, blocks.listed, order=False),
         RequestMethod(admin.HostEnrol, hosts.itself.enrol),
@@ -103,14 +86,12 @@ def request_methods(
         RequestMethod(admin.TokenList, tokens.listed),
         RequestMethod(admin.TokenAdd, tokens.add, who=True),
         RequestMethod(admin.TokenRotate, tokens.rotate, who=True),
-        RequestMethod(admin.TokenRevoke, tokens.revoke, who=True),
+        RequestMethod(admin.TokenRevoke, tokens.revoke, who=True, full_disk=True),
         RequestMethod(admin.RecordingsWanted, recordings.recordings),
         RequestMethod(admin.RecordingWanted, recordings.recording),
-        RequestMethod(admin.RecordNow, recordings.now, who=True),
+        RequestMethod(admin.RecordNow, recordings.now, who=True, full_disk=True),
         RequestMethod(admin.RecordingFetch, recordings.fetch, who=True),
         RequestMethod(admin.RecordingRead, recordings.read, who=True),
-        RequestMethod(admin.RecordingOfMemory, recordings.of_memory, who=True),
-        RequestMethod(admin.RecordingRemove, recordings.remove, who=True),
-        RequestMethod(admin.LogSealed, evidence.seal),
-        RequestMethod(admin.EvidenceExported, evidence.exported, who=True),
+        RequestMethod(admin.RecordingOfMemory, recordings.of_memory, who=True, full_disk=True),
+        RequestMethod(admin.RecordingRemove, recordings.remove, who=True, full_disk=True),
     )

@@ -23,14 +23,7 @@ from appliance.audit.log.record import Severity
 from appliance.base import clock
 from appliance.base.withdrawal import awaited
 from appliance.channel import messages
-from appliance.channel.admin import (
-    ORDERS,
-    AdminAnswer,
-    ChallengeWanted,
-    WaitingRequest,
-    encode,
-    verb_of,
-)
+from appliance.channel.admin import AdminAnswer, ChallengeWanted, WaitingRequest, encode, verb_of
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
@@ -42,6 +35,7 @@ from appliance.channel.messages.api import (
     TokensStated,
     TokenUsed,
 )
+from appliance.channel.operations import ORDERS
 from appliance.control.operators.administration import Administration
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest_proof import RequestAuthenticator, UnprovenError

@@ -25,6 +25,7 @@ from appliance.base import clock
 from appliance.channel import admin
 from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import ClientRequest, RequestMade
+from appliance.channel.operations import CHANGES, RestRequest
 from appliance.channel.rest_meaning import NoOrderError, filled_in, meant
 from appliance.control.rest.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.signing.request_signing import (
@@ -87,7 +88,7 @@ class RequestAuthenticator:
             raise UnprovenError(
                 f"this is for {role}s; the token {row.name} has the role {row.role}", row.name
             )
-        if type(made.request) in admin.CHANGES:
+        if type(made.request) in CHANGES:
             self._require_order(made, row)
         return row.name
 
@@ -158,7 +159,7 @@ class RequestAuthenticator:
             raise UnprovenError(str(error), row.name) from None
 
 
-def _role_for(request: admin.RestRequest) -> TokenRole | None:
+def _role_for(request: RestRequest) -> TokenRole | None:
     """Return the least role that a token needs for this request, or None if the request needs no token."""
     operation = admin.operation_of(request)
     if operation is None or operation.role is None:

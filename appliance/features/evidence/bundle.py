@@ -27,21 +27,20 @@ import msgspec
 from appliance.audit.log.chain import StoredColumns
 from appliance.audit.log.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.log.signatures import pinned_key_path
-from appliance.audit.proof.chain_proofs import ChainProof, ChainReader
+from appliance.audit.proof.chain_proofs import ChainReader, stored_line
 from appliance.base import clock
 from appliance.channel.admin import (
     A,
     AdminAnswer,
     AdminRequest,
-    EvidenceExported,
-    LogSealed,
     MonitorRevisionWanted,
     PolicyWanted,
-    RecordingFetch,
     Trouble,
 )
+from appliance.channel.operations import request_named
+from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed
 from appliance.features.evidence.page import Names, Page
-from appliance.features.recorder.recording_answers import Recording
+from appliance.features.evidence.recorded import RecordingSummary
 from appliance.formats import bundle_verifier
 from appliance.signing.fingerprints import file_name
 
@@ -91,10 +90,10 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Na
     The bundle of a recording has the recording's messages and all records of its period. Raises `BundleError` and
     `LogUnreadableError`, also during the iteration.
     """
-    recording: Recording | None = None
+    recording: RecordingSummary | None = None
     bag = Path()
     if isinstance(wanted, RecordingSelection):
-        recording = _given(ask(RecordingFetch(wanted.id)))
+        recording = _recording(ask, wanted.id)
         bag = wanted.folder / wanted.id / "recording.bag"
         wanted = TimeSpan(recording.began, recording.ended + 1)
     _given(ask(LogSealed()))
@@ -109,11 +108,22 @@ def export(log: Path, wanted: TimeSpan | RecordingSelection, ask: Ask, names: Na
     )
 
 
+def _recording(ask: Ask, recording_id: str) -> RecordingSummary:
+    """Return a recording, and let the recorder record that it is fetched. Raises `BundleError`."""
+    fetch: Any = request_named("recording fetch")
+    if fetch is None:
+        raise BundleError(
+            "this appliance has no flight recorder: give --since instead of a recording", "unknown"
+        )
+    recording: RecordingSummary = _given(ask(fetch(recording_id)))
+    return recording
+
+
 class _Bundle:
     """The members of a bundle."""
 
     def __init__(  # noqa: PLR0917  one caller
-        self, log: Path, span: TimeSpan, ask: Ask, recording: Recording | None, bag: Path, names: Names
+        self, log: Path, span: TimeSpan, ask: Ask, recording: RecordingSummary | None, bag: Path, names: Names
     ) -> None:
         self._log, self._span, self._ask, self._recording, self._bag = log, span, ask, recording, bag
         self._names = names
@@ -289,12 +299,6 @@ def _line(connection: sqlite3.Connection, places: ChainReader, sequence: int, fo
             f"record {sequence} was removed by retention during the export: export again"
         )
     return stored_line(StoredColumns(*row), chain)
-
-
-def stored_line(columns: StoredColumns, chain: ChainProof) -> bytes:
-    """Return a record as it is stored, with its position in the chain, as a line of NDJSON."""
-    stored = columns._asdict() | {"detail": columns.detail.decode("utf-8", "surrogateescape")}
-    return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
 
 
 def _proof(log: Path, record: str) -> bytes:

@@ -3,14 +3,14 @@
 import asyncio
 
 from appliance.audit.log.log import AuditLog
-from appliance.channel import admin
-from appliance.features.evidence.evidence_answers import Sealed
+from appliance.control.errors import UnavailableError
+from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed, Sealed
 from appliance.telemetry.audit_trail import AuditTrail
 
 SEAL_SECONDS = 10.0
 
 
-class NotSealedError(Exception):
+class NotSealedError(UnavailableError):
     """The log's newest records cannot be sealed now; the message gives the reason."""
 
 
@@ -23,12 +23,12 @@ class EvidenceOrders:
         self._trail = trail
         self._robot = {"robot": robot} if robot else {}
 
-    async def seal(self, _request: admin.LogSealed) -> Sealed:
+    async def seal(self, _request: LogSealed) -> Sealed:
         """Wait until a signed checkpoint seals all records."""
         await self._seal()
         return Sealed()
 
-    async def exported(self, request: admin.EvidenceExported, who: str) -> Sealed:
+    async def exported(self, request: EvidenceExported, who: str) -> Sealed:
         """Record an exported bundle. Once a signed checkpoint seals the record, return its id."""
         record = self._trail.happened(
             "evidence exported",

@@ -9,6 +9,7 @@ from starlette.responses import StreamingResponse
 from appliance.api.front.access import Bearer
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
+from appliance.api.front.recording_id import OneId
 from appliance.api.front.route_roles import Investigator, Reader, problem_of
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
@@ -18,7 +19,6 @@ from appliance.audit.log.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest, PolicyWanted
 from appliance.features.evidence.bundle import BundleError, RecordingSelection, TimeSpan, export
 from appliance.features.evidence.page import Names
-from appliance.features.recorder.recording_routes import OneId
 
 _ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {
     404: {"description": "There is no such recording, or the log has no record of that time."}

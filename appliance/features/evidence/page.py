@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from appliance.audit.log.record_format import printable, rfc3339
-from appliance.features.recorder.recording_answers import Recording
+from appliance.features.evidence.recorded import RecordingSummary
 
 _MOST_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")
@@ -51,7 +51,7 @@ class Names(NamedTuple):
 class Page:
     """The page of a bundle, which collects its rows while the records are written."""
 
-    def __init__(self, recording: Recording | None, names: Names) -> None:
+    def __init__(self, recording: RecordingSummary | None, names: Names) -> None:
         self._recording = recording
         self._names = names
         self._events: Counter[str] = Counter()
@@ -112,7 +112,7 @@ class Page:
         return "".join([*parts, "</table>\n"]).encode()
 
 
-def _recorded(recording: Recording | None) -> Iterator[str]:
+def _recorded(recording: RecordingSummary | None) -> Iterator[str]:
     """Yield the triggers of the recording and its topics."""
     if recording is None:
         return

@@ -5,16 +5,16 @@ Removal needs no `If-Match`, because a recording never changes.
 
 import asyncio
 from collections.abc import Callable, Iterator
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from fastapi import Path, Query, Request, Response
+from fastapi import Query, Request, Response
 from fastapi.responses import StreamingResponse
-from starlette.convertors import StringConvertor, register_url_convertor
 
 from appliance.api.front.access import Bearer
 from appliance.api.front.moments import given
 from appliance.api.front.problems import ProblemError
+from appliance.api.front.recording_id import OneId
 from appliance.api.front.route_roles import Investigator, Viewer, answered
 from appliance.api.front.routing import Responses, Routes, file
 from appliance.api.front.services import Services
@@ -42,10 +42,6 @@ _T = TypeVar("_T")
 _PIECE = 1 << 20
 _UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
 _BAG = file("application/octet-stream", "The bag (rosbag, format 2.0), or MCAP (profile ros1)", binary=True)
-OneId = Annotated[
-    str, Path(pattern="^[0-9a-f]{20}$", description="id of the recording", examples=["18ea0bb9b11c1024196c"])
-]
-
 _Moment = Annotated[
     str | None, Query(max_length=64, description="RFC 3339", examples=["2026-03-01T12:00:00.5Z"])
 ]
@@ -53,16 +49,7 @@ _Topics = Annotated[
     list[Annotated[str, Query(max_length=500)]],
     Query(max_length=20, description="only these topics; none: all topics", examples=[["/scan"]]),
 ]
-_Reading = Callable[[Recording, FilePath], _T]
-
-
-class _RecordingId(StringConvertor):
-    """A converter that matches a recording's id in a path, but not the word `memory`."""
-
-    regex = "[0-9a-f]{20}"
-
-
-register_url_convertor("recording", _RecordingId())
+_Reading = Callable[[Recording, Path], _T]
 
 
 def routes(services: Services) -> Routes:
@@ -182,7 +169,7 @@ async def bag_response(services: Services, recording_id: str, bearer: Bearer, *,
     return StreamingResponse(in_thread(pieces), media_type="application/octet-stream", headers=headers)
 
 
-def _bag_of(services: Services, recording_id: str) -> FilePath:
+def _bag_of(services: Services, recording_id: str) -> Path:
     return services.settings.state / "recordings" / recording_id / "recording.bag"
 
 
@@ -194,7 +181,7 @@ def _moment(moment: str | int | None) -> int | None:
     return given(moment) if isinstance(moment, str) else moment
 
 
-def _pieces_of(path: FilePath) -> Iterator[bytes]:
+def _pieces_of(path: Path) -> Iterator[bytes]:
     bag = path.open("rb")
 
     def pieces() -> Iterator[bytes]:

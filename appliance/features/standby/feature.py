@@ -1,6 +1,6 @@
 """The feature standby: two appliances, of which one stands by to take over (docs/standby.md)."""
 
-from appliance.base.verbs import Group, Verb
+from appliance.cli.verb_table import Group, Verb
 from appliance.features.feature import Feature
 
 _PLACE = "appliance.features.standby."
@@ -17,6 +17,7 @@ STANDBY = Feature(
                 "status": Verb(f"{_PLACE}live_verbs:status"),
                 "promote": Verb(f"{_PLACE}live_verbs:promote"),
             },
+            after="host",
         ),
     },
 )

@@ -3,8 +3,6 @@
 import time
 from pathlib import Path
 
-from appliance.features.evidence.bundle import RecordingSelection, export
-from appliance.features.evidence.page import Names
 from tests.system.fleet.fleet_site import FleetRobot
 from tests.unit.features.evidence.conftest import Control
 
@@ -18,6 +16,4 @@ def incident(robot: FleetRobot, place: Path, bag: bytes = b"") -> Path:
     control.work()
     if not bag:
         return control.exported(place)
-    recording: RecordingSelection = control.record(robot.folder, bag)
-    place.write_bytes(b"".join(export(robot.log_file, recording, control.ask, Names("", str))))
-    return place
+    return control.export(control.record(robot.folder, bag), place)

@@ -1,7 +1,8 @@
 """Tests of `appliance.channel.admin`: every request that REST can make has a route and a role."""
 
 from appliance.channel import admin
-from appliance.channel.admin import CHANGES, OPERATIONS, operation_of
+from appliance.channel.admin import operation_of
+from appliance.channel.operations import CHANGES, OPERATIONS
 
 
 def test_changes_are_for_operators_and_admins() -> None:

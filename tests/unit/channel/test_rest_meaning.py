@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.channel import admin
-from appliance.channel.admin import OPERATIONS
 from appliance.channel.messages.api import ClientRequest
+from appliance.channel.operations import OPERATIONS
 from appliance.channel.rest_meaning import BadTagError, NoOrderError, RestCall, call_of, filled_in, meant
 from appliance.channel.rest_operation import Operation, plain
 

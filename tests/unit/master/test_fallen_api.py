@@ -13,8 +13,9 @@ import pytest
 from appliance.audit.log.record import Severity
 from appliance.base.deadlines import Deadlines
 from appliance.channel import admin
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.messages.api import ApiLink, ClientRequest, RequestAnswered, RequestMade
+from appliance.channel.operations import AnyRequest
 from appliance.control.operators.token_orders import TokenOrders
 from appliance.control.rest.rest import RestLink
 from appliance.signing.request_signing import proof_of, reading_key, statement

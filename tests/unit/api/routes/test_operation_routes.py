@@ -17,8 +17,9 @@ from appliance.api.front.access import Bearer
 from appliance.api.front.request_gate import is_console
 from appliance.base.withdrawal import WithdrawnError
 from appliance.channel import admin
-from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.channel.messages.api import RequestMade
+from appliance.channel.operations import CHANGES, OPERATIONS
 from appliance.channel.rest_meaning import call_of, filled_in, meant
 from appliance.channel.rest_operation import Operation
 from appliance.control.assembly.policies import RevisionChangedError

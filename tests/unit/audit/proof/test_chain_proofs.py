@@ -12,10 +12,9 @@ from appliance.audit.log.columns import to_columns
 from appliance.audit.log.record_format import as_json
 from appliance.audit.log.retention import Retention
 from appliance.audit.log.signatures import read_public_key, write_public_key
-from appliance.audit.proof.chain_proofs import evidence, evidence_line
+from appliance.audit.proof.chain_proofs import evidence, evidence_line, stored_line
 from appliance.audit.search.query import Filter
 from appliance.audit.search.search import export
-from appliance.features.evidence.bundle import stored_line
 from appliance.formats.bundle_verifier import Verifier
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary

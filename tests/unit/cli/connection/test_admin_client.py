@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.channel.admin import OPERATIONS, TokenAdd
+from appliance.channel.admin import TokenAdd
+from appliance.channel.operations import OPERATIONS
 from appliance.cli.connection import admin_client
 from appliance.cli.connection.admin_client import AdminSocket, NotRunningError
 

@@ -16,7 +16,7 @@ from appliance.cli.connection import admin_client
 from appliance.cli.connection.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
 from appliance.control.operators.admin_socket import AdminServer
 from appliance.control.operators.administration import Administration
-from appliance.control.operators.request_methods import RequestMethod
+from appliance.control.operators.request_method import RequestMethod
 
 pytestmark = pytest.mark.anyio
 

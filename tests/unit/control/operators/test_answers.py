@@ -9,6 +9,7 @@ from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
+from appliance.channel.operations import AnyRequest, RestRequest
 from appliance.control.assembly.policies import Policies
 from appliance.control.operators.alarm_orders import AlarmOrders
 from appliance.control.operators.block_orders import BlockOrders
@@ -16,7 +17,6 @@ from appliance.control.operators.limit_use import LimitQueries
 from appliance.control.operators.queries import Queries
 from appliance.control.operators.request_methods import request_methods
 from appliance.control.operators.token_orders import TokenOrders
-from appliance.features.evidence.evidence_orders import EvidenceOrders
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.features.standby.standby_orders import StandbyOrders
 from appliance.hosts.certification import Certification
@@ -24,6 +24,7 @@ from appliance.hosts.checked_ports import PortChecks
 from appliance.hosts.enrolment import HostEnrolment
 from appliance.hosts.self_service import HostSelfService
 from appliance.specifications.specification_manager import SpecificationManager
+from tests.support.feature_parts import idle_parts
 
 
 class Hosts(HostEnrolment):
@@ -42,15 +43,12 @@ CLASSES: dict[str, Any] = {
     "tokens": TokenOrders,
     "recordings": RecordingOrders,
     "blocks": BlockOrders,
-    "evidence": EvidenceOrders,
     "standby": StandbyOrders,
     "limits": LimitQueries,
     "alarms": AlarmOrders,
 }
-METHODS = request_methods(**CLASSES)
-REQUESTS: tuple[type[Any], ...] = tuple(
-    dict.fromkeys([*get_args(admin.AnyRequest), *get_args(admin.RestRequest)])
-)
+METHODS = idle_parts().methods() + request_methods(**CLASSES)
+REQUESTS: tuple[type[Any], ...] = tuple(dict.fromkeys([*get_args(AnyRequest), *get_args(RestRequest)]))
 # Exceptions: a record's fields depend on its event, and a child's readiness on its role.
 OPEN = {
     (messages.MonitorEvent, "detail"),

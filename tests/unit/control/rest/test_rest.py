@@ -11,7 +11,7 @@ import pytest
 from appliance.base import clock
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
-from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
+from appliance.channel.admin import AdminAnswer, HostEnrol, PolicyLoad, StatusWanted, decode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import (
@@ -26,6 +26,7 @@ from appliance.channel.messages.api import (
     TokensStated,
     TokenUsed,
 )
+from appliance.channel.operations import AnyRequest
 from appliance.control.rest.rest import RestLink
 from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example

@@ -5,19 +5,20 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from appliance.audit.log.log import AuditLog
 from appliance.audit.log.record import Severity
 from appliance.base.clock import wall_ns
 from appliance.channel import admin
-from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.admin import AdminAnswer, AdminRequest, verb_of
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.features.evidence.bundle import RecordingSelection, TimeSpan, export
 from appliance.features.evidence.evidence_orders import EvidenceOrders, NotSealedError
+from appliance.features.evidence.evidence_requests import EvidenceExported, LogSealed
 from appliance.features.evidence.page import Names
-from appliance.features.recorder.recording_answers import Recording
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
@@ -54,6 +55,37 @@ NUMBERS = (
     -129,
     -(2**31) - 1,
 )
+
+
+class Trigger(msgspec.Struct):
+    """A trigger of a recording, as the recorder answers."""
+
+    time: int
+    what: str
+    record: str
+    text: str
+
+
+class Topic(msgspec.Struct):
+    """A topic of a recording, as the recorder answers."""
+
+    topic: str
+    type: str
+    messages: int
+    missed: int
+
+
+class Recording(msgspec.Struct):
+    """A recording, as the recorder answers."""
+
+    id: str
+    began: int
+    ended: int
+    sha256: str
+    triggers: list[Trigger]
+    topics: list[Topic]
+    complete: bool
+    why_not: str
 
 
 class Control:
@@ -117,13 +149,13 @@ class Control:
         return AdminAnswer(True, body)
 
     def _answer(self, request: AdminRequest[Any]) -> Any:
+        if verb_of(request) == "recording fetch":
+            return self.recordings.get(msgspec.structs.asdict(request)["id"])
         match request:
-            case admin.LogSealed():
+            case LogSealed():
                 return asyncio.run(self.orders.seal(request))
-            case admin.EvidenceExported():
+            case EvidenceExported():
                 return asyncio.run(self.orders.exported(request, "operator"))
-            case admin.RecordingFetch(recording):
-                return self.recordings.get(recording)
             case admin.PolicyWanted(revision=int(revision)) if revision in self.policies:
                 return example(
                     PolicyKnown, text=self.policies[revision], signature=f"signature of {revision}"
@@ -139,7 +171,11 @@ class Control:
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
         """Write a bundle to a file and return its path."""
         span = TimeSpan(self.begun if since is None else since, wall_ns() + 1 if until is None else until)
-        place.write_bytes(b"".join(export(self.log.path, span, self.ask, NAMES)))
+        return self.export(span, place)
+
+    def export(self, wanted: TimeSpan | RecordingSelection, place: Path) -> Path:
+        """Write the bundle of a period or a recording to a file and return its path."""
+        place.write_bytes(b"".join(export(self.log.path, wanted, self.ask, NAMES)))
         return place
 
 

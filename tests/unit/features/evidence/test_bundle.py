@@ -30,7 +30,6 @@ from appliance.base import clock
 from appliance.base.clock import wall_ns
 from appliance.features.evidence import bundle as bundles
 from appliance.features.evidence.bundle import VERIFIER, BundleError, TimeSpan, export
-from appliance.features.recorder.recording_answers import RecordedTopic, Trigger
 from appliance.formats import bundle_verifier
 from tests.support.answers import example
 from tests.support.audit import decision, settle
@@ -40,7 +39,7 @@ from tests.support.examples import examples
 from tests.support.virtual_clock import VirtualClock
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.log.test_retention import make_old, retain
-from tests.unit.features.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control
+from tests.unit.features.evidence.conftest import LENGTHS, NAMES, NUMBERS, Control, Topic, Trigger
 
 Members = dict[str, bytes]
 
@@ -559,10 +558,9 @@ def test_a_recording_is_included(control: Control, tmp_path: Path, reviewer: Rev
     """The bag matches the hash in the log and has the recording's time and reason; a different bag is named."""
     bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
     trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
-    kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(RecordedTopic, topic="/scan")])
+    kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(Topic, topic="/scan")])
     control.work(2)
-    place = tmp_path / "incident.zip"
-    place.write_bytes(b"".join(export(control.log.path, kept, control.ask, NAMES)))
+    place = control.export(kept, tmp_path / "incident.zip")
     members = members_of(place)
     assert members["recording/recording.bag"] == bag
     assert "&lt;b&gt;\\x1b" in members["index.html"].decode()

@@ -1,0 +1,19 @@
+"""Match the id of a recording in a path."""
+
+from typing import Annotated
+
+from fastapi import Path
+from starlette.convertors import StringConvertor, register_url_convertor
+
+OneId = Annotated[
+    str, Path(pattern="^[0-9a-f]{20}$", description="id of the recording", examples=["18ea0bb9b11c1024196c"])
+]
+
+
+class _RecordingId(StringConvertor):
+    """A converter that matches a recording's id in a path, but not the word `memory`."""
+
+    regex = "[0-9a-f]{20}"
+
+
+register_url_convertor("recording", _RecordingId())

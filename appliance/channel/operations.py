@@ -1,0 +1,34 @@
+"""List the requests of the core and of all features: what the admin socket and REST accept."""
+
+from typing import TYPE_CHECKING, Any, Union
+
+from appliance.channel.admin import (
+    CORE_REQUESTS,
+    AdminRequest,
+    ChallengeWanted,
+    HostEnrol,
+    HostRenewed,
+    HostRenewItself,
+)
+from appliance.channel.rest_operation import rows
+from appliance.features.table import FEATURES
+
+REQUESTS = (*CORE_REQUESTS, *(request for feature in FEATURES for request in feature.operations()))
+OPERATIONS = tuple(operation for request in REQUESTS for operation in rows().get(request, ()))
+CHANGES = frozenset(operation.request for operation in OPERATIONS if operation.is_change)
+"""Requests that change something in the name of a token. Control requires the client's HTTP request for each."""
+
+ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
+"""All requests that change something over REST, in the name of a token or of a host."""
+
+if TYPE_CHECKING:
+    RestRequest = AdminRequest[Any]
+    AnyRequest = AdminRequest[Any]
+else:
+    RestRequest = Union[tuple(operation.request for operation in OPERATIONS)]  # noqa: UP007  of any number
+    AnyRequest = Union[tuple(request for request in REQUESTS if request is not ChallengeWanted)]  # noqa: UP007
+
+
+def request_named(verb: str) -> type[AdminRequest[Any]] | None:
+    """Return the request with this `verb`, or None if no feature of this appliance has it."""
+    return next((request for request in REQUESTS if request.__struct_config__.tag == verb), None)

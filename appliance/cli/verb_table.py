@@ -1,0 +1,65 @@
+"""Define the rows of the tables of verbs, without importing a verb."""
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """A verb's function (`module:function`); in the help, `first` precedes its docstring.
+
+    `module` is relative to this folder; a feature gives its whole name.
+    """
+
+    place: str
+    first: str = ""
+    hidden: bool = False
+
+    @property
+    def path(self) -> str:
+        """Return the function's place with the whole name of its module."""
+        return self.place if self.place.startswith("appliance.") else f"appliance.cli.{self.place}"
+
+    @property
+    def help(self) -> str:
+        """Return the first sentence of the help, read without importing the module."""
+        module, _colon, function = self.path.partition(":")
+        file = _PACKAGES.joinpath(*module.split(".")).with_suffix(".py")
+        return self.first or _first_sentence(file, function)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A command with its own verbs, such as `rosrv audit`. The help lists a feature's command `after` another one."""
+
+    help: str
+    verbs: "Verbs"
+    after: str = ""
+
+
+Verbs = Mapping[str, Verb | Group]
+_PACKAGES = Path(__file__).parents[2]
+
+
+def joined(core: Verbs, features: Verbs) -> Verbs:
+    """Return a table with the verbs of features, each at its place."""
+    table = list(core.items())
+    for name, group in features.items():
+        names = [known for known, _verb in table]
+        after = group.after if isinstance(group, Group) else ""
+        table.insert(names.index(after) + 1 if after in names else len(table), (name, group))
+    return dict(table)
+
+
+@functools.cache
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8")
+
+
+def _first_sentence(file: Path, function: str) -> str:
+    found = re.search(rf'(?ms)^def {function}\(.*?"""(.+?)(?:"""|\n\n)', _text(file))
+    assert found is not None, function  # noqa: S101  every verb has a docstring
+    return " ".join(found[1].split())

@@ -1,0 +1,22 @@
+"""Define a row of the table of methods: the method of control that answers a request of operators' tools."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Generic
+
+from appliance.channel.admin import A, AdminRequest
+
+
+@dataclass(frozen=True, slots=True)
+class RequestMethod(Generic[A]):
+    """The method that answers a request. `who`: it also takes the client's name.
+
+    `order`: the answer waits until the records of the request are in the audit log. `full_disk`: the request is also
+    accepted if the store cannot be written.
+    """
+
+    request: type[AdminRequest[A]]
+    answer: Callable[..., Awaitable[A]]
+    who: bool = False
+    order: bool = True
+    full_disk: bool = False
