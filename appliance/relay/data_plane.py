@@ -10,14 +10,14 @@ Invariants:
 """
 
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 from appliance.channel import messages
 from appliance.features.recorder.recorder_ring import RecorderRing
 from appliance.relay.connections.admission import NOTHING, asked_for, bound_name, flaw, missing
-from appliance.relay.connections.headers import kept
 from appliance.relay.connections.incoming_connection import IncomingConnection, RefusedConnection
 from appliance.relay.connections.listening_ports import ListeningPorts
+from appliance.relay.connections.monitor_calls import CallGrant, ServiceCalls
 from appliance.relay.connections.named_subscribers import ActionServers
 from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.own_topic import OwnTopicPublisher
@@ -30,7 +30,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grant_table import GrantTable, PeerGrant, Statement
 from appliance.relay.loop import EventLoop
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import ObservationPoint
+from appliance.relay.monitors.observation_points import ObservationPoint, WantedCall
 from appliance.relay.monitors.topic_pipeline import TopicPipeline
 from appliance.relay.relay_limits import RelayLimits
 from appliance.relay.report import Reporter
@@ -54,6 +54,7 @@ class DataPlane:
             self._reporter,
             budget=limits.budget / 1000,
             publish=self._publish,
+            call=lambda wanted: self._monitor_calls.call(wanted),  # noqa: PLW0108  it is made below
             changed=self._monitors_changed,
             holder=self._holder,
             payer=self._table.payer,
@@ -75,6 +76,14 @@ class DataPlane:
         self._own: dict[str, OwnTopicPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
         self._own_service = OwnService(loop, self._reporter.send)
+        self._monitor_calls = ServiceCalls(
+            loop,
+            seconds=limits.service_seconds,
+            send=self._reporter.send,
+            valid=self._may_call,
+            serve=self._serve_monitor,
+            failed=self.interceptor.call_failed,
+        )
         self.clients: set[ServiceClient] = set()
         self._by_grant: dict[PeerGrant, set[Subscriber | ServiceClient]] = {}
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
@@ -95,6 +104,7 @@ class DataPlane:
         self._reporter.attach(link)
         self._topic_taps.end_all()
         self._own_service.control_gone()
+        self._monitor_calls.attach(link is not None)
 
     def record(self, recorded: RecorderRing) -> None:
         """Record the messages of publishers whose topics are placed from now on."""
@@ -126,8 +136,8 @@ class DataPlane:
             self._tap(message)
         elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
             self._own_topic(message)
-        elif isinstance(message, messages.OwnServiceAnswered):
-            self._own_service.answered(message)
+        elif isinstance(message, messages.OwnServiceAnswered | messages.MonitorCallAnswered):
+            self._answered(message)
         elif isinstance(message, messages.OrdersAsked):
             self._reporter.send(messages.OrdersCarriedOut())
         else:
@@ -326,6 +336,12 @@ class DataPlane:
             if concerned and relayed.lacks_latched:
                 publisher.request_latched()
 
+    def _answered(self, message: messages.OwnServiceAnswered | messages.MonitorCallAnswered) -> None:
+        if isinstance(message, messages.OwnServiceAnswered):
+            self._own_service.answered(message)
+        else:
+            self._monitor_calls.answered(message)
+
     def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
         if isinstance(message, messages.OwnPublished):
             self._publish(message.topic, message.data)
@@ -456,9 +472,9 @@ class DataPlane:
             asked = (kind, incoming.key, name, incoming.host, fields.get("callerid", ""))
             self._refuse(asked, sock, reason)
         elif "topic" in fields:
-            self._subscribe(incoming, sock, kept(fields))
+            self._subscribe(incoming, sock, incoming.kept_fields)
         else:
-            self._serve_client(incoming, sock, kept(fields), rest)
+            self._serve_client(incoming, sock, incoming.kept_fields, rest)
 
     def _not_all_is_stated(self) -> bool:
         """Whether control may still state a grant that is missing."""
@@ -510,6 +526,51 @@ class DataPlane:
         self.clients.add(client)
         self._by_grant.setdefault(client.grant, set()).add(client)
         client.start(rest)
+
+    def _may_call(self, service: str, grant: CallGrant) -> bool:
+        """Whether the appliance's node may call a service by an earlier grant."""
+        known = self._table.service(grant.key, service) is not None
+        return known and self._table.may_call(grant.key, service, grant.host, grant.caller_id)
+
+    def _serve_monitor(
+        self,
+        wanted: WantedCall,
+        grant: CallGrant,
+        sock: socket.socket,
+        request: bytes,
+        refused: Callable[[str], None],
+    ) -> ServiceClient | None:
+        """Serve the appliance's node, which calls a service for a monitor. Its socket does not count for a host."""
+        service = self._table.service(grant.key, wanted.service)
+        if service is None:
+            return None
+
+        def refuse(client: ServiceClient, sock: socket.socket, reason: str) -> None:
+            self._forget(client)
+            sock.close()
+            refused(reason)
+
+        fields = {
+            "callerid": grant.caller_id,
+            "service": wanted.service,
+            "type": wanted.type,
+            "md5sum": wanted.md5sum,
+        }
+        client = ServiceClient(
+            self._context,
+            sock,
+            service,
+            grant.host,
+            fields,
+            caller_id=grant.caller_id,
+            traffic=self._services.setdefault((service.key, service.service), ServiceTraffic()),
+            refuse=refuse,
+            ended=self._forget,
+        )
+        self.clients.add(client)
+        self._by_grant.setdefault(client.grant, set()).add(client)
+        client.start(request)
+        return client
 
     def _subscribe(
         self, incoming: IncomingConnection, sock: socket.socket, fields: Mapping[str, str]

@@ -70,6 +70,10 @@ def contents(
         }
         for messages in (True, False)
     )
+    called = {one.specification: set[str]() for one in monitors.compiled.calls}
+    for one in monitors.compiled.calls:
+        called[one.specification].add(one.topic)
+    services = {name: own | called.get(name, set()) for name, own in services.items()}
     types = dict(monitors.topics) | dict(monitors.publications)
     return Contents(
         {monitor.name: monitor.code.file for monitor in monitors.monitors},

@@ -17,9 +17,10 @@ _EVENTS = {
     "fault": ("monitor fault", Severity.ALARM),
     "log": ("monitor log", Severity.INFO),
     "publish": ("monitor published", Severity.INFO),
+    "call": ("monitor called", Severity.INFO),
 }
 _SHADOW_KINDS = {f"shadow {kind}": kind for kind in (*_EVENTS, "missed")}
-_NOT_DONE = ("drop", "change", "publish")
+_NOT_DONE = ("drop", "change", "publish", "call")
 KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
 

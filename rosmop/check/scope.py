@@ -131,6 +131,7 @@ class CompilationContext:
         """The variables that slices share, by their names in the form."""
         self.findings: list[Diagnostic] = []
         self.publications: list[Publication] = []
+        self.calls: list[Publication] = []
         self.partial = False
         """Whether some files of the set could not be parsed. These files may declare names that seem unknown."""
 
@@ -274,6 +275,10 @@ class FunctionScope:
     def published(self, topic: str, kind: str, position: Position) -> None:
         """Note that the topic is published."""
         self.shared.publications.append(Publication(self.names.name, topic, kind, position))
+
+    def called(self, service: str, kind: str, position: Position) -> None:
+        """Note that the service is called."""
+        self.shared.calls.append(Publication(self.names.name, service, kind, position))
 
     # Statements
 

@@ -90,6 +90,7 @@ def compile_files(
         shared.types,
         shared.messages,
         tuple(shared.publications),
+        tuple(shared.calls),
     )
 
 
@@ -386,6 +387,11 @@ def _check_types(shared: CompilationContext, compiled: Sequence[SpecificationCod
             if known != kind:
                 text = f"{event.topic} has the type {known} at {where}, and {kind} here; a topic has one type"
                 shared.findings.append(Diagnostic(event.position, "error", text))
+    for called in shared.calls:
+        known, where = types.setdefault((called.topic, "service"), (called.type, called.position))
+        if known != called.type:
+            text = f"{called.topic} has the type {known} at {where}, and {called.type} here"
+            shared.findings.append(Diagnostic(called.position, "error", text))
     for published in shared.publications:
         known, where = types.setdefault((published.topic, None), (published.type, published.position))
         if known != published.type:

@@ -21,9 +21,10 @@ from rosmop.runtime import numbers
 from rosmop.runtime.values import struct_code
 from rosmop.text import tree
 from rosmop.types import value_types
-from rosmop.types.messages import shown
+from rosmop.types.messages import nearest, shown
 from rosmop.types.resolve import record, resolve
 from roswire import names
+from roswire.errors import DefinitionError
 
 LARGE = 4096
 """The size in bytes from which a local variable is charged at its declaration."""
@@ -325,6 +326,23 @@ def _publish(scope: FunctionScope, node: tree.PublishStatement) -> None:
     scope.published(node.topic, node.type, node.position)
 
 
+def _call_service(scope: FunctionScope, node: tree.CallStatement) -> None:
+    check_topic(node.service, node.position)
+    try:
+        service = scope.messages.definitions.service(node.type)
+    except DefinitionError:
+        text = f"unknown service type {shown(node.type)}{nearest(node.type, scope.messages.definitions.service_types)}"
+        raise SpecificationError.at(
+            node.type_position, f"{text}; others need a .srv file (--msg DIR)"
+        ) from None
+    kind = value_types.RecordType(service.request.name)
+    value = scope.value_of(node.value)
+    if value.type != kind:
+        raise SpecificationError.at(value.position, f"this is {value.type}, but the request is a {kind}")
+    scope.add(nodes.Publish(scope.lines.site, node.service, kind, value.form, scope.temporary(), node.type))
+    scope.called(node.service, node.type, node.position)
+
+
 def check_topic(topic: str, position: Position) -> None:
     """Reject a topic or service name that is not global and canonical."""
     if not names.is_global_name(topic):
@@ -349,4 +367,5 @@ _KINDS: Mapping[type[tree.Statement], Callable[[FunctionScope, Any], None]] = {
     tree.ResetStatement: _reset,
     tree.DeleteStatement: _delete,
     tree.PublishStatement: _publish,
+    tree.CallStatement: _call_service,
 }

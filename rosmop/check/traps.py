@@ -23,10 +23,22 @@ def traps(specification: tree.Specification) -> Iterator[Diagnostic]:
             period = f"{event.trigger.period_ns / 1e9:g}"
             text = f"`every` without a unit is {period} s; write `{period}s` or `{period}ms`"
             yield Diagnostic(event.trigger.position, "warning", text)
+        yield from _called_again(event)
         yield from _always_dropped(event)
         yield from _lost_changes(event)
         if not tests & _TESTS_OF_NAN:
             yield from _passed_nan(event)
+
+
+def _called_again(event: tree.EventDefinition) -> Iterator[Diagnostic]:
+    """Warn of an event of a service that calls this service."""
+    match event.trigger:
+        case tree.MessageTrigger(part="request" | "response", topic=service):
+            for node in tree.walk(event.action):
+                if isinstance(node, tree.CallStatement) and node.service == service:
+                    text = f"{shown(event.name)} calls {service}, and happens with each call of it"
+                    text += ": it calls without end; call it from another event"
+                    yield Diagnostic(node.position, "warning", text)
 
 
 def _always_dropped(event: tree.EventDefinition) -> Iterator[Diagnostic]:

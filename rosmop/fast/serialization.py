@@ -66,6 +66,7 @@ def encoded(compiled: Compiled) -> bytes:
     services = {
         event.service_type for one in compiled.specifications for event in one.events if event.service_type
     }
+    services |= {one.type for one in compiled.calls}
     used = _Used(
         {name: definitions.message(name) for name in sorted(reached)},
         {name: definitions.service(name) for name in sorted(services)},

@@ -68,7 +68,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Publication:
-    """A topic that a specification publishes, and the position of the statement. `safe`: only its safe message."""
+    """A topic that a specification publishes or a service that it calls, and the position of the statement.
+
+    `safe`: only its safe message is published.
+    """
 
     specification: str
     topic: str
@@ -187,6 +190,8 @@ class Compiled:
     """Types of variables, by their names in the form."""
     messages: MessageTypes
     publications: tuple[Publication, ...]
+    calls: tuple[Publication, ...] = ()
+    """The services that specifications call."""
 
     def alone(self, names: Collection[str]) -> "Compiled":
         """Return `part` without the data of other specifications, so that the result does not depend on them."""
@@ -226,6 +231,7 @@ class Compiled:
             self,
             specifications=tuple(one for one in self.specifications if one.name in names),
             publications=tuple(one for one in self.publications if one.specification in names),
+            calls=tuple(one for one in self.calls if one.specification in names),
         )
 
     def is_stamped(self, message_type: str | None) -> bool:

@@ -454,13 +454,14 @@ class Reset(FormNode, frozen=True):
 
 
 class Publish(FormNode, frozen=True):
-    """Publish a message; its bytes are in the variable `name`."""
+    """Publish a message; its bytes are in the variable `name`. With a `service` type, call the service instead."""
 
     site: int
     topic: str
     kind: value_types.RecordType
     value: Expression
     name: str
+    service: str = ""
 
 
 # Fields of the message

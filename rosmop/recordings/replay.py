@@ -70,7 +70,7 @@ class OutputBag:
 
     def publish(self, outcome: Outcome) -> None:
         """Write the messages that monitors published."""
-        for message in outcome.sent():
+        for message in (one for one in outcome.sent() if not one.is_call):
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
             header = (message.topic, f"{package}/msg/{kind}", text, digest, _OWN, None)

@@ -750,6 +750,8 @@ class MonitorSet:
         """
         judged: dict[int, Outcome] = {}
         for number, message in enumerate(outcome.published):
+            if message.is_call:
+                continue
             places, own = self._places.get(message.topic, ()), self._place_of[message.monitor]
             due = (outcome.timer or "").endswith(".deadline") and self.monitor(message.monitor).code.ordered
             first = (bisect_left if due else bisect_right)(places, own)

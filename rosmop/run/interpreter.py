@@ -425,12 +425,13 @@ class _Maker:
 
     def _publish(self, node: nodes.Publish) -> _Run:
         context, encode, value = self._context, self._values.encoder(node.kind), self.value(node.value)
-        topic, kind, site = node.topic, node.kind.name, node.site
+        topic, kind, site = node.topic, node.service or node.kind.name, node.site
+        is_call = bool(node.service)
 
         def run(v: Variables) -> None:
             out = bytearray()
             encode(value(v), out)
-            context.publish(topic, kind, bytes(out), site)
+            context.publish(topic, kind, bytes(out), site, is_call=is_call)
 
         return run
 

@@ -14,7 +14,8 @@ from rosmop.form.findings import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Source
 from rosmop.run.subformulas import deciding
-from rosmop.runtime.action_context import LogLine, Published
+from rosmop.runtime.action_context import LogLine
+from rosmop.runtime.action_context import Published as Published  # noqa: PLC0414  the appliance imports it from here
 from rosmop.runtime.wire import Buffer
 
 _EACH_END = 5
@@ -186,7 +187,10 @@ class Outcome:
                 buffer[start : start + len(old)] = old
 
     def sent(self) -> Iterator[Published]:
-        """Yield the published messages as they go out: without those that were dropped, and as they were changed."""
+        """Yield the published messages as they go out: without those that were dropped, and as they were changed.
+
+        Calls of services are included; their requests go through the monitors when they are sent.
+        """
         for number, message in enumerate(self.published):
             judged = self.judged.get(number)
             if judged is None:

@@ -70,13 +70,14 @@ def line_of(level: str, text: bytes, monitor: str) -> LogLine:
 
 
 class Published(NamedTuple):
-    """A message that a monitor publishes; `site` is the site of the statement."""
+    """A message that a monitor publishes, or a service that it calls; `site` is the site of the statement."""
 
     monitor: str
     topic: str
     type: str
     data: bytes
     site: int
+    is_call: bool = False
 
 
 @dataclass(slots=True)
@@ -233,12 +234,12 @@ class Context:
         self.throttled[site] = now
         return True
 
-    def publish(self, topic: str, kind: str, data: bytes, site: int) -> None:
-        """Add a message to publish."""
+    def publish(self, topic: str, kind: str, data: bytes, site: int, *, is_call: bool = False) -> None:
+        """Add a message to publish, or a service to call."""
         self.spend(OUTPUT_COST, site)
         self.allocate(len(data), site)
         self._pending += len(data)
-        self.turn.published.append(Published(self.monitor, topic, kind, data, site))
+        self.turn.published.append(Published(self.monitor, topic, kind, data, site, is_call))
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)

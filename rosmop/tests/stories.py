@@ -221,7 +221,9 @@ def lines_of(outcome: Outcome, monitors: MonitorSet, kind: str = "") -> list[str
     ]
     lines += [f"    {one.level} {one.monitor}: {one.text}" for one in outcome.log]
     lines += [
-        f"    {one.monitor} publishes {one.topic} {one.type} {fields_of(one.type, one.data)}"
+        f"    {one.monitor} calls {one.topic} {one.type} hex={one.data.hex()}"
+        if one.is_call
+        else f"    {one.monitor} publishes {one.topic} {one.type} {fields_of(one.type, one.data)}"
         for one in outcome.published
     ]
     return lines + [

@@ -19,7 +19,7 @@ from rosmop.tests.acting import definitions, load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "rv-language.md").read_text()
-EXAMPLE, GIVEN, ORDER, SAFE, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
+EXAMPLE, GIVEN, ORDER, SAFE, CALLS, VARIABLES, FUNCTIONS, PROPERTY, SLICED = re.findall(
     r"```cpp\n(.*?)```", PAGE, re.DOTALL
 )
 
@@ -60,6 +60,7 @@ HELPER = next(re.finditer(r"`(double half.*?})`", PAGE))[1]
     [
         EXAMPLE,
         f"s() {{ {VARIABLES} }}",
+        f"s() {{ {CALLS} }}",
         in_specification(PROPERTY),
         SLICED,
         SAFE + ORDER,

@@ -342,10 +342,10 @@ class TreeBuilder(Transformer_NonRecursive[Token, Any]):
         return tree.DeleteStatement(self.at(meta), children[-1])
 
     def publish(self, meta: Meta, _: Any, topic: Any, kind: Any, value: Any) -> tree.PublishStatement:
-        names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (topic, kind)]
-        return tree.PublishStatement(
-            self.at(meta), names[0], names[1].replace("::", "/"), self.at(kind), value
-        )
+        return tree.PublishStatement(self.at(meta), *_resource(topic, kind), self.at(kind), value)
+
+    def call_service(self, meta: Meta, _: Any, service: Any, kind: Any, value: Any) -> tree.CallStatement:
+        return tree.CallStatement(self.at(meta), *_resource(service, kind), self.at(kind), value)
 
     def declaration(self, meta: Meta, kind: Any, *declarators: Any) -> tree.Declaration:
         return tree.Declaration(self.at(meta), kind, declarators)
@@ -516,6 +516,12 @@ def _character_value(inner: str) -> int:
     if len(value) != 1:
         raise _LiteralError("a character outside ASCII is more than one char; write a string")
     return value[0] - 256 if value[0] > 127 else value[0]
+
+
+def _resource(name: Any, kind: Any) -> tuple[str, str]:
+    """Return the name of a topic or service, and its type."""
+    names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (name, kind)]
+    return names[0], names[1].replace("::", "/")
 
 
 def _duration_ns(text: str) -> int:

@@ -99,6 +99,7 @@ block: "{" statement* "}"
     | RESET ";"                                   -> reset
     | DELETE ["[" "]"] expression ";"             -> delete
     | PUBLISH "(" (TOPIC | STRING) "," (MESSAGE_TYPE | STRING) "," assignment ")" ";" -> publish
+    | CALL "(" (TOPIC | STRING) "," (MESSAGE_TYPE | STRING) "," assignment ")" ";" -> call_service
 ?for_start: declaration ";" | expression ";" -> evaluate | ";" -> nothing
 case: CASE conditional ":" statement*
     | DEFAULT ":" statement*                      -> default
@@ -205,6 +206,7 @@ TOPIC_WORD.5: /topic(?!\w)/
 GIVEN_VALUE.9: /[^;={}]+/
 SAFE.5: /safe(?=<GAP>+[A-Za-z]\w*(\/|::)[A-Za-z]\w*<GAP>*\{)/
 ON.5: /on(?!\w)/
+CALL.3: /CALL(?=<GAP>*\(<GAP>*["\/~])/
 SERVICE.5: /service(?!\w)/
 EVERY.5: /every(?!\w)/
 SERVICE_PART.5: /(request|response)(?!\w)/

@@ -353,6 +353,16 @@ class PublishStatement(Statement):
     value: Expression
 
 
+@dataclass(frozen=True)
+class CallStatement(Statement):
+    """`CALL(service, type, request);`."""
+
+    service: str
+    type: str
+    type_position: Position = field(compare=False)
+    value: Expression
+
+
 # Specifications
 
 

@@ -42,7 +42,10 @@ def record(
             }
             for verdict in outcome.verdicts
         ],
-        "published": [{"topic": message.topic, "type": message.type} for message in outcome.published],
+        "published": [
+            {"service" if message.is_call else "topic": message.topic, "type": message.type}
+            for message in outcome.published
+        ],
         "log": [{"level": line.level, "text": line.text, "monitor": line.monitor} for line in outcome.log],
         "faults": [_fault(fault) for fault in outcome.faults],
     }
@@ -79,7 +82,7 @@ def lines(
         yield f"{head}: {verdict.category} of {name}{bound(verdict)}"
         yield from (f"{head}:   {line}" for line in because(verdict))
     for message in outcome.published:
-        yield f"{head}: published {message.topic} {message.type}"
+        yield f"{head}: {'called' if message.is_call else 'published'} {message.topic} {message.type}"
     for line in outcome.log:
         yield f"{head}: {line.level} {line.monitor}: {line.text}"
     for fault in outcome.faults:

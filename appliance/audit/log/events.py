@@ -83,6 +83,8 @@ EVENTS: dict[str, str] = {
     "monitor log": "A monitor logged a line; the first in each second is recorded in full, and further ones that differ"
     " only in numbers as `detail.count`, with `first_time`, `last_time` (nanoseconds since the epoch), `first_text` and"
     " `last_text` of those. The reason has the last line.",
+    "monitor called": "A monitor called a service, with the fields of `monitor published`; if the call fails, the event"
+    " `monitor fault` follows.",
     "monitor published": "A monitor published a message; `at` is the location of the statement, `conditions` the"
     " conditions that led there; `handler` is the verdict whose handler ran, with its `why`.",
     "publication refused": "A publisher or service uses another type definition than the specifications; it is not"

@@ -427,6 +427,26 @@ class OwnServiceAnswered(Message):
     text: str
 
 
+class MonitorCallWanted(Message):
+    """A monitor wants to call a service, and waits for `MonitorCallAnswered`."""
+
+    number: int
+    service: str
+
+
+class MonitorCallAnswered(Message):
+    """Control has decided a call of a monitor.
+
+    The node with this host and `caller_id` may call the incarnation's service; `refused` has the reason if it may not.
+    """
+
+    number: int
+    key: str
+    host: str
+    caller_id: str
+    refused: str
+
+
 class PublicationRefused(Message):
     """The relay does not carry a publisher or service, because its definition differs from the specifications'."""
 
@@ -438,9 +458,9 @@ class PublicationRefused(Message):
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     """An action of a monitor. The first action of each kind in a second is complete; the others are only counted.
 
-    `kind` is verdict, drop, change, fault, log or publish. The prefix "shadow " marks what a monitor in shadow mode
-    would have done ("shadow missed": a message that it did not get). `time` is in nanoseconds since the epoch. `count`
-    is 0 for a complete event, otherwise the number of counted events.
+    `kind` is verdict, drop, change, fault, log, publish or call. The prefix "shadow " marks an action that a monitor in
+    shadow mode would have taken ("shadow missed": a message that it did not get). `time` is in nanoseconds since the
+    epoch. `count` is 0 for a complete event, otherwise the number of counted events.
 
     `before` and `after` are the first bytes of the message; `size` is its whole length. `monitor` is the monitor that
     acted, and for a change the last one; `changed_by` in the detail names the events of all monitors that changed the
@@ -543,4 +563,5 @@ RelayLink = (
     | MonitorSwitched | MonitorGiven | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
     | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
+    | MonitorCallWanted | MonitorCallAnswered
 )  # fmt: skip

@@ -8,6 +8,7 @@ from appliance.channel import messages
 from appliance.control.assembly.core import Core
 from appliance.control.assembly.foundation import INNER, RVMASTER, Current, Foundation
 from appliance.control.assembly.listener_limits import value_limits
+from appliance.control.monitor_call_gate import MonitorCallGate
 from appliance.features.recorder.recording_orders import RecordingOrders
 from appliance.master import rosout
 from appliance.master.endpoints.delivery import Delivery
@@ -67,6 +68,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         base.plan,
     )
     allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
+    gate = Current[MonitorCallGate]()
     relay = RelayControl(
         core.registry,
         core.grants,
@@ -79,6 +81,7 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         broken=core.watchlist.look_at,
         own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
         own_call=recordings.called,
+        monitor_call=lambda wanted: gate().answer(wanted),
     )
     rosmaster = RosMaster(
         settings.rosmaster_port,
@@ -101,6 +104,17 @@ def make_endpoints(base: Foundation, core: Core) -> Endpoints:
         relay=relay,
         faces=faces,
         places=places,
+    )
+    gate.set(
+        MonitorCallGate(
+            core.registry,
+            core.graph,
+            enactor,
+            core.policy,
+            base.trail,
+            core.mediation,
+            settings.publish_as,
+        )
     )
     enforcement = Enforcement(core.revocation, enactor)
     base.enforcement.set(enforcement)

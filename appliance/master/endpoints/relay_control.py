@@ -90,7 +90,8 @@ class RelayControl:
     """Control's end of the links to the relays.
 
     `broken(incarnation)` is called for lost upstreams. `own_header` is the header of control's own publications.
-    `own_call` answers calls of the appliance's own service. `monitors()` returns the specifications that relays run.
+    `own_call` answers calls of the appliance's own service, and `monitor_call` decides calls of monitors. `monitors()`
+    returns the specifications that relays run.
     """
 
     registry: Registry
@@ -104,6 +105,7 @@ class RelayControl:
     broken: Callable[[Incarnation], None]
     own_header: messages.OwnHeaderStated | None
     own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
+    monitor_call: Callable[[messages.MonitorCallWanted], Awaitable[messages.MonitorCallAnswered]]
     _posts: tuple[RelayOutbox, ...] = field(init=False)
     _asking: set[asyncio.Task[None]] = field(default_factory=set)
     _taps: TapRequests = field(default_factory=TapRequests)
@@ -291,7 +293,7 @@ class RelayControl:
     def _received(self, index: int, message: messages.Message) -> None:
         post = self._posts[index]
         match message:
-            case messages.UpstreamWanted() | messages.OwnServiceCalled():
+            case messages.UpstreamWanted() | messages.OwnServiceCalled() | messages.MonitorCallWanted():
                 task = asyncio.get_running_loop().create_task(self._answer(post, message))
                 self._asking.add(task)
                 task.add_done_callback(self._asking.discard)
@@ -322,10 +324,14 @@ class RelayControl:
                 self.monitors().received(message, post.index)
 
     async def _answer(
-        self, post: RelayOutbox, asked: messages.UpstreamWanted | messages.OwnServiceCalled
+        self,
+        post: RelayOutbox,
+        asked: messages.UpstreamWanted | messages.OwnServiceCalled | messages.MonitorCallWanted,
     ) -> None:
         if isinstance(asked, messages.OwnServiceCalled):
             post.send(await self.own_call(asked))
+        elif isinstance(asked, messages.MonitorCallWanted):
+            post.send(await self.monitor_call(asked))
         else:
             await self._find_upstream(post, asked.key, asked.topic)
 

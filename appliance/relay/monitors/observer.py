@@ -28,6 +28,7 @@ from rosmop.run.outcomes import (
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
+    from rosmop.run.outcomes import Published
 
 _EXPLAINED = 10
 
@@ -50,7 +51,7 @@ class Observer:
     def __init__(
         self,
         observations: Observations,
-        publish: Callable[[str, bytes], None],
+        publish: Callable[[Published], None],
         senders: Senders,
         prefix: str = "",
         held: Callable[[], None] = lambda: None,
@@ -132,7 +133,7 @@ class Observer:
             )
         for number, published in enumerate(() if outcome.repeated else outcome.published):
             self._observations.note(
-                f"{self._prefix}publish",
+                f"{self._prefix}{'call' if published.is_call else 'publish'}",
                 published.monitor,
                 _of_publication(point, published.topic),
                 outcome.time,
@@ -150,7 +151,7 @@ class Observer:
         for earlier in outcome.before:
             self._send(earlier)
         for published in outcome.sent():
-            self._publish(published.topic, published.data)
+            self._publish(published)
         for judged in outcome.judged.values():
             self._send(judged)
 
@@ -247,6 +248,12 @@ class Observer:
             f"{self._prefix}fault", "", point, time, text, distinction=type(error).__name__, observed=observed
         )
         return text
+
+    def call_failed(self, monitor: str, service: str, time: int, text: str) -> None:
+        """Report as a fault of a monitor that its call of a service failed."""
+        self._observations.note(
+            f"{self._prefix}fault", monitor, ObservationPoint("", service), time, text, distinction=text
+        )
 
     def missed(
         self,

@@ -6,7 +6,7 @@ from typing import Any
 from appliance.channel.messages import Message, SpecificationsTaken
 from appliance.relay.loop import LoopTimer
 from appliance.relay.monitors.interceptor import Interceptor
-from appliance.relay.monitors.observation_points import NOWHERE
+from appliance.relay.monitors.observation_points import NOWHERE, WantedCall
 from rosmop.run.outcomes import Outcome
 from tests.support.stated import stated
 
@@ -53,11 +53,15 @@ class Reports:
 
 
 class QuietMonitors:
-    """An interceptor whose specifications are loaded at once; `published` has what its monitors publish."""
+    """An interceptor whose specifications are loaded at once.
+
+    `published` has what its monitors publish, and `called` the services that they call.
+    """
 
     def __init__(self, publish: Callable[[str, bytes], None] | None = None) -> None:
         self.reports = Reports()
         self.published: list[tuple[str, bytes]] = []
+        self.called: list[WantedCall] = []
         loop: Any = Timers()
         self._finish = loop.finish
         reporter: Any = self.reports
@@ -66,6 +70,7 @@ class QuietMonitors:
             reporter,
             budget=1.0,
             publish=publish or (lambda topic, data: self.published.append((topic, data))),
+            call=self.called.append,
             changed=lambda _topics: None,
         )
 

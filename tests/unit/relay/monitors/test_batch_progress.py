@@ -81,6 +81,7 @@ class Monitored:
             self.heard,
             budget=1000.0,
             publish=lambda *message: self.published.append(message),
+            call=lambda _wanted: None,
             changed=lambda _topics: None,
         )
         self.interceptor.over = lambda: False

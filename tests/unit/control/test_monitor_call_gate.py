@@ -1,0 +1,82 @@
+"""The service calls of monitors are decided by the policy like those of a client on the loopback."""
+
+import asyncio
+from typing import Any, cast
+
+import pytest
+
+from appliance.channel.messages import MonitorCallAnswered, MonitorCallWanted
+from appliance.control.monitor_call_gate import MonitorCallGate
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.policy.model import address_of
+from appliance.policy.policy_compiler import compile_policy
+from roswire.uris import parse_node_uri
+
+ALLOWED = "[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 127.0.0.1\n"
+
+
+class Control:
+    """The parts of control that the gate uses: the records, and the grants as `host caller service`."""
+
+    strict = False
+
+    def __init__(
+        self, policy: str, *, offered: bool = True, carries: bool = True, full: bool = False
+    ) -> None:
+        self.records: list[tuple[str, str, bool]] = []
+        self.granted: list[str] = []
+        self.carries, self.strict, self._full = carries, full, full
+        registry, uri = Registry(), "http://10.0.0.5:4000/"
+        node = Incarnation("key", "/node", address_of("10.0.0.5"), parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+        registry.add(node)
+        if offered:
+            registry.register(node, Kind.SERVICE, "/arm", "4001")
+        compiled, own = compile_policy(policy, file="p.ini"), cast(Any, self)
+        self.gate = MonitorCallGate(registry, own, own, lambda: compiled, own, own, "/rosrv")
+
+    def decided(self, asker: Any, method: str, _category: str, resource: str, decision: Any) -> str:
+        self.records.append((f"{asker.host} {asker.caller_id} {method}", resource, decision.allowed))
+        return "18ff"
+
+    async def durable(self) -> str | None:
+        return "the disk is full" if self._full else None
+
+    def carries_service(self, _service: str) -> bool:
+        return self.carries
+
+    def service_granted(self, provider: Incarnation, service: str, host: object, caller_id: str) -> list[str]:
+        return [f"{provider.key} {host} {caller_id} {service}"]
+
+    def carry_out(self, effects: list[str]) -> None:
+        self.granted += effects
+
+    def answer(self) -> MonitorCallAnswered:
+        """Ask for a call of /arm."""
+        return asyncio.run(self.gate.answer(MonitorCallWanted(7, "/arm")))
+
+
+def test_an_allowed_call_is_recorded_and_granted() -> None:
+    """The grant is that of a client, so its revocation by another policy cuts the call."""
+    control = Control(ALLOWED)
+    assert control.answer() == MonitorCallAnswered(7, "key", "127.0.0.1", "/rosrv", "")
+    assert control.records == [("127.0.0.1 /rosrv lookupService", "/arm", True)]
+    assert control.granted == ["key 127.0.0.1 /rosrv /arm"]
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "reason"),
+    [
+        ("[Commands]\nlookupService = 127.0.0.1\n[Clients]\n/arm = 10.0.0.9\n", {}, "[18ff]"),
+        ("[Commands]\nlookupService = 10.0.0.9\n", {}, "[18ff]"),
+        (ALLOWED, {"offered": False}, "no node offers the service"),
+        (ALLOWED, {"carries": False}, "the relay does not carry the service"),
+        (ALLOWED, {"full": True}, "denied: "),
+    ],
+)
+def test_another_call_is_not_granted(policy: str, options: dict[str, bool], reason: str) -> None:
+    """The answer has the reason, and a denial its record."""
+    control = Control(policy, **options)
+    answer = control.answer()
+    assert reason in answer.refused
+    assert not control.granted
+    assert len(control.records) == 1

@@ -1,0 +1,164 @@
+"""The service calls of monitors; the test plays control, and a service."""
+
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from appliance.channel.messages import (
+    ClientGranted,
+    ClientRevoked,
+    MonitorCallAnswered,
+    MonitorCallWanted,
+    NodePlaced,
+    ServicePlaced,
+)
+from appliance.relay.connections.monitor_calls import MOST, ServiceCalls
+from appliance.relay.monitors.observation_points import WantedCall
+from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
+from tests.unit.relay.monitors.monitored import SET_BOOL_MD5, Monitored, string
+from tests.unit.relay.monitors.quiet import QuietMonitors, Timers
+from tests.unit.relay.world import LOOPBACK, Peer
+
+REACT = """react() { std_srvs::SetBoolRequest r;
+    event said(std::string t) /chatter std_msgs/String '{data:t}' { r.data = true; CALL(/arm, std_srvs/SetBool, r); }
+    event ok(bool s) service /arm std_srvs/SetBool response '{success:s}' { ROS_WARN("answer %d", s); } }"""
+WANTED = WantedCall("react", "/arm", "std_srvs/SetBool", SET_BOOL_MD5, b"\x01")
+
+
+class Calls:
+    """Calls without a relay: `sent` are the questions to control, `failed` the faults."""
+
+    def __init__(self, *, connected: bool = True) -> None:
+        self.loop, self.sent, self.failed = Timers(), list[Any](), list[str]()
+        loop: Any = self.loop
+        serve: Any = None
+        self.calls = ServiceCalls(
+            loop,
+            seconds=30.0,
+            send=self.sent.append,
+            valid=lambda _service, _grant: False,
+            serve=serve,
+            failed=lambda wanted, reason: self.failed.append(f"{wanted.service}: {reason}"),
+        )
+        self.calls.attach(connected)
+
+    def run(self) -> None:
+        """Call the timers that are not cancelled, in the order of their times."""
+        due, self.loop.due[:] = sorted(self.loop.due, key=lambda one: one[0]), []
+        for _, timer in due:
+            if timer.callback is not None:
+                timer.callback()
+
+
+def denied(calls: Calls) -> None:
+    calls.calls.answered(MonitorCallAnswered(1, "", "", "", "denied: 127.0.0.1 may not"))
+
+
+@pytest.mark.parametrize(
+    ("connected", "happens", "reason"),
+    [
+        (True, denied, "denied: 127.0.0.1 may not"),
+        (True, Calls.run, "no response within 30 s"),
+        (True, lambda calls: calls.calls.attach(False), "the appliance's control has ended"),
+        (False, Calls.run, "the appliance's control is not running"),
+    ],
+)
+def test_each_call_that_does_not_succeed_is_one_fault(
+    connected: bool, happens: Callable[[Calls], None], reason: str
+) -> None:
+    """Whatever comes later, a call fails once, and the next one can be made."""
+    calls = Calls(connected=connected)
+    calls.calls.call(WANTED)
+    happens(calls)
+    denied(calls)
+    calls.run()
+    assert calls.failed[:1] == [f"/arm: {reason}"]
+    assert len(calls.failed) == 1
+    assert len(calls.sent) == connected
+
+
+def test_the_number_of_calls_under_way_is_bounded() -> None:
+    """A monitor that calls with each message costs a bounded number of connections."""
+    calls = Calls()
+    for _ in range(MOST + 3):
+        calls.calls.call(WANTED)
+    assert len(calls.sent) == MOST
+    assert calls.failed == [f"/arm: {MOST} calls of monitors are under way; the call was not made"] * 3
+    calls.run()
+    calls.calls.call(WANTED)
+    assert len(calls.sent) == MOST + 1
+
+
+def test_a_failed_call_counts_as_a_fault_of_its_monitor() -> None:
+    """`rosrv status` reports a monitor whose calls fail as failing."""
+    quiet = QuietMonitors()
+    quiet.load(REACT)
+    quiet.process("/chatter", struct.pack("<I", 0))
+    [wanted] = quiet.called
+    assert wanted == WANTED
+    quiet.interceptor.call_failed(wanted, "no node offers the service")
+    monitors = quiet.interceptor.monitors
+    assert monitors is not None
+    assert monitors.monitor("react").faults == 1
+
+
+@pytest.fixture(name="world")
+def served() -> Iterator[Monitored]:
+    """Yield a relay with a service /arm of the node /server, and a monitor that calls it."""
+    world = Monitored()
+    listening = socket.create_server((LOOPBACK, 0))
+    world.state(NodePlaced("srv", "/server", LOOPBACK), world.listen())
+    world.state(ServicePlaced("srv", "/arm", LOOPBACK, listening.getsockname()[1]))
+    world.load(REACT)
+    world.service = listening
+    yield world
+    listening.close()
+    world.close()
+
+
+def asked(world: Monitored) -> Peer:
+    """Return the service's end of the call, after the request."""
+    peer = world.accept(world.service)
+    header = world.gets_header(peer)
+    assert (header["callerid"], header["md5sum"]) == ("/rosrv", SET_BOOL_MD5)
+    peer.send(encode_header({"callerid": "/server", "type": "std_srvs/SetBool", "md5sum": SET_BOOL_MD5}))
+    world.gets(peer, encode_frame(b"\x01"))
+    return peer
+
+
+def grant(world: Monitored) -> None:
+    """Grant the call that a monitor wants, as control does."""
+    wanted = world.hears(MonitorCallWanted, service="/arm")
+    world.state(ClientGranted("srv", "/arm", LOOPBACK, "/rosrv"))
+    world.state(MonitorCallAnswered(wanted.number, "srv", LOOPBACK, "/rosrv", ""))
+
+
+@pytest.mark.nightly
+def test_the_response_of_a_call_is_an_event(world: Monitored) -> None:
+    """The next call uses the grant; after its revocation control is asked again."""
+    publisher, _subscriber = world.typed()
+    world.push(publisher, string("x"))
+    grant(world)
+    asked(world).send(encode_service_reply(b"\x01\0\0\0\0"))
+    assert world.event("log").text == "answer 1"
+    world.push(publisher, string("x"))
+    asked(world).send(encode_service_error("not now"))
+    assert world.event("fault").text == "the call of /arm failed: not now"
+    world.state(ClientRevoked("srv", "/arm", LOOPBACK, "/rosrv"))
+    world.push(publisher, string("x"))
+    grant(world)
+    asked(world).send(encode_service_reply(b"\x00\0\0\0\0"))
+    assert world.event("log", text="answer 0")
+
+
+@pytest.mark.nightly
+def test_a_service_that_goes_away_is_a_fault(world: Monitored) -> None:
+    """The call ends with the connection."""
+    publisher, _subscriber = world.typed()
+    world.push(publisher, string("x"))
+    grant(world)
+    asked(world).reset()
+    assert "the call of /arm failed: " in world.event("fault").text
