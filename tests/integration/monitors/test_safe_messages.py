@@ -12,11 +12,11 @@ from tests.support.processes import Process
 from tests.support.requirements import needs
 
 GUARD = """
-guard() {
+guard() given { int least = 1 in 0..9; } {
     int near = 9;
     safe std_msgs/String { data:"stop" } on /chatter every 100ms;
     event scan(std::vector<int> ranges) /scan std_msgs/Int32MultiArray '{data:ranges}' { near = ranges[0]; }
-    event drive() /chatter std_msgs/String '{}' { if (near < 1) { STOP; } }
+    event drive() /chatter std_msgs/String '{}' { if (near < least) { STOP; } }
 }
 """
 
@@ -44,6 +44,12 @@ def change(appliance: Appliance, _: RosSession) -> None:
     appliance.rosrv("monitor", "load", "--hold", str(spec))
 
 
+def tighten(appliance: Appliance, ros: RosSession) -> None:
+    """Set the bound beyond the distance that the next scan reports; the text and the state stay."""
+    appliance.rosrv("monitor", "set", "guard", "least=9")
+    scan(appliance, ros, "5")
+
+
 def restart(appliance: Appliance, _: RosSession) -> None:
     """Stop the whole appliance, and start it again."""
     assert appliance.stop() == 0
@@ -63,6 +69,7 @@ def only_stops(base: Process, since: int) -> None:
 
 ROWS: dict[str, tuple[Callable[[Appliance, RosSession], object], bool]] = {
     "an obstacle": (lambda appliance, ros: scan(appliance, ros, "0"), False),
+    "a new bound": (tighten, False),
     "a faulty sensor": (lambda appliance, ros: scan(appliance, ros, ""), True),
     "a changed text": (change, True),
 }
@@ -87,6 +94,7 @@ def test_the_base_gets_stops_and_nothing_else(
         only_stops(base, base.mark())
         if holds:
             guarded.rosrv("monitor", "resume", "guard")
+        guarded.rosrv("monitor", "set", "guard", "least=1")
         scan(guarded, ros, "5")
         base.wait_for(lambda event: "hello" in event.get("data", ""), since=base.mark(), timeout=60)
 
