@@ -239,13 +239,13 @@ class RosNode:
 
     async def _serve_header(self, reader: asyncio.StreamReader, writer: ByteWriter) -> None:
         try:
-            header, rest = await read_header(reader, self._limits.header_seconds)
+            header = await read_header(reader, self._limits.header_seconds)
             if "service" in header:
                 service = self.services.get(header["service"])
                 if service is None:
                     refuse(writer, f"{self.name} does not offer the service {header['service'][:200]}")
                 else:
-                    await service.serve(reader, writer, header, rest)
+                    await service.serve(reader, writer, header)
             else:
                 publisher = self.publishers.get(header.get("topic", ""))
                 if publisher is None:

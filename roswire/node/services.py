@@ -5,13 +5,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from roswire.definitions import Definitions
-from roswire.errors import PeerError
+from roswire.errors import PeerError, ProtocolError
 from roswire.node.network import ByteWriter, PeerUnreachableError, ServiceFailedError
-from roswire.node.tcpros_streams import ANY, READ_BYTES, exchange_headers, refuse
+from roswire.node.tcpros_streams import ANY, exchange_headers, read_frame, refuse
 from roswire.node.topics import NodeLink
 from roswire.tcpros import (
-    FrameParser,
-    ServiceReplyParser,
     encode_frame,
     encode_header,
     encode_service_error,
@@ -19,7 +17,6 @@ from roswire.tcpros import (
 )
 from roswire.uris import NodeUri
 
-_MOST_WAITING = 64  # requests of one connection that wait for their answers
 _IDLE_SECONDS = 3600.0  # a persistent connection without a request
 
 
@@ -42,7 +39,9 @@ class ServiceType:
 async def probe_service(link: NodeLink, service: str, uri: NodeUri) -> dict[str, str]:
     """Return the header of a service, which names its type. Raises `RosError`."""
     fields = {"callerid": link.name, "service": service, "md5sum": ANY, "probe": "1"}
-    header, _ = await _connected(link, service, uri, fields, request=b"", seconds=link.limits.call_seconds)
+    header, _reply = await _connected(
+        link, service, uri, fields, request=b"", seconds=link.limits.call_seconds
+    )
     return header
 
 
@@ -54,7 +53,9 @@ async def call_service(
     Raises `ServiceFailedError` with the service's reason, or another `RosError`.
     """
     fields = {"callerid": link.name, "service": service, "md5sum": md5sum, "persistent": "0"}
-    _, reply = await _connected(link, service, uri, fields, request=encode_frame(request), seconds=seconds)
+    _header, reply = await _connected(
+        link, service, uri, fields, request=encode_frame(request), seconds=seconds
+    )
     return reply
 
 
@@ -66,12 +67,12 @@ async def _connected(
         async with asyncio.timeout(seconds):
             reader, writer = await link.network.connect(uri.host, uri.port)
             try:
-                header, rest = await exchange_headers(reader, writer, fields, link.limits.header_seconds)
+                header = await exchange_headers(reader, writer, fields, link.limits.header_seconds)
                 if not request:
                     return header, b""
                 writer.write(request)
                 await writer.drain()
-                return header, await _reply(link, reader, rest)
+                return header, await _read_reply(link, reader)
             finally:
                 writer.close()
     except TimeoutError:
@@ -80,16 +81,14 @@ async def _connected(
         raise PeerUnreachableError(f"{service} cannot be called: {error.strerror or error}") from error
 
 
-async def _reply(link: NodeLink, reader: asyncio.StreamReader, data: bytes) -> bytes:
-    parser = ServiceReplyParser(link.limits.message_bytes)
-    while True:
-        for reply in parser.feed(data):
-            if not reply.ok:
-                raise ServiceFailedError(reply.body[:4000].decode("utf-8", "replace"))
-            return reply.body
-        data = await reader.read(READ_BYTES)
-        if not data:
-            raise ConnectionResetError("the connection ended before the reply")
+async def _read_reply(link: NodeLink, reader: asyncio.StreamReader) -> bytes:
+    ok = await reader.read(1)
+    body = await read_frame(reader, link.limits.message_bytes)
+    if ok == b"\x01":
+        return body
+    if ok == b"\x00":
+        raise ServiceFailedError(body[:4000].decode("utf-8", "replace"))
+    raise ProtocolError(f"service reply: the first byte is {ok[0]}; it is 1 (success) or 0 (error)")
 
 
 class ServiceServer:
@@ -104,9 +103,9 @@ class ServiceServer:
         self._answer = answer
 
     async def serve(
-        self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], data: bytes
+        self, reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str]
     ) -> None:
-        """Serve one client, from its header on; `data` are the bytes after the header."""
+        """Serve one client, from its header on."""
         if header.get("md5sum") not in (ANY, self.type.md5sum):
             refuse(writer, f"{self.name} has the type {self.type.name} with the md5sum {self.type.md5sum}")
             return
@@ -120,19 +119,12 @@ class ServiceServer:
         writer.write(encode_header(fields))
         if header.get("probe") == "1":
             return
-        frames = FrameParser(self._link.limits.message_bytes)
         while True:
-            requests = frames.feed(data)
-            if len(requests) > _MOST_WAITING:
-                return
-            for request in requests:
-                writer.write(await self._reply(request))
-                await writer.drain()
-                if header.get("persistent") != "1":
-                    return
             async with asyncio.timeout(_IDLE_SECONDS):
-                data = await reader.read(READ_BYTES)
-            if not data:
+                request = await read_frame(reader, self._link.limits.message_bytes)
+            writer.write(await self._reply(request))
+            await writer.drain()
+            if header.get("persistent") != "1":
                 return
 
     async def _reply(self, request: bytes) -> bytes:

@@ -1,18 +1,19 @@
 """TCPROS on a node's connections: the exchange of headers, with limits of size and time."""
 
 import asyncio
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from roswire.definitions import Definitions
-from roswire.errors import ProtocolError
+from roswire.errors import LimitExceededError, ProtocolError
 from roswire.node.network import ByteWriter
-from roswire.tcpros import HeaderParser, encode_header
+from roswire.tcpros import HEADER_LIMIT, decode_header, encode_header
 
 ANY = "*"
 """The md5sum, or the name, of any type."""
 
-READ_BYTES = 1 << 16
+_LENGTH = struct.Struct("<I")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,34 +46,41 @@ ANY_TYPE = MessageType(ANY, ANY, "")
 """The type of a subscriber that accepts every type."""
 
 
-async def read_header(reader: asyncio.StreamReader, seconds: float) -> tuple[dict[str, str], bytes]:
-    """Return the peer's header, and the bytes that followed it.
+async def read_frame(reader: asyncio.StreamReader, limit: int) -> bytes:
+    """Return the next frame: a header, message, request or response.
+
+    Raises `LimitExceededError` as soon as the announced length exceeds the limit, and `OSError` if the connection ends.
+    """
+    try:
+        (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
+        if size > limit:
+            raise LimitExceededError(f"frame of {size} bytes; at most {limit} are allowed")
+        return await reader.readexactly(size)
+    except asyncio.IncompleteReadError:
+        raise ConnectionResetError("the peer ended the connection") from None
+
+
+async def read_header(reader: asyncio.StreamReader, seconds: float) -> dict[str, str]:
+    """Return the peer's header.
 
     Raises `ProtocolError`, or `OSError` if the connection ends or the time limit passes.
     """
-    parser = HeaderParser()
     async with asyncio.timeout(seconds):
-        while True:
-            data = await reader.read(READ_BYTES)
-            if not data:
-                raise ConnectionResetError("the connection ended before its header was complete")
-            fields = parser.feed(data)
-            if fields is not None:
-                return fields, parser.rest
+        return decode_header(await read_frame(reader, HEADER_LIMIT))
 
 
 async def exchange_headers(
     reader: asyncio.StreamReader, writer: ByteWriter, header: Mapping[str, str], seconds: float
-) -> tuple[dict[str, str], bytes]:
-    """Send a header, and return the answer and the bytes that followed it.
+) -> dict[str, str]:
+    """Send a header, and return the answer.
 
     Raises `ProtocolError` with the peer's reason if it rejects the connection, or `OSError`.
     """
     writer.write(encode_header(header))
-    answer, rest = await read_header(reader, seconds)
+    answer = await read_header(reader, seconds)
     if "error" in answer:
         raise ProtocolError(f"the peer rejected the connection: {answer['error'][:1000]}")
-    return answer, rest
+    return answer
 
 
 def refuse(writer: ByteWriter, reason: str) -> None:

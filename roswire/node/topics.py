@@ -4,6 +4,7 @@ A publisher never waits: if a subscriber is slower than its topic, the oldest wa
 """
 
 import asyncio
+import itertools
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,14 +13,14 @@ from roswire.errors import ProtocolError, RosError
 from roswire.node.network import ByteWriter, NodeNetwork, OwnedTasks
 from roswire.node.tcpros_streams import (
     ANY,
-    READ_BYTES,
     MessageType,
     NodeLimits,
     exchange_headers,
+    read_frame,
     refuse,
 )
 from roswire.node.xmlrpc_http import CALL_LIMITS, call_xmlrpc
-from roswire.tcpros import FrameParser, encode_frame, encode_header
+from roswire.tcpros import encode_frame, encode_header
 from roswire.uris import parse_node_uri
 
 Received = Callable[[bytes, Mapping[str, str]], None]
@@ -29,6 +30,7 @@ _FIRST_PAUSE = (
     0.1  # seconds between two attempts to reach a publisher; the pause doubles up to the second number
 )
 _LONGEST_PAUSE = 5.0
+_TURN = 64  # messages after which other tasks get a turn, although more have come
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,19 +111,15 @@ class NodeSubscription:
                 "message_definition": self.wanted.definition,
                 "tcp_nodelay": "1",
             }
-            header, data = await exchange_headers(reader, writer, fields, limits.header_seconds)
+            header = await exchange_headers(reader, writer, fields, limits.header_seconds)
             self._check(uri, header)
             self.connected[uri] = header
             self._connection.set()
             self.problems.pop(uri, None)
-            frames = FrameParser(limits.message_bytes)
-            while True:
-                for body in frames.feed(data):
-                    self._received(body, header)
-                await asyncio.sleep(0)  # a fast publisher must not keep other tasks waiting
-                data = await reader.read(READ_BYTES)
-                if not data:
-                    raise ConnectionResetError(f"{uri} ended the connection")
+            for number in itertools.count(1):
+                self._received(await read_frame(reader, limits.message_bytes), header)
+                if number % _TURN == 0:
+                    await asyncio.sleep(0)
         finally:
             writer.close()
 
